@@ -1,0 +1,581 @@
+"""What a run can be told: frozen dataclasses with range checks, and the team file that holds them.
+
+Every parameter has one name: in the team file (a flat key), on the command line (``--name-with-dashes``) and here.
+This is the only module that reads or writes configuration files.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+from octoreplay.errors import ConfigError
+from octoreplay.records import ClassTable, SemanticClass
+
+RULES = ("gradient", "bayes", "natural", "local")
+EVIDENCES = ("sum", "time-average", "cell-average")
+MODES = ("sync", "on-arrival")
+TOPOLOGIES = ("complete", "ring", "line", "star", "edges")
+WEIGHTS = ("metropolis", "degree", "given")
+
+PALETTE: tuple[tuple[int, int, int], ...] = (
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167),
+    (120, 120, 120), (127, 60, 141), (17, 165, 121), (57, 105, 172), (242, 183, 1), (231, 63, 116), (128, 186, 90),
+)  # fmt: skip
+"""Colours for classes that come without one (the first seven: Okabe and Ito's colour-blind safe set)."""
+
+
+def _parameter(
+    default: Any,
+    help_text: str,
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """A dataclass field that carries its help text and the range that it is checked against."""
+    return field(
+        default=default,
+        metadata={"help": help_text, "minimum": minimum, "maximum": maximum, "above": above, "choices": choices},
+    )
+
+
+def _check_ranges(config: Any) -> None:
+    """Check every parameter of one section against its type and range."""
+    for item in dataclasses.fields(config):
+        value, meta = getattr(config, item.name), item.metadata
+        if value is None or not meta:
+            continue
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{item.name}: {value} is not a finite number")
+        if meta["choices"] is not None and value not in meta["choices"]:
+            raise ConfigError(f"{item.name}: '{value}' is not one of {', '.join(meta['choices'])}")
+        if meta["minimum"] is not None and value < meta["minimum"]:
+            raise ConfigError(f"{item.name}: {value} is below the least value {meta['minimum']:g}")
+        if meta["maximum"] is not None and value > meta["maximum"]:
+            raise ConfigError(f"{item.name}: {value} is above the largest value {meta['maximum']:g}")
+        if meta["above"] is not None and value <= meta["above"]:
+            raise ConfigError(f"{item.name}: {value} must be greater than {meta['above']:g}")
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The inverse sensor model: log-odds increments, clamping and ranges."""
+
+    hit: float = _parameter(1.0, "log-odds added to a hit cell's class (psi)", above=0.0)
+    miss: float = _parameter(-0.3, "log-odds added to all classes of a cell that a ray passes (phi)", maximum=0.0)
+    hit_other: float | None = _parameter(None, "log-odds added to a hit cell's other classes (default: miss)")
+    clamp_min: float = _parameter(-5.0, "least log-odds of a class", maximum=0.0)
+    clamp_max: float = _parameter(5.0, "largest log-odds of a class", minimum=0.0)
+    min_range: float = _parameter(0.0, "points nearer than this carry no information [m]", minimum=0.0)
+    max_range: float = _parameter(10.0, "rays are cut here [m]", above=0.0)
+    rays: str = _parameter("cells", "one ray per distinct end cell, or per measured point", choices=("cells", "all"))
+    invalid_depth: tuple[float, ...] = _parameter((), "raw depth values that carry no information")
+    no_return_depth: tuple[float, ...] = _parameter(
+        (), "raw depth values that mean 'no return' and free their ray up to max_range"
+    )
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if self.clamp_min >= self.clamp_max:
+            raise ConfigError("clamp_min: must be below clamp_max")
+        if self.min_range >= self.max_range:
+            raise ConfigError("min_range: must be below max_range")
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """The map's geometry and prior."""
+
+    resolution: float = _parameter(0.2, "edge of the finest leaf [m]", above=0.0)
+    bounds: tuple[float, ...] = _parameter(
+        (), "mapped region: ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m]"
+    )
+    prob_free: float | None = _parameter(
+        None, "prior probability of free space (default: uniform over all classes)", above=0.0, maximum=0.999999
+    )
+    prune_tolerance: float = _parameter(
+        0.0, "siblings whose log-odds differ by at most this are one leaf when published (0: lossless)", minimum=0.0
+    )
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if len(self.bounds) not in (0, 2, 6):
+            raise ConfigError(f"bounds: expects 2 or 6 numbers, got {len(self.bounds)}")
+        half = len(self.bounds) // 2
+        if any(self.bounds[i] >= self.bounds[half + i] for i in range(half)):
+            raise ConfigError("bounds: every minimum must be below its maximum")
+
+    @property
+    def box(self) -> tuple[float, float, float, float, float, float]:
+        """The mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres; infinite where it is not limited."""
+        infinity = math.inf
+        if len(self.bounds) == 2:
+            return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
+        if len(self.bounds) == 6:
+            return cast("tuple[float, float, float, float, float, float]", self.bounds)
+        return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
+
+    def prior(self, num_classes: int) -> float:
+        """h_0: the log-odds of each occupied class in an unobserved cell."""
+        if self.prob_free is None:
+            return 0.0
+        return math.log((1.0 - self.prob_free) / num_classes / self.prob_free)
+
+
+@dataclass(frozen=True)
+class ConsensusConfig:
+    """The consensus rule and its steps (ALGORITHM: Rules, Settling)."""
+
+    rule: str = _parameter("gradient", "consensus rule", choices=RULES)
+    evidence: str = _parameter("sum", "reading of log q_i", choices=EVIDENCES)
+    mode: str = _parameter("sync", "one iteration per tick, or one per arriving map", choices=MODES)
+    epsilon: float | None = _parameter(
+        None, "consensus step size (default: 0.5; with preset paper min(0.5, 0.9 / lambda_max))", above=0.0
+    )
+    gamma: float = _parameter(0.5, "gradient step size", minimum=0.0)
+    gamma_power: float = _parameter(0.0, "gamma_k = gamma / (1 + k / gamma_decay)^gamma_power", minimum=0.0)
+    gamma_decay: float = _parameter(1.0, "iterations after which gamma starts to fall", above=0.0)
+    gamma_per_arrival: str = _parameter(
+        "divided", "on-arrival: gamma divided by the robot's degree, or full", choices=("divided", "full")
+    )
+    settle: int = _parameter(20, "ticks over which gamma ramps to 0 after the last log; 0: no settling", minimum=0)
+    settle_tolerance: float = _parameter(
+        1e-6, "settling stops when no log-odds changes by more than this in a tick", above=0.0
+    )
+    settle_max: int | None = _parameter(None, "most settling ticks (default: 20 + 12 / -log10 lambda_2)", minimum=1)
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The simulated communication graph."""
+
+    topology: str = _parameter("complete", "communication graph", choices=TOPOLOGIES)
+    edges: tuple[tuple[str, str, float | None], ...] = field(default=())
+    weights: str = _parameter("metropolis", "weights A_ij of the links", choices=WEIGHTS)
+    publish_period: float = _parameter(1.0, "every robot publishes its map every so often [s]", above=0.0)
+    after_end: str = _parameter(
+        "stay", "after a robot's last scan it stays in the team or leaves", choices=("stay", "leave")
+    )
+    packet_compression: str = _parameter("zstd", "compression of the packets", choices=("zstd", "none"))
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if (self.topology == "edges") != bool(self.edges):
+            raise ConfigError("edges: an edge list goes with topology 'edges', and topology 'edges' needs one")
+        if (self.weights == "given") != any(weight is not None for *_, weight in self.edges):
+            raise ConfigError("weights: 'given' goes with an edge list that carries a weight for every edge")
+        if self.weights == "given" and any(weight is None for *_, weight in self.edges):
+            raise ConfigError("edges: with weights 'given' every edge needs a weight")
+
+
+@dataclass(frozen=True)
+class TimeConfig:
+    """How stamps are read and streams are paired."""
+
+    clock: str = _parameter("header", "stamps: the messages' headers or the log's", choices=("header", "log"))
+    reorder_window: float = _parameter(1.0, "messages may be this much out of order [s]", minimum=0.0)
+    pair_tolerance: float = _parameter(0.02, "depth and label may be this far apart [s]", minimum=0.0)
+    pose_gap: float = _parameter(0.5, "poses further apart than this are not interpolated between [s]", above=0.0)
+    strict_labels: bool = _parameter(False, "refuse raw labels that the class table does not know")
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+
+
+@dataclass(frozen=True)
+class OutputConfig:
+    """What the result holds."""
+
+    state_every: float = _parameter(5.0, "each robot's map is stored every so often and at the end [s]", above=0.0)
+    view_every: float = _parameter(10.0, "fused maps for viewing, every so often and at the end [s]", above=0.0)
+    keep_packets: bool = _parameter(False, "store the radio packets themselves")
+    hash: bool = _parameter(False, "fingerprint inputs by a SHA-256 of the whole file")
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """One robot: its log files, topics, clock and frames. Topics and frames that are None are found in the log.
+
+    ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo. Transforms are (x, y, z, qx, qy, qz, qw):
+    ``T_team_map`` from the robot's map frame to the team's, ``T_body_sensor`` from the sensor's frame to the frame
+    whose pose the pose topic gives, in place of TF. ``clock_offset`` [s] is added to the robot's stamps.
+    """
+
+    robot_id: str
+    logs: tuple[Path, ...]
+    depth_topic: str | None = None
+    label_topic: str | None = None
+    camera_info_topic: str | None = None
+    cloud_topic: str | None = None
+    pose_topic: str | None = None
+    label_info_topic: str | None = None
+    map_frame: str | None = None
+    sensor_frame: str | None = None
+    intrinsics: tuple[float, ...] | None = None
+    depth_unit: float | None = None
+    clock_offset: float = 0.0
+    T_team_map: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    T_body_sensor: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.robot_id or "/" in self.robot_id:
+            raise ConfigError(f"robot id '{self.robot_id}': must not be empty or contain '/'")
+        if not self.logs:
+            raise ConfigError(f"robot '{self.robot_id}': needs a log")
+        for name in ("T_team_map", "T_body_sensor"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if len(value) != 7:
+                raise ConfigError(f"robot '{self.robot_id}': {name} expects 7 numbers x, y, z, qx, qy, qz, qw")
+            if abs(math.hypot(*value[3:]) - 1.0) > 1e-3:
+                raise ConfigError(f"robot '{self.robot_id}': {name}'s quaternion must have length 1")
+        if self.intrinsics is not None and (len(self.intrinsics) != 4 or min(self.intrinsics[:2]) <= 0):
+            raise ConfigError(f"robot '{self.robot_id}': intrinsics expects 4 numbers fx, fy, cx, cy")
+        if self.depth_unit is not None and self.depth_unit <= 0:
+            raise ConfigError(f"robot '{self.robot_id}': depth_unit must be greater than 0")
+        if self.depth_topic and self.cloud_topic:
+            raise ConfigError(f"robot '{self.robot_id}': give depth_topic or cloud_topic, not both")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that a run depends on. ``classes`` is None where the logs bring their own class table."""
+
+    robots: tuple[RobotConfig, ...]
+    classes: ClassTable | None = None
+    sensor: SensorConfig = SensorConfig()
+    map: MapConfig = MapConfig()
+    consensus: ConsensusConfig = ConsensusConfig()
+    network: NetworkConfig = NetworkConfig()
+    time: TimeConfig = TimeConfig()
+    output: OutputConfig = OutputConfig()
+
+    def __post_init__(self) -> None:
+        if not self.robots:
+            raise ConfigError("robots: a team needs at least one robot")
+        seen: set[str] = set()
+        for robot in self.robots:
+            if robot.robot_id in seen:
+                raise ConfigError(f"robots: '{robot.robot_id}' is listed twice")
+            seen.add(robot.robot_id)
+        for sender, receiver, weight in self.network.edges:
+            for robot_id in (sender, receiver):
+                if robot_id not in seen:
+                    raise ConfigError(f"edges: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+            if sender == receiver:
+                raise ConfigError(f"edges: '{sender}' cannot have a link to itself")
+            if weight is not None and weight < 0:
+                raise ConfigError(f"edges: the weight of {sender} - {receiver} is negative")
+
+    def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
+        """This configuration with flat parameters replaced.
+
+        Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.
+        """
+        changes: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            parameter = PARAMETERS.get(name)
+            if parameter is None:
+                raise ConfigError(f"{name}: unknown parameter{_suggestion(name, PARAMETERS)}")
+            changes.setdefault(parameter.section, {})[name] = parameter.coerce(value)
+        sections = {
+            section: dataclasses.replace(getattr(self, section), **fields) for section, fields in changes.items()
+        }
+        return dataclasses.replace(self, **sections)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One flat parameter: its name, section, type and what its help says."""
+
+    name: str
+    section: str
+    kind: str
+    default: Any
+    help: str
+    choices: tuple[str, ...] | None
+
+    def coerce(self, value: Any) -> Any:
+        """The value in the parameter's type. Raises ConfigError where it has another."""
+        try:
+            return self._coerce(value)
+        except (TypeError, ValueError):
+            expected = {"float": "a number", "int": "a whole number", "bool": "true or false", "str": "a word",
+                        "floats": "numbers"}[self.kind]  # fmt: skip
+            raise ConfigError(f"{self.name}: expects {expected}, got {value!r}") from None
+
+    def _coerce(self, value: Any) -> Any:
+        if value is None and self.default is None:
+            return None
+        if self.kind == "floats":
+            numbers = value.split(",") if isinstance(value, str) else value
+            return tuple(_number(number) for number in ([numbers] if _is_number(numbers) else numbers))
+        if self.kind == "bool":
+            if not isinstance(value, bool):
+                raise TypeError
+            return value
+        if self.kind == "int":
+            if not _is_number(value) or int(value) != value:
+                raise TypeError
+            return int(value)
+        if self.kind == "float":
+            return _number(value)
+        if not isinstance(value, str):
+            raise TypeError
+        return value
+
+
+def _is_number(value: Any) -> bool:
+    """True for int and float, not for bool."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _number(value: Any) -> float:
+    """A float from a number or its text."""
+    if isinstance(value, str):
+        return float(value)
+    if not _is_number(value):
+        raise TypeError
+    return float(value)
+
+
+def _parameters() -> Iterator[Parameter]:
+    """All flat parameters, in the order of the sections' fields."""
+    kinds = {"float": "float", "float | None": "float", "int": "int", "int | None": "int", "bool": "bool",
+             "str": "str", "tuple[float, ...]": "floats"}  # fmt: skip
+    for section in dataclasses.fields(RunConfig):
+        if section.name in ("robots", "classes"):
+            continue
+        for item in dataclasses.fields(cast("Any", section.default)):
+            if item.metadata:
+                yield Parameter(
+                    item.name, section.name, kinds[str(item.type)], item.default, item.metadata["help"],
+                    item.metadata["choices"],
+                )  # fmt: skip
+
+
+PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: parameter for parameter in _parameters()})
+"""Every flat parameter by name."""
+
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "paper": MappingProxyType(
+            {
+                "rule": "gradient", "evidence": "time-average", "mode": "on-arrival", "gamma_per_arrival": "full",
+                "topology": "complete", "publish_period": 1.0, "weights": "degree", "settle": 0, "gamma": 1.0,
+            }
+        )
+    }
+)  # fmt: skip
+"""Named sets of parameters. 'paper' is the literal reading of the paper."""
+
+
+def _suggestion(name: str, known: Any) -> str:
+    """'; did you mean ...' for the nearest known name, or nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+# --- team files ------------------------------------------------------------------------------------------------------
+
+_ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
+_CLASS_KEYS = ("name", "color", "raw_labels")
+_TEAM_KEYS = ("robots", "classes", "ignored_raw_labels", "edges")
+
+
+def load_team_file(path: Path) -> RunConfig:
+    """Read a team file. Log paths in it are relative to its folder.
+
+    Raises ConfigError with the file and the key for anything that is not understood.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a team file (no UTF-8 text)") from error
+    return parse_team(text, source=str(path), folder=path.parent)
+
+
+def parse_team(text: str, *, source: str, folder: Path) -> RunConfig:
+    """A configuration from a team file's text; ``source`` names it in errors. Raises ConfigError."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        content = YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        line = getattr(getattr(error, "problem_mark", None), "line", None)
+        where = "" if line is None else f" (line {line + 1})"
+        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
+    try:
+        return _team_from_mapping(content, folder)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+
+
+def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
+    if not isinstance(content, Mapping):
+        raise ConfigError("a team file is a YAML mapping with the key 'robots'")
+    if "robots" not in content or not isinstance(content["robots"], list):
+        raise ConfigError("robots: expects a list of robots, each with 'id' and 'log'")
+    for key in content:
+        if key not in _TEAM_KEYS and key not in PARAMETERS:
+            raise ConfigError(f"{key}: unknown key{_suggestion(str(key), (*_TEAM_KEYS, *PARAMETERS))}")
+    robots = tuple(_robot_from_mapping(entry, folder) for entry in content["robots"])
+    classes = None
+    if content.get("classes") is not None:
+        classes = class_table(content["classes"], content.get("ignored_raw_labels") or ())
+    parameters = {key: value for key, value in content.items() if key in PARAMETERS}
+    network = {key: parameters.pop(key) for key in ("topology", "weights") if key in parameters}
+    edges = _edges(content.get("edges") or ())
+    config = RunConfig(robots=robots, classes=classes).with_parameters(parameters)
+    section = dataclasses.replace(
+        config.network, edges=edges, **{key: PARAMETERS[key].coerce(value) for key, value in network.items()}
+    )
+    return dataclasses.replace(config, network=section)
+
+
+def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
+    if not isinstance(entry, Mapping):
+        raise ConfigError("robots: every robot is a mapping with 'id' and 'log'")
+    robot_id = str(entry.get("id", ""))
+    for key in entry:
+        if key not in _ROBOT_KEYS:
+            raise ConfigError(f"robot '{robot_id}': {key}: unknown key{_suggestion(str(key), _ROBOT_KEYS)}")
+    logs = entry.get("log") or ()
+    logs = (logs,) if isinstance(logs, str) else logs
+    if not isinstance(logs, list | tuple) or not all(isinstance(log, str) for log in logs):
+        raise ConfigError(f"robot '{robot_id}': log: expects a path or a list of paths")
+    fields: dict[str, Any] = {}
+    for key, value in entry.items():
+        if key in ("id", "log") or value is None:
+            continue
+        try:
+            if key in ("intrinsics", "T_team_map", "T_body_sensor"):
+                fields[key] = tuple(_number(number) for number in value)
+            elif key in ("clock_offset", "depth_unit"):
+                fields[key] = _number(value)
+            else:
+                if not isinstance(value, str):
+                    raise TypeError
+                fields[key] = value
+        except (TypeError, ValueError):
+            raise ConfigError(f"robot '{robot_id}': {key}: {value!r} has the wrong type") from None
+    return RobotConfig(robot_id=robot_id, logs=tuple(folder / log for log in logs), **fields)
+
+
+def _edges(entries: Any) -> tuple[tuple[str, str, float | None], ...]:
+    """Edges from lists [a, b] or [a, b, weight]."""
+    edges = []
+    for entry in entries:
+        if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
+            raise ConfigError("edges: every edge is a list [robot, robot] or [robot, robot, weight]")
+        if len(entry) == 3 and not _is_number(entry[2]):
+            raise ConfigError(f"edges: the weight of {entry[0]} - {entry[1]} is not a number")
+        edges.append((str(entry[0]), str(entry[1]), float(entry[2]) if len(entry) == 3 else None))
+    return tuple(edges)
+
+
+def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
+    """A class table from the list that a team file holds: mappings with name, color [r, g, b] and raw_labels.
+
+    Raises ConfigError for an unknown key, a wrong type, or a raw label that has two meanings.
+    """
+    if not isinstance(entries, list | tuple) or not entries:
+        raise ConfigError("classes: expects a list of classes, each with 'name' and 'raw_labels'")
+    if len(entries) > 254:
+        raise ConfigError(f"classes: at most 254 classes, got {len(entries)}")
+    classes = []
+    meaning: dict[int, str] = {}
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, Mapping) or "name" not in entry:
+            raise ConfigError("classes: every class is a mapping with 'name', 'color' and 'raw_labels'")
+        for key in entry:
+            if key not in _CLASS_KEYS:
+                raise ConfigError(f"classes: {key}: unknown key{_suggestion(str(key), _CLASS_KEYS)}")
+        name = str(entry["name"])
+        raw_labels = _raw_labels(entry.get("raw_labels", [index + 1]), name)
+        for raw in raw_labels:
+            if raw in meaning:
+                raise ConfigError(f"classes: raw label {raw} means both '{meaning[raw]}' and '{name}'")
+            meaning[raw] = name
+        color = entry.get("color") or PALETTE[index % len(PALETTE)]
+        if len(color) != 3 or not all(isinstance(c, int) and 0 <= c <= 255 for c in color):
+            raise ConfigError(f"classes: the color of '{name}' must be three whole numbers from 0 to 255")
+        classes.append(SemanticClass(index + 1, name, (color[0], color[1], color[2]), raw_labels))
+    ignored_labels = _raw_labels(ignored, "ignored_raw_labels")
+    for raw in ignored_labels:
+        if raw in meaning:
+            raise ConfigError(f"classes: raw label {raw} means '{meaning[raw]}' and is in ignored_raw_labels")
+    return ClassTable(tuple(classes), ignored_labels)
+
+
+def _raw_labels(value: Any, name: str) -> tuple[int, ...]:
+    """Raw labels as whole numbers."""
+    values = [value] if _is_number(value) else value
+    if not isinstance(values, list | tuple) or not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
+        raise ConfigError(f"classes: the raw labels of '{name}' must be whole numbers")
+    return tuple(values)
+
+
+def dump_team(config: RunConfig, folder: Path | None = None) -> str:
+    """The team file's text of a configuration: everything that differs from the defaults, and every robot.
+
+    Log paths are written relative to ``folder`` where they lie below it. ``parse_team`` gives the same configuration.
+    """
+    from ruamel.yaml import YAML
+
+    content: dict[str, Any] = {"robots": [_robot_to_mapping(robot, folder) for robot in config.robots]}
+    if config.classes is not None:
+        content["classes"] = [
+            {"name": c.name, "color": list(c.color), "raw_labels": list(c.raw_labels)} for c in config.classes.classes
+        ]
+        if config.classes.ignored_raw_labels:
+            content["ignored_raw_labels"] = list(config.classes.ignored_raw_labels)
+    if config.network.edges:
+        content["edges"] = [[e for e in edge if e is not None] for edge in config.network.edges]
+    for name, parameter in PARAMETERS.items():
+        value = getattr(getattr(config, parameter.section), name)
+        if value != parameter.default:
+            content[name] = list(value) if isinstance(value, tuple) else value
+    buffer = io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.width = 110
+    yaml.dump(content, buffer)
+    return buffer.getvalue()
+
+
+def _robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
+    """One robot as a team file holds it."""
+
+    def text(path: Path) -> str:
+        return str(path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path)
+
+    logs = [text(path) for path in robot.logs]
+    entry: dict[str, Any] = {"id": robot.robot_id, "log": logs[0] if len(logs) == 1 else logs}
+    for item in dataclasses.fields(RobotConfig):
+        if item.name in ("robot_id", "logs"):
+            continue
+        value = getattr(robot, item.name)
+        if value != item.default:
+            entry[item.name] = list(value) if isinstance(value, tuple) else value
+    return entry

@@ -1,0 +1,115 @@
+"""The ROS 2 message types that octoreplay reads and writes, and their CDR encoding (rosbags' typestore)."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+VISION_MSGS = {
+    "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name\n",
+    "vision_msgs/msg/LabelInfo": ("std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"),
+}
+"""Definitions of vision_msgs 4 that rosbags' stores lack."""
+
+OCTOREPLAY_MSGS = {
+    "octoreplay_msgs/msg/MapState": """\
+# One robot's map after the tick at header.stamp, as a packet of the map codec (docs/packet-format.md).
+std_msgs/Header header
+string robot_id
+uint32 tick
+# Counts the states of this robot from 0. A delta replaces the bricks it holds in the state base_sequence.
+uint32 sequence
+uint32 base_sequence
+bool is_key_frame
+uint8[] data
+""",
+    "octoreplay_msgs/msg/Packet": """\
+# One packet as it went over the air (only with --keep-packets).
+std_msgs/Header header
+string sender
+uint32 tick
+uint8[] data
+""",
+    "octoreplay_msgs/msg/RobotMetrics": """\
+string robot_id
+bool active
+uint32 num_scans
+uint32 num_iterations
+# Share of the cells known to any robot whose label equals the oracle's: all cells; cells the oracle calls occupied.
+float64 agreement
+float64 agreement_occupied
+uint64 num_leaves
+uint64 num_cells
+# Cubic metres.
+float64 observed_volume
+# Mean over observed cells, in bits.
+float64 entropy_bits
+uint64 memory_bytes
+# The map published in this tick: as sent, as uncompressed octree, as uniform grid, as octree without pruning.
+uint64 packet_bytes
+uint64 octree_bytes
+uint64 grid_bytes
+uint64 unpruned_bytes
+uint64 unpruned_compressed_bytes
+""",
+    "octoreplay_msgs/msg/LinkMetrics": """\
+string sender
+string receiver
+uint64 sent_bytes
+uint32 num_sent
+uint32 num_delivered
+uint32 num_lost
+uint32 num_late
+float64 bytes_per_second
+""",
+    "octoreplay_msgs/msg/TickMetrics": """\
+# The team after one consensus tick; the definitions are in docs/metrics.md.
+std_msgs/Header header
+uint32 tick
+bool settling
+# Phi: over the tick's links; over all pairs of robots.
+float64 total_distance
+float64 total_distance_all
+float64 distance_per_leaf
+float64 distance_per_cell_and_link
+uint64 num_known_cells
+float64 label_disagreement
+# Largest change of any log-odds in this tick.
+float64 max_change
+octoreplay_msgs/RobotMetrics[] robots
+octoreplay_msgs/LinkMetrics[] links
+""",
+}
+"""octoreplay's own messages; docs/result-format.md explains them."""
+
+
+@cache
+def typestore() -> Typestore:
+    """The types of ROS 2 Humble with vision_msgs and octoreplay_msgs registered."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, definition in {**VISION_MSGS, **OCTOREPLAY_MSGS}.items():
+        store.register(get_types_from_msg(definition, name))
+    return store
+
+
+def message(type_name: str, **fields: Any) -> Any:
+    """A message of a registered type from its fields."""
+    return typestore().types[type_name](**fields)
+
+
+def stamp_to_ns(stamp: Any) -> int:
+    """Nanoseconds of a builtin_interfaces/Time (ROS 2) or time (ROS 1)."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def time_message(stamp_ns: int) -> Any:
+    """builtin_interfaces/Time of a time in nanoseconds."""
+    return message("builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000)
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """std_msgs/Header with stamp and frame."""
+    return message("std_msgs/msg/Header", stamp=time_message(stamp_ns), frame_id=frame_id)
