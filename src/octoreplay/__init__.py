@@ -1,3 +1,71 @@
-"""octoreplay: replays multi-robot logs into semantic octree maps that the team agrees on."""
+"""octoreplay: replays multi-robot logs into semantic octree maps that the team agrees on.
+
+The names below are the public ones; everything else may change between versions. They are imported when they are first
+used, so that ``import octoreplay`` and the command line's ``--help`` stay quick.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from octoreplay.config import RobotConfig, RunConfig, load_team_file
+    from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
+    from octoreplay.io.discover import discover, resolve
+    from octoreplay.io.logs import open_log
+    from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
+    from octoreplay.replay.session import Progress, replay_team
+    from octoreplay.report.export import export_ply
+    from octoreplay.result import PointQuery, Result, StoredMap, open_result
+    from octoreplay.simulate.team import SimulationConfig, simulate_team
+
+_HOMES = {
+    "ClassTable": "records",
+    "ConfigError": "errors",
+    "InputError": "errors",
+    "LeafTable": "records",
+    "OctoreplayError": "errors",
+    "OutputError": "errors",
+    "PacketError": "errors",
+    "PointQuery": "result",
+    "Progress": "replay.session",
+    "Result": "result",
+    "RobotConfig": "config",
+    "RunConfig": "config",
+    "RunSummary": "records",
+    "SemanticClass": "records",
+    "SimulationConfig": "simulate.team",
+    "StoredMap": "result",
+    "TickMetrics": "records",
+    "discover": "io.discover",
+    "export_ply": "report.export",
+    "load_team_file": "config",
+    "open_log": "io.logs",
+    "open_result": "result",
+    "replay_team": "replay.session",
+    "resolve": "io.discover",
+    "simulate_team": "simulate.team",
+}
+"""The module that each public name comes from."""
+
+__all__ = [
+    "ClassTable", "ConfigError", "InputError", "LeafTable", "OctoreplayError", "OutputError", "PacketError",
+    "PointQuery", "Progress", "Result", "RobotConfig", "RunConfig", "RunSummary", "SemanticClass", "SimulationConfig",
+    "StoredMap", "TickMetrics", "__version__", "discover", "export_ply", "load_team_file", "open_log", "open_result",
+    "replay_team", "resolve", "simulate_team",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported at its first use."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'octoreplay' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"octoreplay.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -121,7 +121,7 @@ class MapConfig:
         if len(self.bounds) == 2:
             return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
         if len(self.bounds) == 6:
-            return cast("tuple[float, float, float, float, float, float]", self.bounds)
+            return self.bounds
         return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
 
     def prior(self, num_classes: int) -> float:

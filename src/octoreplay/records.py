@@ -41,7 +41,7 @@ class DepthFrame:
     """One depth image with its labels and the camera's pose at its stamp.
 
     ``depth_image`` is (H, W), uint16 or float32; metres along z = value x ``depth_unit``.
-    ``class_image`` is (H, W) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels (every point is class 1).
+    ``class_image`` is (H, W) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels (all points class 1).
     ``T_team_sensor`` is (4, 4) float64.
     """
 

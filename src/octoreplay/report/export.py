@@ -1,0 +1,145 @@
+"""Exports of a stored result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from octoreplay.config import PALETTE
+from octoreplay.errors import ConfigError
+from octoreplay.io import ply, posterior
+from octoreplay.records import BoolArray, ClassTable, Float64Array, FloatArray, LeafTable, UInt8Array
+from octoreplay.result import Result, StoredMap, open_result
+
+COLORS = ("label", "robot", "disagreement", "probability")
+FREE_COLOR = (225, 225, 225)
+
+_RAMP = np.array(
+    [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142], [31, 158, 137], [53, 183, 121],
+     [109, 205, 89], [180, 222, 44], [253, 231, 37]], dtype=np.float64,
+)  # fmt: skip
+"""Matplotlib's viridis at ten even steps: dark is low, yellow is high."""
+
+
+def export_ply(
+    result_path: Path, output: Path, robot: str | None = None, at: float | None = None, what: str = "points",
+    color: str = "label", *, free: bool = False, team_posterior: bool = False,
+) -> int:  # fmt: skip
+    """Write a map of a result as a PLY file; the number of leaves written.
+
+    ``robot``: whose map; None for the first robot's, and with color 'robot' for all of them laid over each other.
+    ``at``: seconds after the run's start, None for the end. ``what``: 'points' (leaf centres) or 'voxels' (cubes).
+    ``color``:
+
+    - 'label': the most probable class's colour; free leaves are grey
+    - 'robot': the mean of the colours of the robots whose own map knows the leaf's centre
+    - 'probability': of the label, from 1 / (C + 1), dark, to 1, yellow
+    - 'disagreement': the largest ||h_j - h|| over the other robots at the leaf's centre, from 0, dark, to the largest
+      in the file, yellow (an unknown cell counts as the prior)
+
+    ``free`` writes free leaves too. ``team_posterior`` takes h_0 + N (h - h_0) for labels and probabilities. The file's
+    comments say what was chosen. Raises InputError, ConfigError or OutputError.
+    """
+    if what not in ("points", "voxels"):
+        raise ConfigError(f"what: '{what}' is not one of points, voxels")
+    if color not in COLORS:
+        raise ConfigError(f"color: '{color}' is not one of {', '.join(COLORS)}")
+    with open_result(result_path) as result:
+        at_ns = None if at is None else result.time_ns(at)
+        together = robot is None and color == "robot"
+        chosen = result.robots if together else (result.robots[0] if robot is None else robot,)
+        shown = [result.map(robot_id, at_ns=at_ns) for robot_id in chosen]
+        leaves = _leaves(shown, team_posterior, free)
+        colors, scale = _colors(result, shown, leaves, color, at_ns)
+        comments = _comments(result, shown, color, scale, team_posterior)
+    write = ply.write_voxels if what == "voxels" else ply.write_points
+    write(output, leaves, colors, comments)
+    return len(leaves)
+
+
+def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTable:
+    """The leaves of some maps; a leaf that several have is taken from the first."""
+    tables = [stored.leaves(team_posterior=team_posterior) for stored in maps]
+    centers = np.concatenate([table.centers for table in tables])
+    sizes = np.concatenate([table.sizes for table in tables])
+    log_odds = np.concatenate([table.log_odds for table in tables])
+    keep = np.ones(len(sizes), dtype=np.bool_)
+    if len(tables) > 1:
+        # Centres lie on multiples of half the resolution, so that rounding makes equal leaves equal keys.
+        keys = np.column_stack([np.rint(centers / (maps[0].resolution / 2)), np.rint(sizes / maps[0].resolution)])
+        _, first = np.unique(keys.astype(np.int64), axis=0, return_index=True)
+        keep[:] = False
+        keep[first] = True
+    if not free:
+        keep &= posterior.labels(log_odds) > 0
+    return LeafTable(centers[keep], sizes[keep], log_odds[keep])
+
+
+def _colors(
+    result: Result, shown: list[StoredMap], leaves: LeafTable, color: str, at_ns: int | None
+) -> tuple[UInt8Array, str]:
+    """Colours (L, 3) of the leaves, and what their ends mean."""
+    if color == "label":
+        return _label_colors(result.class_table, leaves), "the classes' own"
+    if color == "probability":
+        least = 1.0 / (result.class_table.num_classes + 1)
+        values = (posterior.label_probabilities(leaves.log_odds) - least) / (1.0 - least)
+        return _ramp(values), f"dark {least:.3f}, yellow 1"
+    ids = {stored.robot_id: stored for stored in shown}
+    maps = [ids.get(robot_id) or result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
+    if color == "robot":
+        known = np.column_stack([stored.query(leaves.centers).known for stored in maps])
+        return _robot_colors(known), ", ".join(f"{m.robot_id} {_robot_color(i)}" for i, m in enumerate(maps))
+    values = _disagreement(shown[0], maps, leaves.centers)
+    largest = float(values.max(initial=0.0))
+    return _ramp(values / largest if largest > 0 else values), f"dark 0, yellow {largest:.6g}"
+
+
+def _label_colors(class_table: ClassTable, leaves: LeafTable) -> UInt8Array:
+    palette = np.concatenate([np.array([FREE_COLOR], dtype=np.uint8), class_table.colors])
+    return palette.take(posterior.labels(leaves.log_odds), axis=0)
+
+
+def _robot_color(index: int) -> tuple[int, int, int]:
+    return PALETTE[index % len(PALETTE)]
+
+
+def _robot_colors(known: BoolArray) -> UInt8Array:
+    """The mean colour of the robots that know a leaf, from (L, N)."""
+    palette = np.array([_robot_color(index) for index in range(known.shape[1])], dtype=np.float64)
+    count = np.maximum(known.sum(axis=1, keepdims=True), 1)
+    mean: Float64Array = known.astype(np.float64) @ palette / count
+    return (mean + 0.5).astype(np.uint8)
+
+
+def _disagreement(own: StoredMap, maps: list[StoredMap], points: Float64Array) -> FloatArray:
+    """The largest distance between one robot's log-odds and another's at points: (P,) float64."""
+    h = own.query(points).log_odds.astype(np.float64)
+    largest = np.zeros(len(points))
+    for other in maps:
+        if other is not own:
+            np.maximum(largest, np.linalg.norm(other.query(points).log_odds - h, axis=1), out=largest)
+    return largest
+
+
+def _ramp(values: FloatArray) -> UInt8Array:
+    """Colours (L, 3) of values 0..1."""
+    place = np.clip(values, 0.0, 1.0) * (len(_RAMP) - 1)
+    steps = np.arange(len(_RAMP))
+    return np.rint(np.column_stack([np.interp(place, steps, _RAMP[:, k]) for k in range(3)])).astype(np.uint8)
+
+
+def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, team_posterior: bool) -> list[str]:
+    """What the file's reader has to know."""
+    last = shown[0]
+    names = ", ".join(f"{c.class_id} {c.name}" for c in result.class_table.classes)
+    evidence = "team posterior h_0 + N (h - h_0)" if team_posterior else "the robot's own h"
+    when = f"tick {last.tick}, {result.seconds(last.stamp_ns):g} s after the start"
+    lines = [
+        f"octoreplay map of {', '.join(stored.robot_id for stored in shown)} at {when}",
+        f"resolution {last.resolution:g} m, N = {last.num_robots} robots, log-odds: {evidence}",
+        f"classes: 0 free, {names}",
+        f"color: {color} ({scale})",
+    ]
+    return ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in lines]

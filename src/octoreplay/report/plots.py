@@ -1,0 +1,186 @@
+"""Metrics as CSV and as the paper's two figures: disagreement over time, packet sizes."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from octoreplay.errors import InputError, OutputError
+from octoreplay.records import TickMetrics
+
+_TEAM_COLUMNS = (
+    "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
+    "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change",
+)  # fmt: skip
+_ROBOT_COLUMNS = (
+    "active", "num_scans", "num_iterations", "agreement", "agreement_occupied", "num_leaves", "num_cells",
+    "observed_volume", "entropy_bits", "memory_bytes", "packet_bytes", "octree_bytes", "grid_bytes", "unpruned_bytes",
+    "unpruned_compressed_bytes",
+)  # fmt: skip
+_LINK_COLUMNS = ("num_sent", "num_delivered", "num_lost", "num_late", "sent_bytes")
+
+_BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
+
+
+def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
+    """All metrics as CSV text, one row per tick: the team's, then each robot's and each link's.
+
+    Columns are named as the fields of the metrics; a robot's have ``<robot>.`` and a link's ``<sender>><receiver>.``
+    before them. Numbers are exact; what a tick does not have is empty.
+    """
+    robots = list(dict.fromkeys(robot.robot_id for tick in metrics for robot in tick.robots))
+    links = list(dict.fromkeys((link.sender, link.receiver) for tick in metrics for link in tick.links))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        [*_TEAM_COLUMNS, *(f"{robot}.{name}" for robot in robots for name in _ROBOT_COLUMNS),
+         *(f"{a}>{b}.{name}" for a, b in links for name in _LINK_COLUMNS)]
+    )  # fmt: skip
+    for tick in metrics:
+        of_robot: dict[Any, Any] = {robot.robot_id: robot for robot in tick.robots}
+        of_link: dict[Any, Any] = {(link.sender, link.receiver): link for link in tick.links}
+        writer.writerow(
+            [*_cells(tick, _TEAM_COLUMNS), *(v for r in robots for v in _cells(of_robot.get(r), _ROBOT_COLUMNS)),
+             *(v for key in links for v in _cells(of_link.get(key), _LINK_COLUMNS))]
+        )  # fmt: skip
+    return text.getvalue()
+
+
+def write_metrics_csv(metrics: Sequence[TickMetrics], path: Path) -> None:
+    """Write ``metrics_csv`` to a file. Raises OutputError."""
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.write_text(metrics_csv(metrics), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:
+    """Write ``disagreement.png`` and ``packet_size.png`` into a folder, made if need be; the files written.
+
+    Raises OutputError, and InputError where there is no tick to draw.
+    """
+    if not metrics:
+        raise InputError("there is no tick to draw; the run was interrupted before its first one")
+    figures = {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}
+    paths = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, figure in figures.items():
+            # Software would name matplotlib's version: left out, so that equal results give equal files.
+            figure.savefig(folder / name, metadata={"Software": None})
+            paths.append(folder / name)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return paths
+
+
+def _cells(record: Any, names: Sequence[str]) -> list[str]:
+    """The values of one record as text; empty where there is no record."""
+    if record is None:
+        return [""] * len(names)
+    return [_cell(getattr(record, name)) for name in names]
+
+
+def _cell(value: Any) -> str:
+    return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
+
+
+def _axes(title: str, y_label: str) -> tuple[Any, Any]:
+    """An empty figure and its axes, in the one style of all figures. Drawn without a display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.6), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_xlabel("log time [s]")
+    axes.set_ylabel(y_label)
+    axes.grid(visible=True, color="#e5e5e5", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _times(metrics: Sequence[TickMetrics]) -> Any:
+    """Seconds since the first tick."""
+    return np.array([tick.stamp_ns - metrics[0].stamp_ns for tick in metrics]) / 1e9
+
+
+def _mark_settling(axes: Any, metrics: Sequence[TickMetrics], times: Any) -> None:
+    """A grey band over the ticks after the last log."""
+    first = next((index for index, tick in enumerate(metrics) if tick.settling), None)
+    if first is not None:
+        start = times[first - 1] if first else times[0]
+        axes.axvspan(start, times[-1], color=_GREY, alpha=0.15, linewidth=0, label="settling, no new scans")
+
+
+def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Any:
+    """Phi over time, on a logarithmic axis."""
+    figure, axes = _axes("Disagreement of the team", "\u03a6")
+    times = _times(metrics)
+    links = np.array([tick.total_distance for tick in metrics])
+    pairs = np.array([tick.total_distance_all for tick in metrics])
+    if not np.array_equal(links, pairs):
+        axes.plot(
+            times, np.where(pairs > 0, pairs, np.nan), color=_ORANGE, linewidth=1.2, label="\u03a6 over all pairs"
+        )
+    axes.plot(times, np.where(links > 0, links, np.nan), color=_BLUE, linewidth=1.6, label="\u03a6 over the links")
+    if (pairs > 0).any():
+        axes.set_yscale("log")
+    _mark_settling(axes, metrics, times)
+    figure.legend(frameon=False, fontsize=9, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _packet_figure(metrics: Sequence[TickMetrics]) -> Any:
+    """Bytes of a published map: as sent, as octree and as uniform grid; mean and standard deviation over robots."""
+    figure, axes = _axes("Size of a published map (mean and standard deviation over robots)", "bytes")
+    times = _times(metrics)
+    least = np.inf
+    for name, label, color in (
+        ("grid_bytes", "uniform grid", _ORANGE),
+        ("octree_bytes", "octree", _BLUE),
+        ("packet_bytes", "octree, as sent", _GREEN),
+    ):
+        mean, deviation = _over_robots(metrics, name)
+        axes.plot(times, mean, color=color, linewidth=1.6, label=label)
+        axes.fill_between(times, np.maximum(mean - deviation, 1), mean + deviation, color=color, alpha=0.2, linewidth=0)
+        least = min([least, *mean[mean > 0]])
+    if np.isfinite(least):
+        # Logarithmic: on a linear axis both octree curves lie on the floor.
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=least / 2)
+        _label_in_bytes(axes)
+    _mark_settling(axes, metrics, times)
+    figure.legend(frameon=False, fontsize=9, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
+    """Mean and standard deviation over the robots that published in a tick; NaN where none did."""
+    means, deviations = [], []
+    for tick in metrics:
+        values = [getattr(robot, name) for robot in tick.robots if robot.grid_bytes > 0]
+        means.append(np.mean(values) if values else np.nan)
+        deviations.append(np.std(values) if values else np.nan)
+    return np.array(means), np.array(deviations)
+
+
+def _label_in_bytes(axes: Any) -> None:
+    """Ticks on a logarithmic axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
+    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(EngFormatter(unit="B"))

@@ -1,0 +1,325 @@
+"""Tables for the terminal: what a run came to, what was chosen, what a query found."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+import numpy as np
+from rich import box
+from rich.columns import Columns
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.io import posterior
+from octoreplay.records import ClassTable, FrameCounts, LeafTable, RunSummary, TickMetrics
+
+if TYPE_CHECKING:
+    from octoreplay.io.discover import LogDescription, LogSummary
+    from octoreplay.result import PointQuery
+
+_YEAR_2000_NS = 946_684_800_000_000_000
+"""Stamps before it count from some start of a clock and are no dates."""
+
+_CAUSES = {
+    "no_label": "no label", "no_pose": "no pose", "no_intrinsics": "no intrinsics", "late": "late",
+    "undecodable": "unreadable",
+}  # fmt: skip
+"""Why a frame was not mapped: fields of FrameCounts and what the table calls them."""
+
+
+def number(value: float) -> str:
+    """A number for the eye: about three significant digits, thousands separated."""
+    if not math.isfinite(value):
+        return "-"
+    if value == 0 or 999.5 <= abs(value) < 1e9:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+def size(num_bytes: float) -> str:
+    """Bytes for the eye: B, kB, MB, GB (powers of 1000)."""
+    if not math.isfinite(num_bytes):
+        return "-"
+    for unit in ("B", "kB", "MB"):
+        if abs(num_bytes) < 999.5:
+            return f"{num_bytes:.0f} {unit}" if unit == "B" else f"{num_bytes:.3g} {unit}"
+        num_bytes /= 1000
+    return f"{num_bytes:,.3g} GB"
+
+
+def share(value: float) -> str:
+    """A share 0..1 as per cent; a dash where there is nothing to count."""
+    return f"{100 * value:.2f} %" if math.isfinite(value) else "-"
+
+
+def seconds(value: float) -> str:
+    """A duration: seconds below two minutes, else minutes and seconds."""
+    if value < 119.95:
+        return f"{value:.1f} s"
+    whole = round(value)
+    return f"{whole // 60} min {whole % 60:02d} s"
+
+
+def instant(stamp_ns: int) -> str:
+    """A point in time: RFC 3339 where it is a date, else seconds."""
+    if stamp_ns < _YEAR_2000_NS:
+        return f"{stamp_ns / 1e9:.3f} s"
+    return datetime.datetime.fromtimestamp(stamp_ns // 1_000_000_000, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def results(summary: RunSummary) -> RenderableType:
+    """A finished run as tables: the team, each robot, and the frames that could not be used."""
+    parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
+    if any(counts.skipped for counts in summary.frame_counts.values()):
+        parts.append(_frames_table(summary.frame_counts))
+    return _spaced(parts)
+
+
+def chosen_inputs(config: RunConfig) -> Table:
+    """The robots, logs and topics that a run will use."""
+    table = _table("Robots and topics")
+    table.add_column("robot", no_wrap=True)
+    table.add_column("log", overflow="fold")
+    table.add_column("topics and frames", overflow="fold")
+    for robot in config.robots:
+        logs = "\n".join(log.name or str(log) for log in robot.logs)
+        table.add_row(robot.robot_id, logs, "\n".join(_choices(robot)))
+    return table
+
+
+def class_list(class_table: ClassTable) -> RenderableType:
+    """The classes with their colours."""
+    items = [
+        Text.assemble(("\u25a0 ", "rgb({},{},{})".format(*entry.color)), entry.name) for entry in class_table.classes
+    ]
+    return Group(Text("Classes", style="bold"), Columns(items, padding=(0, 2)))
+
+
+def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, float]], answer: PointQuery) -> Table:
+    """What a map says about points: the three most probable of ``names`` (free, then the classes)."""
+    table = _table("")
+    table.add_column("x, y, z [m]", no_wrap=True)
+    table.add_column("what", no_wrap=True)
+    table.add_column("how sure", justify="right", no_wrap=True)
+    table.add_column("else")
+    table.add_column("leaf", justify="right", no_wrap=True)
+    for index, point in enumerate(points):
+        where = ", ".join(f"{value:g}" for value in point)
+        if not answer.known[index]:
+            table.add_row(where, "unknown", "", "", "")
+            continue
+        row = answer.probabilities[index]
+        order = sorted(range(len(names)), key=lambda k: (-row[k], k))
+        rest = ", ".join(f"{names[k]} {share(row[k])}" for k in order[1:3])
+        table.add_row(where, names[order[0]], share(row[order[0]]), rest, f"{answer.sizes[index]:g} m")
+    return table
+
+
+def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
+    """How much of each of ``names`` (free, then the classes) a table of leaves holds."""
+    labels, volumes = posterior.labels(leaves.log_odds), leaves.sizes**3
+    sure = posterior.label_probabilities(leaves.log_odds)
+    table = _table("")
+    table.add_column("what", no_wrap=True)
+    for heading in ("leaves", "volume", "how sure, mean"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for class_id, name in enumerate(names):
+        chosen = labels == class_id
+        if chosen.any():
+            mean = np.average(sure[chosen], weights=volumes[chosen])
+            table.add_row(name, f"{chosen.sum():,}", f"{number(volumes[chosen].sum())} m\u00b3", share(mean))
+    if not len(leaves):
+        table.add_row("unknown", "", "", "")
+    return table
+
+
+def made_files(files: Mapping[Path, str]) -> Table:
+    """Files or folders and what they are for."""
+    table = _table("Made")
+    table.show_header = False
+    table.add_column(overflow="fold")
+    table.add_column()
+    for path, purpose in files.items():
+        table.add_row(str(path), purpose)
+    return table
+
+
+def description(logs: LogDescription) -> RenderableType:
+    """What logs hold: their topics, the robots in them, and what a run would miss."""
+    parts: list[RenderableType] = [_log_table(log) for log in logs.logs]
+    if logs.robots:
+        parts.append(_robot_spans(logs))
+    parts.append(_readiness(logs))
+    return _spaced(parts)
+
+
+def terminal(*, stderr: bool = False, file: IO[str] | None = None, width: int | None = None) -> Console:
+    """A console at most 100 columns wide, in which square brackets and colons are just text."""
+    console = Console(stderr=stderr, file=file, width=width, markup=False, emoji=False, highlight=False)
+    console.width = min(console.width, 100)
+    return console
+
+
+def show(console: Console, *parts: RenderableType) -> None:
+    """Print tables and texts one below the other, an empty line after each."""
+    for part in parts:
+        console.print(part)
+        console.print()
+
+
+def _table(title: str) -> Table:
+    """The one style of all tables."""
+    return Table(
+        title=title or None,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        header_style="bold",
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+
+
+def _spaced(parts: Sequence[RenderableType]) -> Group:
+    """Parts with an empty line between them."""
+    lines: list[RenderableType] = []
+    for part in parts:
+        lines += [*([""] if lines else []), part]
+    return Group(*lines)
+
+
+def _team_table(summary: RunSummary) -> Table:
+    """Rows of description and value for the whole team."""
+    last, table = summary.last, _table("Team")
+    table.show_header = False
+    table.add_column(no_wrap=True)
+    table.add_column()
+    table.add_row("log time", seconds(summary.log_seconds))
+    if math.isfinite(summary.wall_seconds) and summary.wall_seconds > 0:
+        speed = summary.log_seconds / summary.wall_seconds
+        table.add_row("wall time", f"{seconds(summary.wall_seconds)} ({speed:.1f} times real time)")
+    settling = f", and {summary.num_settling_ticks} to settle" if summary.num_settling_ticks else ""
+    table.add_row("ticks", f"{summary.num_ticks - summary.num_settling_ticks}{settling}")
+    table.add_row("stopped", summary.stop_reason)
+    table.add_row("known cells", f"{last.num_known_cells:,}")
+    table.add_row(
+        "disagreement \u03a6",
+        f"{number(last.total_distance)} at the end, {number(summary.peak_total_distance)} at most",
+    )
+    table.add_row(
+        "\u03a6 over all pairs",
+        f"{number(last.total_distance_all)} at the end, {number(summary.peak_total_distance_all)} at most",
+    )
+    table.add_row("cells with different labels", share(last.label_disagreement))
+    worst = [min((getattr(r, name) for r in last.robots), default=math.nan) for name in _AGREEMENTS]
+    table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
+    table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
+    table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
+    grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
+    if summary.mean_grid_bytes > 0:
+        grid += f" (sent: {share(summary.mean_packet_bytes / summary.mean_grid_bytes)} of it)"
+    table.add_row("", grid)
+    table.add_row("sent in total", size(summary.total_sent_bytes))
+    return table
+
+
+_AGREEMENTS = ("agreement", "agreement_occupied")
+
+
+def _robots_table(last: TickMetrics) -> Table:
+    """One row per robot after the last tick."""
+    table = _table("Robots, after the last tick")
+    table.add_column("robot", no_wrap=True)
+    for name in ("scans", "agreement\nall cells", "\noccupied", "leaves", "volume", "entropy", "packet"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for robot in last.robots:
+        table.add_row(
+            robot.robot_id, f"{robot.num_scans:,}", share(robot.agreement), share(robot.agreement_occupied),
+            f"{robot.num_leaves:,}", f"{number(robot.observed_volume)} m\u00b3", f"{robot.entropy_bits:.3f} bit",
+            size(robot.packet_bytes),
+        )  # fmt: skip
+    return table
+
+
+def _log_table(log: LogSummary) -> RenderableType:
+    """One log: its span, and one row per topic."""
+    span = "empty"
+    if log.start_ns is not None and log.end_ns is not None:
+        span = f"{instant(log.start_ns)}, {seconds((log.end_ns - log.start_ns) / 1e9)}"
+    title = Text.assemble((str(log.path), "bold"), f"\n{span}, {log.num_messages:,} messages")
+    table = _table("")
+    longest = max((len(topic.name) for topic in log.topics), default=0)
+    table.add_column("topic", overflow="fold", min_width=min(longest, 32))
+    table.add_column("type", no_wrap=True)
+    table.add_column("count", justify="right", no_wrap=True)
+    table.add_column("rate", justify="right", no_wrap=True)
+    table.add_column("what", overflow="fold")
+    for topic in log.topics:
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.3g} Hz"
+        kind = topic.type_name.replace("/msg/", "/")
+        kind = kind if topic.encoding in ("", "cdr", "ros1") else f"{kind} ({topic.encoding})"
+        table.add_row(topic.name, kind, f"{topic.num_messages:,}", rate, topic.detail)
+    damage = [Text(f"damaged: {log.damage}", style="yellow")] if log.damage else []
+    return Group(title, *damage, table)
+
+
+def _robot_spans(logs: LogDescription) -> Table:
+    """One row per robot that was found: its topics, and when it was there."""
+    table = _table("Robots")
+    table.add_column("robot", no_wrap=True)
+    table.add_column("topics and frames", overflow="fold")
+    table.add_column("start", justify="right", no_wrap=True)
+    table.add_column("length", justify="right", no_wrap=True)
+    first = min((robot.start_ns for robot in logs.robots if robot.start_ns is not None), default=0)
+    for robot in logs.robots:
+        begin, length = "-", "-"
+        if robot.start_ns is not None and robot.end_ns is not None:
+            begin, length = f"+{(robot.start_ns - first) / 1e9:.1f} s", seconds((robot.end_ns - robot.start_ns) / 1e9)
+        table.add_row(robot.robot.robot_id, "\n".join(_choices(robot.robot)), begin, length)
+    return table
+
+
+def _readiness(logs: LogDescription) -> RenderableType:
+    """The time that all robots share, the classes, and what a run would miss."""
+    lines: list[RenderableType] = []
+    if len(logs.robots) > 1:
+        shared = "none" if logs.overlap_ns is None else seconds((logs.overlap_ns[1] - logs.overlap_ns[0]) / 1e9)
+        lines.append(Text(f"time that all robots share: {shared}"))
+    if logs.class_table is not None:
+        lines.append(class_list(logs.class_table))
+    missing = [f"{robot.robot.robot_id}: {what}" for robot in logs.robots for what in robot.missing]
+    missing += logs.missing
+    if not missing:
+        lines.append(Text("nothing is missing for a run", style="green"))
+    lines += [Text(f"missing for a run: {what}", style="yellow") for what in missing]
+    return Group(*lines)
+
+
+def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
+    """One row per robot: frames that were mapped, and those that were not, by cause."""
+    table = _table("Frames")
+    table.add_column("robot", no_wrap=True)
+    table.add_column("mapped", justify="right")
+    causes = [cause for cause in _CAUSES if any(getattr(count, cause) for count in counts.values())]
+    for cause in causes:
+        table.add_column(_CAUSES[cause], justify="right")
+    for robot_id, count in counts.items():
+        table.add_row(robot_id, f"{count.used:,}", *(f"{getattr(count, cause):,}" for cause in causes))
+    return table
+
+
+def _choices(robot: RobotConfig) -> list[str]:
+    """One line per topic or frame that a robot's configuration names."""
+    names = {
+        "depth_topic": "depth", "cloud_topic": "cloud", "label_topic": "labels", "camera_info_topic": "camera",
+        "pose_topic": "pose", "label_info_topic": "names", "map_frame": "map frame", "sensor_frame": "sensor frame",
+    }  # fmt: skip
+    width = max(len(name) for name in names.values())
+    return [f"{name:<{width}}  {value}" for field, name in names.items() if (value := getattr(robot, field))]

@@ -1,0 +1,100 @@
+"""Depth and label images of a mesh by ray casting, and a depth camera's noise.
+
+The only module that imports Open3D, and only when a picture is taken.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.errors import InputError
+from octoreplay.records import CameraModel, Float32Array, Float64Array, UInt8Array
+from octoreplay.simulate.world import World
+
+NO_LABEL = 255
+"""Raw label of a pixel that measured nothing."""
+
+
+class MeshCamera:
+    """Takes depth and label pictures of a world.
+
+    Raises InputError where Open3D or a shared library that it needs is missing.
+    """
+
+    def __init__(self, world: World, camera: CameraModel) -> None:
+        open3d = _import_open3d()
+        self._tensor = open3d.core.Tensor
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(self._tensor(world.vertices), self._tensor(world.triangles.astype(np.uint32)))
+        # One more entry: a ray that meets nothing has the id 2^32 - 1, and is given the label of nothing.
+        self._labels = np.append(world.triangle_classes, np.uint8(NO_LABEL))
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+
+    def take(self, T_world_camera: Float64Array, max_depth: float) -> tuple[Float32Array, UInt8Array]:
+        """Depth (H, W) float32 in metres along z, 0 where nothing is nearer than ``max_depth``, and labels (H, W).
+
+        ``T_world_camera`` is (4, 4), optical frame (z forward, x right, y down).
+        """
+        # The rays' z component is 1, so that the distance that comes back is the depth along z itself.
+        directions = self._rays @ T_world_camera[:3, :3].T
+        rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
+        rays[..., :3] = T_world_camera[:3, 3]
+        rays[..., 3:] = directions
+        answer = self._scene.cast_rays(self._tensor(rays))
+        depth = answer["t_hit"].numpy()
+        ids = np.minimum(answer["primitive_ids"].numpy(), np.uint32(len(self._labels) - 1))
+        labels = self._labels[ids]
+        beyond = ~(depth <= max_depth)
+        depth[beyond] = 0.0
+        labels[beyond] = NO_LABEL
+        return depth, labels
+
+
+def depth_noise_sigma(depth: npt.ArrayLike) -> Float64Array:
+    """Standard deviation in metres of a depth camera's noise at a depth in metres.
+
+    sigma(z) = 0.0012 + 0.0019 (z - 0.4)^2: Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D
+    Reconstruction and Tracking, 3DIMPVT 2012.
+    """
+    sigma: Float64Array = 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
+    return sigma
+
+
+def add_depth_noise(depth: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """The depth image with Gaussian noise that grows with range; pixels without a measurement stay 0."""
+    noise = rng.standard_normal(depth.shape, dtype=np.float32)
+    noisy = depth + noise * depth_noise_sigma(depth).astype(np.float32)
+    return np.where(depth > 0, np.maximum(noisy, np.float32(0.001)), np.float32(0.0))
+
+
+def depth_to_millimetres(depth: Float32Array) -> npt.NDArray[np.uint16]:
+    """A depth image in metres as 16UC1 millimetres; 65535 is never written, since it often means 'invalid'."""
+    millimetres: npt.NDArray[np.uint16] = np.clip(np.rint(depth * np.float32(1000.0)), 0, 65534).astype(np.uint16)
+    return millimetres
+
+
+def add_label_noise(labels: UInt8Array, share: float, num_classes: int, rng: np.random.Generator) -> UInt8Array:
+    """The label image with this share of its measured pixels turned into another class, each equally likely."""
+    wrong = (rng.random(labels.shape, dtype=np.float32) < share) & (labels != NO_LABEL)
+    noisy = labels.copy()
+    # Adding 1..C-1 modulo C never gives the class itself.
+    shift = rng.integers(1, num_classes, int(wrong.sum()), dtype=np.int64)
+    noisy[wrong] = (labels[wrong].astype(np.int64) - 1 + shift) % num_classes + 1
+    return noisy
+
+
+def _import_open3d() -> ModuleType:
+    """Open3D, or one sentence on what is missing."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"simulation needs Open3D, which cannot be loaded ({error}); on a headless Debian or Ubuntu machine its "
+            "shared libraries come with: apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6"
+        ) from error
+    module: ModuleType = open3d
+    return module

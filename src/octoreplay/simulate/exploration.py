@@ -1,0 +1,371 @@
+"""A team that explores: frontiers on one shared 2-D map, goals that robots share out, and paths round obstacles.
+
+Frontiers are seen free cells beside unseen ones (Yamauchi, A Frontier-Based Approach for Autonomous Exploration,
+CIRA 1997). A robot takes the frontier with the most unseen area for the least way, and a frontier near another robot's
+goal counts less (Burgard, Moors, Stachniss and Schneider, Coordinated Multi-Robot Exploration, T-RO 2005). When nothing
+is left to see, robots patrol: the same with the area that was seen longest ago.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.records import BoolArray, Float64Array, Int64Array
+from octoreplay.simulate.world import World, grid_length
+
+CELL = 0.5
+"""Edge of the exploration map's cells in metres."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a robot drives and looks; the defaults are a Clearpath Husky with a wide camera.
+
+    Metres, seconds and radians. ``clearance`` is kept between the centres of the cells that the robot and an obstacle
+    are in; ``view_range`` and ``view_angle`` are the sector that counts as seen.
+    """
+
+    speed: float = 1.0
+    turn_rate: float = 1.0
+    clearance: float = 1.0
+    view_range: float = 6.0
+    view_angle: float = 1.75
+
+
+@dataclass(frozen=True, eq=False)
+class Exploration:
+    """Where the team drove: ``states`` (N, T, 3) float64 x, y [m] and heading [rad], one every ``period`` seconds.
+
+    ``first_seen`` (N, n, n) int32 is the step at which a robot first saw a cell of the map, -1 where it never did.
+    """
+
+    period: float
+    states: Float64Array
+    first_seen: npt.NDArray[np.int32]
+
+
+def explore(
+    world: World,
+    num_robots: int,
+    num_steps: int,
+    period: float,
+    *,
+    motion: Motion | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Exploration:
+    """Drive a team through a world for ``num_steps`` states, ``period`` seconds apart.
+
+    The team starts on a ring around the origin, all looking along x, so that their first views overlap. Deterministic:
+    nothing is drawn at random, and ties go to the lower index. ``progress`` is called with the share that is done.
+    """
+    team = _Team(world, num_robots, num_steps, period, motion or Motion())
+    for step in range(num_steps):
+        team.look(step)
+        if step + 1 < num_steps:
+            team.move(step)
+        if progress is not None:
+            progress((step + 1) / num_steps)
+    return Exploration(period, team.states, team.first_seen)
+
+
+class _Team:
+    """The robots' states and the map that they share."""
+
+    def __init__(self, world: World, num_robots: int, num_steps: int, period: float, motion: Motion) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        self.size = world.size
+        self.n = grid_length(world.size, CELL)
+        self.period = period
+        self.motion = motion
+        self.obstacles = world.obstacle_mask(CELL)
+        # Distance from a cell's centre to the nearest obstacle cell's centre; the map's edge counts as an obstacle.
+        padded = np.pad(~self.obstacles, 1, constant_values=False)
+        self.true_distance: Float64Array = distance_transform_edt(padded)[1:-1, 1:-1] * CELL
+        self.first_seen = np.full((num_robots, self.n, self.n), -1, dtype=np.int32)
+        self.last_seen = np.full((self.n, self.n), -1, dtype=np.int32)
+        self.states = np.zeros((num_robots, num_steps, 3))
+        self.states[:, 0] = self._start(num_robots)
+        self.paths: list[Float64Array | None] = [None] * num_robots
+        self.goals: list[Int64Array | None] = [None] * num_robots
+        self.passable = np.zeros((num_robots, self.n, self.n), dtype=np.bool_)
+        self.planned_at = [-(10**9)] * num_robots
+        self._rays = self._sector()
+
+    def _start(self, num_robots: int) -> Float64Array:
+        """A ring around the origin, headings along x; a place that is taken moves to the nearest free cell."""
+        ring = max(1.2, num_robots * 2.6 / (2 * math.pi)) if num_robots > 1 else 0.0
+        free = np.argwhere(self.true_distance >= self.motion.clearance)
+        centers = self._center(free)
+        states = np.zeros((num_robots, 3))
+        for robot in range(num_robots):
+            angle = 2 * math.pi * robot / num_robots
+            wanted = ring * np.array([math.cos(angle), math.sin(angle)])
+            crowded = np.zeros(len(centers), dtype=np.bool_)
+            for other in states[:robot, :2]:
+                crowded |= np.hypot(*(centers - other).T) < 1.2
+            distance = np.hypot(*(centers - wanted).T) + 1e6 * crowded
+            states[robot, :2] = centers[int(np.argmin(distance))]
+        return states
+
+    def _sector(self) -> tuple[Float64Array, Float64Array]:
+        """Angles of the view's rays and distances along them, dense enough to touch every cell."""
+        reach, spread = self.motion.view_range, self.motion.view_angle
+        count = math.ceil(spread * reach / CELL)
+        return np.linspace(-spread / 2, spread / 2, count), np.arange(CELL / 2, reach, CELL / 2)
+
+    def look(self, step: int) -> None:
+        """Mark what every robot sees: its camera's sector up to the first obstacle, and where it stands."""
+        angles, distances = self._rays
+        for robot in range(len(self.states)):
+            x, y, heading = self.states[robot, step]
+            bearing = heading + angles
+            direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+            points = np.array([x, y]) + direction[:, None] * distances[None, :, None]
+            cells = np.floor((points + self.size / 2) / CELL).astype(np.int64)
+            outside = ((cells < 0) | (cells >= self.n)).any(axis=2)
+            cells = np.clip(cells, 0, self.n - 1)
+            blocked = self.obstacles[cells[..., 0], cells[..., 1]] | outside
+            # The first obstacle on a ray is seen, what comes after it is not.
+            behind = np.cumsum(blocked, axis=1) - blocked > 0
+            self._mark(robot, step, cells[~behind & ~outside])
+            # A robot feels what stands beside it.
+            reach = math.ceil(1.5 / CELL)
+            i, j = self._cell(x, y)
+            near = np.stack(np.meshgrid(np.arange(i - reach, i + reach + 1), np.arange(j - reach, j + reach + 1)), -1)
+            near = near.reshape(-1, 2)
+            self._mark(robot, step, near[((near >= 0) & (near < self.n)).all(axis=1)])
+
+    def _mark(self, robot: int, step: int, cells: Int64Array) -> None:
+        """Remember cells as seen by a robot at a step."""
+        first = self.first_seen[robot]
+        i, j = cells[:, 0], cells[:, 1]
+        new = first[i, j] < 0
+        first[i[new], j[new]] = step
+        self.last_seen[i, j] = step
+
+    def move(self, step: int) -> None:
+        """Drive every robot one step along its path; a new path is planned when the old one has served."""
+        for robot in range(len(self.states)):
+            if self._wants_plan(robot, step):
+                self._plan(robot, step)
+            self.states[robot, step + 1] = self._drive(robot, step)
+
+    def _wants_plan(self, robot: int, step: int) -> bool:
+        """True when the goal is reached or nothing new is to be seen there; at most one plan a second."""
+        if (step - self.planned_at[robot]) * self.period < 1.0:
+            return False
+        path, goal = self.paths[robot], self.goals[robot]
+        if path is None or goal is None:
+            return True
+        arrived = np.hypot(*(path[-1] - self.states[robot, step, :2])) < 1.0
+        i, j = goal
+        window = self.last_seen[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
+        return bool(arrived or (window >= self.planned_at[robot]).all())
+
+    def _plan(self, robot: int, step: int) -> None:
+        """Choose the best goal and the shortest path to it over cells known to be free."""
+        from scipy.ndimage import distance_transform_edt
+
+        self.planned_at[robot] = step
+        self.paths[robot], self.goals[robot] = None, None
+        known = self.last_seen >= 0
+        open_cells = np.pad(~(known & self.obstacles), 1, constant_values=False)
+        passable = known & (distance_transform_edt(open_cells)[1:-1, 1:-1] * CELL >= self.motion.clearance)
+        for other in range(len(self.states)):
+            if other != robot:
+                self._block(passable, self.states[other, step, :2], 1.2)
+        start = self._nearest(passable, self.states[robot, step, :2])
+        if start is None:
+            return
+        cells, way, previous = _shortest_paths(passable, start)
+        cost = 0.6 * CELL * way + self._turning(robot, step, cells) + self._crowding(robot, step, cells)
+        cost[way * CELL < 1.5] = np.inf
+        best = None
+        for novelty in (self._frontier_area(), self._age(step)):
+            utility = novelty[cells[:, 0], cells[:, 1]] - cost
+            best = int(np.argmax(utility))
+            if np.isfinite(utility[best]):
+                break
+        else:
+            return
+        self.goals[robot] = cells[best]
+        chain = [best]
+        while previous[chain[-1]] >= 0:
+            chain.append(int(previous[chain[-1]]))
+        self.paths[robot] = self._center(cells[chain[::-1]])
+        self.passable[robot] = passable
+
+    def _frontier_area(self) -> Float64Array:
+        """Square metres of unseen area about each cell from which a frontier is near; elsewhere -inf."""
+        from scipy.ndimage import uniform_filter
+
+        unseen = self.last_seen < 0
+        width = self._window()
+        area: Float64Array = uniform_filter(unseen.astype(np.float64), width, mode="constant") * (width * CELL) ** 2
+        return np.where(self._frontier(unseen), area, -np.inf)
+
+    def _age(self, step: int) -> Float64Array:
+        """Mean seconds since the cells about each cell were last seen, 120 at most."""
+        from scipy.ndimage import uniform_filter
+
+        age: Float64Array = np.minimum((step - self.last_seen) * self.period, 120.0)
+        mean: Float64Array = uniform_filter(age, self._window(), mode="constant")
+        return mean
+
+    def _window(self) -> int:
+        """Cells along the edge of the square that a robot sees well about a place."""
+        return 2 * math.ceil(0.5 * self.motion.view_range / CELL) + 1
+
+    def _frontier(self, unseen: BoolArray) -> BoolArray:
+        """Seen free cells from which an unseen cell is within reach of the planner's clearance, in groups of five."""
+        from scipy.ndimage import binary_dilation, label
+
+        free = ~unseen & ~self.obstacles
+        edge = free & binary_dilation(unseen, iterations=1)
+        groups, count = label(edge, structure=np.ones((3, 3)))
+        sizes = np.bincount(groups.ravel(), minlength=count + 1)
+        large = edge & (sizes[groups] >= 5)
+        reach = math.ceil(self.motion.clearance / CELL)
+        near: BoolArray = binary_dilation(large, structure=np.ones((3, 3)), iterations=reach) & free
+        return near
+
+    def _turning(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
+        """The cost of turning towards each cell, so that a robot does not dither between its left and right."""
+        x, y, heading = self.states[robot, step]
+        offset = self._center(cells) - (x, y)
+        error = np.abs(_wrap(np.arctan2(offset[:, 1], offset[:, 0]) - heading))
+        cost: Float64Array = 6.0 * error
+        return cost
+
+    def _crowding(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
+        """What each cell loses because another robot stands there or goes there."""
+        cost = np.zeros(len(cells))
+        centers = self._center(cells)
+        for other, goal in enumerate(self.goals):
+            if other == robot:
+                continue
+            places = [self.states[other, step, :2]] + ([] if goal is None else [self._center(goal)])
+            for place in places:
+                cost += 20.0 * np.clip(1.0 - np.hypot(*(centers - place).T) / 10.0, 0.0, None)
+        return cost
+
+    def _drive(self, robot: int, step: int) -> Float64Array:
+        """The next state: turn towards a point ahead on the path and drive, never into anything."""
+        x, y, heading = self.states[robot, step]
+        path = self.paths[robot]
+        if path is None:
+            return np.array([x, y, heading])
+        target = self._look_ahead(robot, path, np.array([x, y]))
+        error = float(_wrap(math.atan2(target[1] - y, target[0] - x) - heading))
+        turn = max(-self.motion.turn_rate * self.period, min(self.motion.turn_rate * self.period, error))
+        heading += turn
+        # Full speed when the way is ahead, turning on the spot when it is behind.
+        pace = self.motion.speed * self.period * max(0.0, math.cos(min(1.2 * abs(error), math.pi / 2)))
+        pace = min(pace, math.hypot(target[0] - x, target[1] - y))
+        ahead = np.array([x + pace * math.cos(heading), y + pace * math.sin(heading)])
+        if not self._may_stand(robot, step, ahead):
+            # Turning on towards the path is enough on a known way; what blocks it straight ahead is news.
+            if abs(error) < 0.05:
+                self.paths[robot] = None
+            ahead = np.array([x, y])
+        return np.array([*ahead, heading])
+
+    def _look_ahead(self, robot: int, path: Float64Array, here: Float64Array) -> Float64Array:
+        """The farthest point of the path, up to 2 m on from the robot, that it can make for in a straight line."""
+        nearest = int(np.argmin(np.hypot(*(path - here).T)))
+        target: Float64Array = path[nearest]
+        for ahead in path[nearest + 1 : nearest + 5]:
+            along = ahead - here
+            # A strip rather than a line, for steps have a length and may clip a corner that a thin line just misses.
+            side = 0.06 * np.array([-along[1], along[0]]) / max(1e-9, float(np.hypot(*along)))
+            line = here + np.linspace(0.0, 1.0, 40)[:, None] * along
+            strip = np.concatenate([line - side, line + side])
+            i, j = np.clip(np.floor((strip + self.size / 2) / CELL).astype(np.int64), 0, self.n - 1).T
+            if not self.passable[robot, i, j].all():
+                break
+            target = ahead
+        return target
+
+    def _may_stand(self, robot: int, step: int, place: Float64Array) -> bool:
+        """True when a place keeps clear of obstacles, and of other robots or at least leads away from them."""
+        if self.true_distance[self._cell(*place)] < self.motion.clearance:
+            return False
+        here = self.states[robot, step, :2]
+        for other in range(len(self.states)):
+            if other == robot:
+                continue
+            # Robots with a lower index have moved already.
+            there = self.states[other, step + 1 if other < robot else step, :2]
+            if np.hypot(*(place - there)) < min(1.0, float(np.hypot(*(here - there)))):
+                return False
+        return True
+
+    def _block(self, passable: BoolArray, place: Float64Array, radius: float) -> None:
+        """Take a disc out of a mask."""
+        reach = math.ceil(radius / CELL)
+        i, j = self._cell(*place)
+        rows, columns = np.ogrid[max(0, i - reach) : min(self.n, i + reach + 1),
+                                 max(0, j - reach) : min(self.n, j + reach + 1)]  # fmt: skip
+        passable[rows, columns] &= np.hypot(rows - i, columns - j) * CELL > radius
+
+    def _nearest(self, passable: BoolArray, place: Float64Array) -> Int64Array | None:
+        """The passable cell nearest to a place, at most 3 m away."""
+        cells = np.argwhere(passable)
+        if len(cells) == 0:
+            return None
+        distance = np.hypot(*(self._center(cells) - place).T)
+        best = int(np.argmin(distance))
+        return cells[best] if distance[best] < 3.0 else None
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        """The cell that holds a point; points on the edge belong to the last cell."""
+        i, j = (min(self.n - 1, max(0, math.floor((value + self.size / 2) / CELL))) for value in (x, y))
+        return i, j
+
+    def _center(self, cells: Int64Array) -> Float64Array:
+        """Centres in metres of cells (..., 2)."""
+        centers: Float64Array = (np.asarray(cells, dtype=np.float64) + 0.5) * CELL - self.size / 2
+        return centers
+
+
+def _shortest_paths(passable: BoolArray, start: Int64Array) -> tuple[Int64Array, Float64Array, Int64Array]:
+    """Dijkstra over the eight neighbours of passable cells; a diagonal step needs both cells beside it.
+
+    Gives the cells (P, 2), their distance from the start in cells, infinite where there is no way, and the index of the
+    cell before each on the way, negative at the start.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    cells = np.argwhere(passable)
+    index = np.full(passable.shape, -1, dtype=np.int64)
+    index[cells[:, 0], cells[:, 1]] = np.arange(len(cells))
+    rows, columns, lengths = [], [], []
+    padded = np.pad(index, 1, constant_values=-1)
+    n, m = passable.shape
+    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        neighbour = padded[1 + di : 1 + di + n, 1 + dj : 1 + dj + m]
+        beside = padded[1 : 1 + n, 1 + dj : 1 + dj + m], padded[1 + di : 1 + di + n, 1 : 1 + m]
+        linked = (index >= 0) & (neighbour >= 0) & (beside[0] >= 0) & (beside[1] >= 0)
+        rows.append(index[linked])
+        columns.append(neighbour[linked])
+        lengths.append(np.full(int(linked.sum()), math.hypot(di, dj)))
+    graph = csr_array(
+        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), shape=(len(cells), len(cells))
+    )
+    distance, previous = dijkstra(
+        graph, directed=False, indices=int(index[start[0], start[1]]), return_predecessors=True
+    )
+    return cells, distance, previous
+
+
+def _wrap(angle: npt.ArrayLike) -> Float64Array:
+    """Angles in [-pi, pi)."""
+    wrapped: Float64Array = (np.asarray(angle, dtype=np.float64) + math.pi) % (2 * math.pi) - math.pi
+    return wrapped

@@ -1,0 +1,308 @@
+"""A simulated team: a village, robots that explore it, and their logs, as robots would have recorded them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from octoreplay.config import MapConfig, RobotConfig, RunConfig, dump_team
+from octoreplay.errors import ConfigError, OutputError
+from octoreplay.io.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
+from octoreplay.records import CameraModel, Float64Array
+from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
+from octoreplay.simulate.exploration import Exploration, explore
+from octoreplay.simulate.world import (
+    VILLAGE_CLASSES,
+    Terrain,
+    make_village,
+    write_ground_truth,
+    write_mesh,
+)
+
+START_NS = 1_700_000_000_000_000_000
+"""Stamp of a simulation's first message: fixed, so that the same options give the same bytes."""
+
+_ODOMETRY_RATE = 20.0
+_BASE_HEIGHT = 0.13
+_CAMERA_POSITION = (0.35, 0.0, 0.75)
+_CAMERA_PITCH = 0.08
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What is simulated.
+
+    ``duration`` in seconds; ``rate`` images per second; ``image`` (width, height) in pixels; ``resolution`` in metres,
+    of the ground truth's cells and of the team file; ``label_noise`` is the share of pixels that get another class;
+    ``world_size`` is the edge in metres of the square that robots may drive in; ``max_depth`` the camera's range in
+    metres. Raises ConfigError for a value out of range.
+    """
+
+    num_robots: int = 6
+    duration: float = 60.0
+    rate: float = 4.0
+    image: tuple[int, int] = (160, 120)
+    seed: int = 0
+    resolution: float = 0.3
+    label_noise: float = 0.1
+    depth_noise: bool = True
+    world_size: float = 70.0
+    max_depth: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name, value, least, most in (
+            ("num_robots", self.num_robots, 1, 100),
+            ("duration", self.duration, 1.0, 86_400.0),
+            ("rate", self.rate, 0.1, 100.0),
+            ("image width", self.image[0], 8, 4096),
+            ("image height", self.image[1], 6, 4096),
+            ("seed", self.seed, 0, 2**32 - 1),
+            ("resolution", self.resolution, 0.02, 5.0),
+            ("label_noise", self.label_noise, 0.0, 1.0),
+            ("world_size", self.world_size, 20.0, 1000.0),
+            ("max_depth", self.max_depth, 1.0, 65.0),
+        ):
+            if not least <= value <= most:
+                raise ConfigError(f"{name}: {value:g} is not between {least:g} and {most:g}")
+
+    @property
+    def camera(self) -> CameraModel:
+        """The robots' camera: fx = fy = 65.25 pixels at 160 pixels width, the principal point at the centre."""
+        width, height = self.image
+        focal = 65.25 * width / 160
+        return CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @property
+    def robot_ids(self) -> tuple[str, ...]:
+        """husky_1, husky_2, ..."""
+        return tuple(f"husky_{index + 1}" for index in range(self.num_robots))
+
+
+@dataclass(frozen=True)
+class SimulationSummary:
+    """What a simulation wrote. ``num_cells`` counts the ground truth's labelled cells."""
+
+    folder: Path
+    team_file: Path
+    logs: tuple[Path, ...]
+    num_frames: int
+    num_cells: int
+    num_bytes: int
+
+
+def simulate_team(
+    folder: Path, config: SimulationConfig, progress: Callable[[float], None] | None = None
+) -> SimulationSummary:
+    """Simulate a team and write one log per robot, ``team.yaml``, ``world.npz`` and ``world.ply`` into a folder.
+
+    The same configuration gives the same bytes. ``progress`` is called with the share that is done, 0 to 1. Files
+    appear under their names only when all are complete. Raises OutputError where the folder is not empty or cannot be
+    written, InputError where Open3D cannot be loaded.
+    """
+    created = _prepare(folder)
+    work = folder / ".partial"
+    try:
+        work.mkdir()
+        num_frames, num_cells = _write_all(work, config, progress or _no_progress)
+        names = sorted(path.name for path in work.iterdir())
+        # The team file comes last: where it stands, everything does.
+        for name in sorted(names, key=lambda name: name == "team.yaml"):
+            (work / name).replace(folder / name)
+        work.rmdir()
+    except BaseException as error:
+        shutil.rmtree(work, ignore_errors=True)
+        if created:
+            shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+        raise
+    return SimulationSummary(
+        folder,
+        folder / "team.yaml",
+        tuple(folder / f"{robot_id}.mcap" for robot_id in config.robot_ids),
+        num_frames,
+        num_cells,
+        sum((folder / name).stat().st_size for name in names),
+    )
+
+
+def _no_progress(share: float) -> None:
+    """Nobody watches."""
+
+
+def _prepare(folder: Path) -> bool:
+    """Make sure of an empty folder; True when it was made."""
+    try:
+        if folder.exists():
+            if not folder.is_dir():
+                raise OutputError(f"{folder}: is a file; give a new folder")
+            if any(folder.iterdir()):
+                raise OutputError(f"{folder}: is not empty; give a new folder, or empty this one")
+            return False
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return True
+
+
+def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float], None]) -> tuple[int, int]:
+    """Write every file; the numbers of frames and of labelled cells."""
+    world = make_village(config.world_size, config.seed)
+    eye = MeshCamera(world, config.camera)
+    num_cells = write_ground_truth(work / "world.npz", world, config.resolution, VILLAGE_CLASSES)
+    write_mesh(work / "world.ply", world, VILLAGE_CLASSES)
+    progress(0.1)
+    schedule = _Schedule.of(config)
+    drive = explore(
+        world,
+        config.num_robots,
+        schedule.num_poses,
+        schedule.pose_period_ns / 1e9,
+        progress=lambda share: progress(0.1 + 0.2 * share),
+    )
+    total = config.num_robots * len(schedule.exposures(0, config.num_robots))
+    num_frames = 0
+    for index, robot_id in enumerate(config.robot_ids):
+        recorder = _Recorder(config, world.terrain, eye, drive, index, schedule)
+        with RobotLogWriter(
+            work / f"{robot_id}.mcap",
+            robot_id,
+            config.camera,
+            VILLAGE_CLASSES,
+            T_body_sensor=T_BODY_CAMERA,
+            start_ns=START_NS,
+        ) as log:
+            for _ in recorder.record(log):
+                num_frames += 1
+                progress(min(1.0, 0.3 + 0.7 * num_frames / total))
+    (work / "team.yaml").write_text(dump_team(_team(work, config), work), encoding="utf-8")
+    return num_frames, num_cells
+
+
+def _team(folder: Path, config: SimulationConfig) -> RunConfig:
+    """The team file's content: every robot with its topics, the classes and the resolution."""
+    robots = []
+    for robot_id in config.robot_ids:
+        depth, labels, camera_info, odometry, label_info = topics(robot_id)
+        robots.append(
+            RobotConfig(
+                robot_id=robot_id,
+                logs=(folder / f"{robot_id}.mcap",),
+                depth_topic=depth,
+                label_topic=labels,
+                camera_info_topic=camera_info,
+                pose_topic=odometry,
+                label_info_topic=label_info,
+            )
+        )
+    return RunConfig(tuple(robots), classes=VILLAGE_CLASSES, map=MapConfig(resolution=config.resolution))
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """When poses and images are taken: whole numbers of nanoseconds, ``stride`` poses per image."""
+
+    pose_period_ns: int
+    stride: int
+    num_poses: int
+
+    @classmethod
+    def of(cls, config: SimulationConfig) -> _Schedule:
+        """About 20 poses a second, and a whole number of them per image."""
+        stride = max(1, round(_ODOMETRY_RATE / config.rate))
+        pose_period_ns = round(1e9 / config.rate / stride)
+        return cls(pose_period_ns, stride, max(2, round(config.duration * 1e9 / pose_period_ns) + 1))
+
+    def exposures(self, robot_index: int, num_robots: int) -> range:
+        """The poses after which a robot takes a picture; robots take theirs at different times, as real cameras do."""
+        return range(robot_index * self.stride // num_robots, self.num_poses - 1, self.stride)
+
+
+class _Recorder:
+    """Records one robot's drive."""
+
+    def __init__(
+        self,
+        config: SimulationConfig,
+        terrain: Terrain,
+        eye: MeshCamera,
+        drive: Exploration,
+        index: int,
+        schedule: _Schedule,
+    ) -> None:
+        self._config = config
+        self._eye = eye
+        self._schedule = schedule
+        self._states = drive.states[index]
+        self._poses = body_poses(terrain, self._states)
+        self._exposures = schedule.exposures(index, config.num_robots)
+        self._rng = np.random.default_rng([config.seed, 2, index])
+
+    def record(self, log: RobotLogWriter) -> Iterator[int]:
+        """Write all poses and images in time order; gives each image's stamp."""
+        period_ns = self._schedule.pose_period_ns
+        for step, (state, T_map_body) in enumerate(zip(self._states, self._poses, strict=True)):
+            stamp_ns = START_NS + step * period_ns
+            following = self._states[min(step + 1, len(self._states) - 1)]
+            speed = float(np.hypot(*(following[:2] - state[:2]))) * 1e9 / period_ns
+            log.write_pose(stamp_ns, T_map_body, speed, float(following[2] - state[2]) * 1e9 / period_ns)
+            if step in self._exposures:
+                # Exposed midway between two poses: whoever reads the log has to interpolate.
+                T_map_camera = midway(T_map_body, self._poses[step + 1]) @ T_BODY_CAMERA
+                self._write_image(log, stamp_ns + period_ns // 2, T_map_camera)
+                yield stamp_ns + period_ns // 2
+
+    def _write_image(self, log: RobotLogWriter, stamp_ns: int, T_map_camera: Float64Array) -> None:
+        """Take one picture and spoil it as a real camera and a real network would."""
+        config = self._config
+        depth, labels = self._eye.take(T_map_camera, config.max_depth)
+        if config.depth_noise:
+            depth = add_depth_noise(depth, self._rng)
+        if config.label_noise > 0:
+            labels = add_label_noise(labels, config.label_noise, VILLAGE_CLASSES.num_classes, self._rng)
+        log.write_frame(stamp_ns, depth_to_millimetres(depth), labels)
+
+
+def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
+    """Poses (T, 4, 4) of a base that stands on the ground at states (T, 3) of x, y and heading."""
+    poses = np.zeros((len(states), 4, 4))
+    up = terrain.normal(states[:, :2])
+    heading = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))], axis=1)
+    left = np.cross(up, heading)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    poses[:, :3, 0] = np.cross(left, up)
+    poses[:, :3, 1] = left
+    poses[:, :3, 2] = up
+    poses[:, :2, 3] = states[:, :2]
+    poses[:, 2, 3] = terrain.height(states[:, :2]) + _BASE_HEIGHT
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
+def midway(T_a: Float64Array, T_b: Float64Array) -> Float64Array:
+    """The pose (4, 4) halfway between two: mean position, and the rotation that slerp gives at one half.
+
+    Halfway, slerp's rotation is the one nearest to the sum of the two matrices; its columns come from an SVD.
+    """
+    middle = np.eye(4)
+    u, _, vt = np.linalg.svd(T_a[:3, :3] + T_b[:3, :3])
+    middle[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    middle[:3, 3] = (T_a[:3, 3] + T_b[:3, 3]) / 2
+    return middle
+
+
+def _camera_mount() -> Float64Array:
+    """From the camera's optical frame to the base: ahead of its middle, on a mast, tilted down a little."""
+    cos, sin = np.cos(_CAMERA_PITCH), np.sin(_CAMERA_PITCH)
+    mount = np.eye(4)
+    mount[:3, :3] = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]) @ OPTICAL_IN_BODY
+    mount[:3, 3] = _CAMERA_POSITION
+    return mount
+
+
+T_BODY_CAMERA = _camera_mount()
+"""(4, 4): where the simulated robots carry their camera."""

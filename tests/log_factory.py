@@ -1,0 +1,263 @@
+"""Messages and small robot logs for the tests of reading, in ROS 2 and ROS 1 types."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from octoreplay.io.mcap_writer import RosMcapWriter
+from octoreplay.io.messages import typestore
+
+SECOND = 1_000_000_000
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+# The rotation from a body (x forward, z up) to an optical frame (z forward, y down), REP 103.
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
+
+
+class Entry(NamedTuple):
+    """One message of a log."""
+
+    topic: str
+    type_name: str
+    value: Any
+    log_time_ns: int
+
+
+class Factory:
+    """Makes messages of ROS 2 or ROS 1."""
+
+    def __init__(self, *, ros1: bool = False) -> None:
+        self.ros1 = ros1
+        self.store = ROS1 if ros1 else typestore()
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        return self.store.types[type_name](**fields)
+
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
+        extra = {"seq": 7} if self.ros1 else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **extra)
+
+    def image(
+        self, stamp_ns: int, pixels: npt.NDArray[Any], encoding: str, *, frame_id: str = "camera", padding: int = 0,
+        big_endian: bool = False,
+    ) -> Any:  # fmt: skip
+        stored = pixels.astype(pixels.dtype.newbyteorder(">" if big_endian else "<"))
+        rows = stored.view(np.uint8).reshape(pixels.shape[0], -1)
+        data = np.pad(rows, ((0, 0), (0, padding)), constant_values=171)
+        return self.make(
+            "sensor_msgs/msg/Image", header=self.header(stamp_ns, frame_id), height=pixels.shape[0],
+            width=pixels.shape[1], encoding=encoding, is_bigendian=int(big_endian), step=data.shape[1],
+            data=data.reshape(-1),
+        )  # fmt: skip
+
+    def camera_info(
+        self, stamp_ns: int, size: tuple[int, int], *, k: Sequence[float] = (50, 0, 5.5, 0, 60, 3.5, 0, 0, 1),
+        d: Sequence[float] = (), model: str = "plumb_bob",
+    ) -> Any:  # fmt: skip
+        matrices = {"d": np.array(d, float), "k": np.array(k, float), "r": np.eye(3).ravel(), "p": np.zeros(12)}
+        if self.ros1:
+            matrices = {name.upper(): value for name, value in matrices.items()}
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return self.make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(stamp_ns, "camera"), height=size[1], width=size[0],
+            distortion_model=model, binning_x=0, binning_y=0, roi=roi, **matrices,
+        )  # fmt: skip
+
+    def pose(self, position: Sequence[float], quaternion: Sequence[float] = IDENTITY) -> Any:
+        return self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, position), strict=True))),
+            orientation=self.make(
+                "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, quaternion), strict=True))
+            ),
+        )
+
+    def odometry(
+        self, stamp_ns: int, position: Sequence[float], quaternion: Sequence[float] = IDENTITY, *,
+        frame_id: str = "map", child: str = "base_link",
+    ) -> Any:  # fmt: skip
+        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        return self.make(
+            "nav_msgs/msg/Odometry",
+            header=self.header(stamp_ns, frame_id),
+            child_frame_id=child,
+            pose=self.make(
+                "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(position, quaternion), covariance=np.zeros(36)
+            ),
+            twist=self.make(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+                covariance=np.zeros(36),
+            ),
+        )
+
+    def pose_stamped(self, stamp_ns: int, position: Sequence[float], *, frame_id: str = "map") -> Any:
+        return self.make(
+            "geometry_msgs/msg/PoseStamped", header=self.header(stamp_ns, frame_id), pose=self.pose(position)
+        )
+
+    def tf(self, *edges: tuple[str, str, int, Sequence[float], Sequence[float]]) -> Any:
+        transforms = []
+        for parent, child, stamp_ns, translation, rotation in edges:
+            value = self.make(
+                "geometry_msgs/msg/Transform",
+                translation=self.make(
+                    "geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, translation), strict=True))
+                ),
+                rotation=self.make(
+                    "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, rotation), strict=True))
+                ),
+            )
+            transforms.append(
+                self.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.header(stamp_ns, parent),
+                    child_frame_id=child,
+                    transform=value,
+                )
+            )
+        return self.make("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+    def label_info(self, stamp_ns: int, names: Mapping[int, str]) -> Any:
+        entries = [
+            self.make("vision_msgs/msg/VisionClass", class_id=raw, class_name=name) for raw, name in names.items()
+        ]
+        return self.make(
+            "vision_msgs/msg/LabelInfo", header=self.header(stamp_ns, "camera"), class_map=entries, threshold=0.0
+        )
+
+    def cloud(
+        self, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], *, frame_id: str = "lidar", gap: int = 0,
+        height: int = 1, row_padding: int = 0, big_endian: bool = False,
+    ) -> Any:  # fmt: skip
+        """A cloud with the columns after ``gap`` unused bytes in every point, and padding after every row."""
+        datatypes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+        order = ">" if big_endian else "<"
+        fields, offset, length = [], gap, len(next(iter(columns.values())))
+        for name, column in columns.items():
+            kind = column.dtype.str[1:]
+            fields.append(
+                self.make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatypes[kind], count=1)
+            )
+            offset += column.dtype.itemsize
+        points = np.zeros(
+            length,
+            dtype=np.dtype(
+                {
+                    "names": list(columns), "formats": [order + c.dtype.str[1:] for c in columns.values()],
+                    "offsets": [f.offset for f in fields], "itemsize": offset,
+                }
+            ),
+        )  # fmt: skip
+        for name, column in columns.items():
+            points[name] = column
+        rows = points.view(np.uint8).reshape(height, -1)
+        data = np.pad(rows, ((0, 0), (0, row_padding)))
+        return self.make(
+            "sensor_msgs/msg/PointCloud2", header=self.header(stamp_ns, frame_id), height=height,
+            width=length // height, fields=fields, is_bigendian=big_endian, point_step=offset,
+            row_step=data.shape[1], data=data.reshape(-1), is_dense=False,
+        )  # fmt: skip
+
+
+ros2 = Factory()
+
+WIDTH, HEIGHT = 12, 8
+NAMES = {1: "ground", 2: "tree", 7: "wall"}
+
+
+def depth_pixels(index: int) -> npt.NDArray[np.uint16]:
+    """The depth image with a number, in millimetres."""
+    return (1000 + 10 * index + np.arange(WIDTH * HEIGHT)).reshape(HEIGHT, WIDTH).astype(np.uint16)
+
+
+def label_pixels(index: int) -> npt.NDArray[np.uint8]:
+    """The label image with a number: the raw labels 1, 2, 7 and 255 in turn."""
+    return np.array([1, 2, 7, 255], np.uint8)[(np.arange(WIDTH * HEIGHT) + index) % 4].reshape(HEIGHT, WIDTH)
+
+
+def robot_entries(
+    *, num_frames: int = 6, period_ns: int = SECOND // 4, start_ns: int = 100 * SECOND, namespace: str = "",
+    labels: bool = True, poses: str = "odometry", factory: Factory = ros2, camera_info: bool = True,
+) -> list[Entry]:  # fmt: skip
+    """The messages of a robot that drives along x at 1 m/s with a camera 0.5 m above its base.
+
+    ``poses`` is 'odometry', 'tf' or 'none'. Frame i is at ``start_ns + i * period_ns``; poses come at twice that rate.
+    """
+    prefix = f"{namespace}/" if namespace else ""
+    camera, base = f"{prefix}camera", f"{prefix}base_link"
+    root = f"/{namespace}" if namespace else ""
+    entries = [
+        Entry(
+            "/tf_static", "tf2_msgs/msg/TFMessage",
+            factory.tf((base, camera, start_ns, (0.0, 0.0, 0.5), OPTICAL)), start_ns,
+        )
+    ]  # fmt: skip
+    if labels and not factory.ros1:
+        entries.append(
+            Entry(f"{root}/label_info", "vision_msgs/msg/LabelInfo", ros2.label_info(start_ns, NAMES), start_ns)
+        )
+    for half in range(2 * num_frames - 1):
+        stamp = start_ns + half * period_ns // 2
+        x = (stamp - start_ns) / SECOND
+        if poses == "odometry":
+            odometry = factory.odometry(stamp, (x, 0, 0), child=base)
+            entries.append(Entry(f"{root}/odom", "nav_msgs/msg/Odometry", odometry, stamp))
+        elif poses == "tf":
+            tf = factory.tf(("map", base, stamp, (x, 0, 0), IDENTITY))
+            entries.append(Entry("/tf", "tf2_msgs/msg/TFMessage", tf, stamp))
+        if half % 2:
+            continue
+        index = half // 2
+        depth = factory.image(stamp, depth_pixels(index), "16UC1", frame_id=camera)
+        entries.append(Entry(f"{root}/camera/depth/image_raw", "sensor_msgs/msg/Image", depth, stamp))
+        if labels:
+            image = factory.image(stamp, label_pixels(index), "mono8", frame_id=camera)
+            entries.append(Entry(f"{root}/camera/labels/image_raw", "sensor_msgs/msg/Image", image, stamp))
+        if camera_info:
+            info = factory.camera_info(stamp, (WIDTH, HEIGHT))
+            entries.append(Entry(f"{root}/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", info, stamp))
+    return entries
+
+
+def write_mcap(path: Path, entries: Iterable[Entry], *, chunk_size: int = 1 << 20) -> Path:
+    """Write messages with the project's own writer."""
+    with RosMcapWriter(path, chunk_size=chunk_size) as writer:
+        for entry in entries:
+            writer.write(entry.topic, entry.type_name, entry.value, entry.log_time_ns)
+    return path
+
+
+def write_bag(path: Path, entries: Iterable[Entry]) -> Path:
+    """Write ROS 1 messages as a bag, with rosbags."""
+    with Rosbag1Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_name, value, log_time_ns in entries:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=ROS1)
+            writer.write(connections[topic], log_time_ns, ROS1.serialize_ros1(value, type_name))
+    return path
+
+
+def write_rosbag2(path: Path, entries: Iterable[Entry], *, storage: str = "sqlite3") -> Path:
+    """Write ROS 2 messages as a rosbag2 folder, with rosbags."""
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Rosbag2Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_name, value, log_time_ns in entries:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=typestore())
+            writer.write(connections[topic], log_time_ns, typestore().serialize_cdr(value, type_name))
+    return path

@@ -1,0 +1,93 @@
+"""Another implementation's map against the twin's, cell by cell and both ways; and how many leaves a lossless octree
+has for given cells."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoreplay.records import Float64Array, Int64Array, LeafTable
+from reference.twin import TwinTick
+
+Key = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class MapDifference:
+    """``max_abs``: the largest |log-odds difference| over the twin's cells, unknown cells counted as the prior.
+
+    ``missing``: cells that the twin's robot knows and the leaves do not hold; ``spurious``: the reverse, cells that no
+    scan ever touched included; ``overlapping``: cells that more than one leaf holds. ``worst_key`` is where max_abs is.
+    """
+
+    max_abs: float
+    missing: int
+    spurious: int
+    overlapping: int
+    worst_key: Key
+
+
+def compare_map(keys: Int64Array, tick: TwinTick, robot: int, leaves: LeafTable, resolution: float) -> MapDifference:
+    """How one robot's leaves (log-odds with the prior) differ from the twin's map over ``recording.keys``."""
+    leaf_keys, leaf_log_odds = expand_leaves(leaves, resolution)
+    row_of = {key: row for row, key in enumerate(map(tuple, leaf_keys.tolist()))}
+    rows = np.array([row_of.get(key, -1) for key in map(tuple, keys.tolist())], dtype=np.int64)
+    held = rows >= 0
+    theirs = np.full((len(keys), tick.maps.shape[2] - 1), tick.prior)
+    theirs[held] = leaf_log_odds[rows[held]]
+    difference = np.abs(theirs - tick.log_odds(robot)).max(axis=1, initial=0.0)
+    worst = int(difference.argmax())
+    known = tick.known[robot]
+    x, y, z = keys[worst].tolist()
+    return MapDifference(
+        max_abs=float(difference[worst]),
+        missing=int((known & ~held).sum()),
+        spurious=int((held & ~known).sum()) + len(row_of) - int(held.sum()),
+        overlapping=len(leaf_keys) - len(row_of),
+        worst_key=(x, y, z),
+    )
+
+
+def expand_leaves(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Float64Array]:
+    """The finest cells (X, 3) that the leaves cover, and the log-odds (X, C) of each."""
+    cells = np.rint(leaves.sizes / resolution).astype(np.int64)
+    if not np.allclose(cells * resolution, leaves.sizes, rtol=1e-6, atol=0.0):
+        raise AssertionError("a leaf's size is no whole number of cells")
+    first = np.rint((leaves.centers - leaves.sizes[:, None] / 2) / resolution).astype(np.int64)
+    keys, rows = [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for edge in np.unique(cells):
+        of_size = np.flatnonzero(cells == edge)
+        offsets = np.array(list(itertools.product(range(edge), repeat=3)), dtype=np.int64)
+        keys.append((first[of_size, None, :] + offsets[None, :, :]).reshape(-1, 3))
+        rows.append(np.repeat(of_size, len(offsets)))
+    return np.concatenate(keys), leaves.log_odds[np.concatenate(rows)].astype(np.float64)
+
+
+def num_lossless_leaves(keys: Int64Array, values: Float64Array, max_levels: int = 20) -> int:
+    """Leaves of the octree in which eight sibling leaves with bit-equal values (M, C) are one leaf, level by level.
+
+    Siblings of level l are the cells whose keys agree after floor division by 2^l; unknown cells are in no leaf.
+    """
+    level: dict[Key, bytes] = {
+        (key[0], key[1], key[2]): row.tobytes()
+        for key, row in zip(keys.tolist(), np.ascontiguousarray(values), strict=True)
+    }
+    num_leaves = 0
+    for _ in range(max_levels):
+        parents: dict[Key, list[bytes]] = {}
+        for (x, y, z), value in level.items():
+            parents.setdefault((x // 2, y // 2, z // 2), []).append(value)
+        merged = dict(_merged(parents))
+        num_leaves += len(level) - 8 * len(merged)
+        level = merged
+    return num_leaves + len(level)
+
+
+def _merged(parents: dict[Key, list[bytes]]) -> Iterator[tuple[Key, bytes]]:
+    """The parents whose eight children are all leaves with equal values."""
+    for key, children in parents.items():
+        if len(children) == 8 and len(set(children)) == 1:
+            yield key, children[0]

@@ -1,0 +1,58 @@
+"""One robot's own evidence: the sums of its scans' log-odds increments, and the three readings of log q."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoreplay.config import SensorConfig
+from octoreplay.records import Float64Array, Int64Array
+
+
+@dataclass(frozen=True, eq=False)
+class IndexedScan:
+    """One scan as indices into the team's list of cells; ``hit_classes`` are 1..C."""
+
+    robot: int
+    stamp_ns: int
+    freed: Int64Array
+    hit: Int64Array
+    hit_classes: Int64Array
+
+
+class Evidence:
+    """The clamped and the unclamped sum of one robot's increments, (M, K) with column 0 zero, and what was counted."""
+
+    def __init__(self, num_cells: int, num_classes: int) -> None:
+        self.clamped: Float64Array = np.zeros((num_cells, num_classes + 1))
+        self.total: Float64Array = np.zeros((num_cells, num_classes + 1))
+        self.num_touching_scans: Int64Array = np.zeros(num_cells, dtype=np.int64)
+        self.num_scans = 0
+
+    def integrate(self, scan: IndexedScan, sensor: SensorConfig) -> None:
+        """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells."""
+        for cells, increments in self._increments(scan, sensor):
+            self.total[cells] += increments
+            self.clamped[cells] = np.clip(self.clamped[cells] + increments, sensor.clamp_min, sensor.clamp_max)
+            self.num_touching_scans[cells] += 1
+        self.num_scans += 1
+
+    def _increments(self, scan: IndexedScan, sensor: SensorConfig) -> Iterator[tuple[Int64Array, Float64Array]]:
+        """(cells, increments (., K)) of the freed and of the hit cells; a cell is in one of them, once."""
+        num_columns = self.clamped.shape[1]
+        freed = np.full((len(scan.freed), num_columns), sensor.miss)
+        hit = np.full((len(scan.hit), num_columns), sensor.miss if sensor.hit_other is None else sensor.hit_other)
+        hit[np.arange(len(scan.hit)), scan.hit_classes] = sensor.hit
+        for cells, increments in ((scan.freed, freed), (scan.hit, hit)):
+            increments[:, 0] = 0.0
+            yield cells, increments
+
+    def log_likelihood(self, reading: str) -> Float64Array:
+        """log q (M, K), as a deviation from the prior: 'sum', 'time-average' or 'cell-average'."""
+        if reading == "sum":
+            return self.clamped.copy()
+        if reading == "time-average":
+            return self.total / max(self.num_scans, 1)
+        return self.total / np.maximum(self.num_touching_scans, 1)[:, None]

@@ -1,0 +1,156 @@
+"""The inverse sensor model of one scan: which cells it frees, which it hits, and with which class.
+
+OctoMap's rule holds: one update per cell and scan, and a cell that is hit is not freed as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.records import NO_CLASS, BoolArray, CloudFrame, DepthFrame, Float64Array, Frame, Int64Array
+from reference.rays import Key, cells_before_end, coord_to_key, key_to_coord
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What one scan measured, one row per ray.
+
+    ``ends`` is (P, 3) float64, team frame [m]: the measured point, or the cut end of a ray beyond max_range.
+    ``class_ids`` is (P,): 1..C for a point that hits its cell, NO_CLASS for one that only frees its ray (an ignored
+    label, a cut ray, 'no return').
+    """
+
+    origin: Float64Array
+    ends: Float64Array
+    class_ids: Int64Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScanUpdate:
+    """The cells that one scan touches, each once: ``freed`` (F, 3), ``hit`` (H, 3), and the class of each hit (H,)."""
+
+    freed: Int64Array
+    hit: Int64Array
+    hit_classes: Int64Array
+
+
+def scan_update(frame: Frame, sensor: SensorConfig, region: MapConfig) -> ScanUpdate:
+    """The cells that a scan frees and hits; cells whose centre is outside the mapped region are left out."""
+    measured = measurements(frame, sensor)
+    hit = hit_cells(measured, region.resolution)
+    passed = passed_cells(measured, sensor.rays, region.resolution)
+    hit = {key: class_id for key, class_id in hit.items() if in_region(key, region)}
+    freed = sorted(key for key in passed if key not in hit and in_region(key, region))
+    return ScanUpdate(
+        freed=np.array(freed, dtype=np.int64).reshape(-1, 3),
+        hit=np.array(sorted(hit), dtype=np.int64).reshape(-1, 3),
+        hit_classes=np.array([hit[key] for key in sorted(hit)], dtype=np.int64),
+    )
+
+
+def in_region(key: Key, region: MapConfig) -> bool:
+    """True when the cell's centre lies in the mapped region [min, max)."""
+    box = region.box
+    centre = key_to_coord(key, region.resolution)
+    return all(box[axis] <= centre[axis] < box[axis + 3] for axis in range(3))
+
+
+def hit_cells(measured: Measurements, resolution: float) -> dict[Key, int]:
+    """The class of every end cell with a labelled point: the one with the most points, ties to the lower id."""
+    votes: dict[Key, dict[int, int]] = {}
+    for end, class_id in zip(measured.ends, measured.class_ids, strict=True):
+        if class_id != NO_CLASS:
+            counts = votes.setdefault(coord_to_key(end, resolution), {})
+            counts[int(class_id)] = counts.get(int(class_id), 0) + 1
+    return {key: min(counts, key=lambda c: (-counts[c], c)) for key, counts in votes.items()}
+
+
+def passed_cells(measured: Measurements, rays: str, resolution: float) -> set[Key]:
+    """Every cell that any ray passes before its end cell.
+
+    ``rays`` 'cells': one ray per distinct end cell (of hits, ignored points and cut rays alike) to the cell's centre.
+    'all': one ray per measured point, to the point itself or to the exact cut end.
+    """
+    origin = measured.origin.tolist()
+    passed: set[Key] = set()
+    end_keys = [coord_to_key(end, resolution) for end in measured.ends]
+    if rays == "cells":
+        for key in set(end_keys):
+            passed.update(cells_before_end(origin, key_to_coord(key, resolution), key, resolution))
+    else:
+        for key, end in zip(end_keys, measured.ends, strict=True):
+            passed.update(cells_before_end(origin, end.tolist(), key, resolution))
+    return passed
+
+
+def measurements(frame: Frame, sensor: SensorConfig) -> Measurements:
+    """The rays of one scan that carry information, in the team's frame."""
+    if isinstance(frame, DepthFrame):
+        points, class_ids, no_return = _depth_points(frame, sensor)
+    else:
+        points, class_ids, no_return = _cloud_points(frame)
+    distance = np.sqrt((points**2).sum(axis=1))
+    used = no_return | ((distance >= sensor.min_range) & (distance > 0))
+    points, class_ids, distance, no_return = points[used], class_ids[used], distance[used], no_return[used]
+    cut = no_return | (distance > sensor.max_range)
+    points[cut] *= (sensor.max_range / distance[cut])[:, None]
+    class_ids[cut] = NO_CLASS
+    rotation, origin = frame.T_team_sensor[:3, :3], frame.T_team_sensor[:3, 3]
+    return Measurements(origin.astype(np.float64), points @ rotation.T + origin, class_ids)
+
+
+def _depth_points(frame: DepthFrame, sensor: SensorConfig) -> tuple[Float64Array, Int64Array, BoolArray]:
+    """Points (P, 3) in the sensor's frame, classes and the 'no return' mask of a depth image's usable pixels.
+
+    A pixel without return stands for the point of its ray at depth 1 m; only its direction is used.
+    """
+    image, camera = frame.depth_image, frame.camera
+    no_return = _equals_any(image, sensor.no_return_depth)
+    measured = ~no_return & ~_without_information(image, sensor.invalid_depth)
+    depth = image.astype(np.float64) * frame.depth_unit
+    depth[no_return] = 1.0
+    v, u = np.nonzero(measured | no_return)
+    z = depth[v, u]
+    points = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
+    classes = np.ones(image.shape, dtype=np.int64) if frame.class_image is None else frame.class_image
+    return points, classes[v, u].astype(np.int64), no_return[v, u]
+
+
+def _without_information(image: npt.NDArray[Any], invalid_depth: tuple[float, ...]) -> BoolArray:
+    """True for depths that are 0, negative, not finite, the largest value of an integer type, or named invalid."""
+    if np.issubdtype(image.dtype, np.integer):
+        by_type = (image <= 0) | (image == np.iinfo(image.dtype).max)
+    else:
+        by_type = ~np.isfinite(image) | ~(image > 0)
+    without: BoolArray = by_type | _equals_any(image, invalid_depth)
+    return without
+
+
+def _equals_any(image: npt.NDArray[Any], values: tuple[float, ...]) -> BoolArray:
+    """True where the raw depth is one of ``values``, as the image's own type stores them; NaN equals NaN."""
+    found = np.zeros(image.shape, dtype=bool)
+    for value in values:
+        if np.issubdtype(image.dtype, np.integer):
+            found |= image == value
+        elif math.isnan(value):
+            found |= np.isnan(image)
+        else:
+            found |= image == image.dtype.type(value)
+    return found
+
+
+def _cloud_points(frame: CloudFrame) -> tuple[Float64Array, Int64Array, BoolArray]:
+    """The finite points of a cloud, their classes, and a 'no return' mask that is False."""
+    finite = np.isfinite(frame.points).all(axis=1)
+    points = frame.points[finite].astype(np.float64)
+    if frame.class_ids is None:
+        class_ids = np.ones(len(points), dtype=np.int64)
+    else:
+        class_ids = frame.class_ids[finite].astype(np.int64)
+    return points, class_ids, np.zeros(len(points), dtype=bool)

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ALLOWED = {"octoreplay.config", "octoreplay.errors", "octoreplay.records"}
+MODULES = sorted(path for path in Path(__file__).parent.glob("*.py") if not path.name.startswith("test_"))
+
+
+def _imports(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide where they lead"
+            yield node.module
+            if node.module == "octoreplay":
+                yield from (f"octoreplay.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.name)
+def test_the_judge_shares_no_code_with_what_it_judges(path):
+    imported = list(_imports(path))
+    assert imported
+    ours = {name for name in imported if name.split(".")[0] == "octoreplay"}
+    assert ours <= ALLOWED
+    others = {name.split(".")[0] for name in imported} - {"octoreplay", "reference", "numpy"}
+    assert others <= {"__future__", "collections", "dataclasses", "itertools", "math", "pathlib", "typing"}

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+import leaf_list
+from octoreplay.config import PALETTE
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.result_writer import ResultWriter
+from octoreplay.records import LeafTable
+from octoreplay.report.export import FREE_COLOR, export_ply
+from result_factory import leaf_table, state, write_result
+
+LEAVES = leaf_table()
+DARK, YELLOW = [68, 1, 84], [253, 231, 37]
+
+
+def fill(writer: ResultWriter) -> None:
+    """Alpha knows all four leaves; beta the first, with other log-odds, and a place of its own."""
+    other = LeafTable(
+        np.array([[0.1, 0.1, 0.1], [3.1, 3.1, 3.1]]),
+        np.array([0.2, 0.2]),
+        np.array([[2.0, 5.0], [4.0, 0.0]], dtype=np.float32),
+    )
+    first = LeafTable(LEAVES.centers[:1], LEAVES.sizes[:1], LEAVES.log_odds[:1])
+    rest = LeafTable(LEAVES.centers[1:], LEAVES.sizes[1:], LEAVES.log_odds[1:])
+    writer.write_state(state("alpha", 0, 1, leaf_list.encode(first), key=True))
+    writer.write_state(state("beta", 0, 1, leaf_list.encode(other), key=True))
+    writer.write_state(state("alpha", 1, 3, leaf_list.encode(rest)))
+
+
+@pytest.fixture
+def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    leaf_list.install(monkeypatch)
+    return write_result(tmp_path, fill)
+
+
+def exported(result: Path, **options: object) -> tuple[list[list[float]], list[list[int]], PlyData]:
+    """Positions and colours of the points, and the whole file."""
+    path = result.with_name("map.ply")
+    count = export_ply(result, path, **options)
+    data = PlyData.read(path)
+    vertices = data["vertex"]
+    assert count == len(vertices.data)
+    positions = np.column_stack([vertices[name] for name in "xyz"]).astype(np.float64).round(5).tolist()
+    return positions, np.column_stack([vertices[name] for name in ("red", "green", "blue")]).tolist(), data
+
+
+def test_labels_have_the_classes_colours(result: Path) -> None:
+    positions, colors, data = exported(result)
+    np.testing.assert_allclose(positions, LEAVES.centers[:3], atol=1e-5)
+    assert colors == [[10, 20, 30], [1, 2, 250], [10, 20, 30]]
+    assert data["vertex"]["label"].tolist() == [1, 2, 1]
+
+
+def test_free_leaves_come_only_when_asked_for(result: Path) -> None:
+    positions, colors, data = exported(result, free=True)
+    assert len(positions) == 4
+    assert colors[3] == list(FREE_COLOR)
+    assert data["vertex"]["label"].tolist() == [1, 2, 1, 0]
+
+
+def test_the_comments_say_what_was_chosen(result: Path) -> None:
+    comments = exported(result, robot="beta", team_posterior=True)[2].comments
+    assert "octoreplay map of beta at tick 1, 1 s after the start" in comments
+    assert "resolution 0.2 m, N = 2 robots, log-odds: team posterior h_0 + N (h - h_0)" in comments
+    assert "classes: 0 free, 1 ground, 2 tree" in comments
+    assert "log-odds: the robot's own h" in exported(result)[2].comments[1]
+
+
+def test_the_team_posterior_is_surer(result: Path) -> None:
+    own = exported(result)[2]["vertex"]["probability"]
+    whole = exported(result, team_posterior=True)[2]["vertex"]["probability"]
+    odds = np.exp(2 * LEAVES.log_odds[0])
+    assert whole[0] == pytest.approx(odds[0] / (1 + odds.sum()), rel=1e-5)
+    assert (whole > own).all()
+
+
+def test_an_earlier_map_can_be_written(result: Path) -> None:
+    assert len(exported(result, at=2.5)[0]) == 1
+    with pytest.raises(InputError, match="no map of robot 'alpha' is stored up to"):
+        export_ply(result, result.with_name("map.ply"), at=0.5)
+
+
+def test_probability_runs_from_a_guess_to_certainty(result: Path) -> None:
+    _, colors, data = exported(result, color="probability")
+    order = np.argsort(data["vertex"]["probability"])
+    # The ramp's green rises all the way.
+    green = [colors[index][1] for index in order]
+    assert green == sorted(green)
+    assert "dark 0.333, yellow 1" in data.comments[-1]
+
+
+def test_disagreement_is_the_distance_to_the_other_robots(result: Path) -> None:
+    _, colors, data = exported(result, color="disagreement")
+    distances = [4.0, np.sqrt(10), np.hypot(0.5, 0.25)]
+    assert data.comments[-1] == "color: disagreement (dark 0, yellow 4)"
+    assert colors[0] == YELLOW
+    assert np.argsort([color[1] for color in colors]).tolist() == np.argsort(distances).tolist()
+    assert colors[2] != DARK
+
+
+def test_a_team_of_equal_maps_has_no_disagreement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leaf_list.install(monkeypatch)
+
+    def equal(writer: ResultWriter) -> None:
+        for robot_id in ("alpha", "beta"):
+            writer.write_state(state(robot_id, 0, 1, leaf_list.encode(LEAVES), key=True))
+
+    assert exported(write_result(tmp_path, equal), color="disagreement")[1] == [DARK] * 3
+
+
+def test_robots_colours_mix_where_both_know_a_place(result: Path) -> None:
+    positions, colors, data = exported(result, color="robot")
+    first, second = np.array(PALETTE[0]), np.array(PALETTE[1])
+    found = {tuple(position): color for position, color in zip(positions, colors, strict=True)}
+    assert found == {
+        (0.1, 0.1, 0.1): ((first + second) / 2 + 0.5).astype(int).tolist(),
+        (0.6, 0.2, 0.2): first.tolist(),
+        (1.1, 0.1, 0.3): first.tolist(),
+        (3.1, 3.1, 3.1): second.tolist(),
+    }
+    assert "octoreplay map of alpha, beta" in data.comments[0]
+    assert len(exported(result, color="robot", robot="beta")[0]) == 2
+
+
+def test_voxels_are_cubes(result: Path) -> None:
+    path = result.with_name("cubes.ply")
+    assert export_ply(result, path, what="voxels") == 3
+    data = PlyData.read(path)
+    assert (data["vertex"].count, data["face"].count) == (24, 36)
+
+
+@pytest.mark.parametrize("options", [{"what": "mesh"}, {"color": "height"}])
+def test_other_choices_are_refused(result: Path, options: dict[str, str]) -> None:
+    with pytest.raises(ConfigError, match="is not one of"):
+        export_ply(result, result.with_name("map.ply"), **options)

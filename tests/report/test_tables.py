@@ -1,0 +1,145 @@
+import dataclasses
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import RenderableType
+
+from octoreplay.config import RobotConfig
+from octoreplay.io.discover import LogDescription, LogSummary, RobotSummary, TopicSummary
+from octoreplay.records import RobotMetrics
+from octoreplay.report import tables
+from octoreplay.result import PointQuery
+from result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
+
+
+def rendered(*parts: RenderableType, width: int = 80) -> str:
+    text = io.StringIO()
+    tables.show(tables.terminal(file=text, width=width), *parts)
+    lines = [line.rstrip() for line in text.getvalue().splitlines()]
+    assert all(len(line) <= width for line in lines)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (1234567.8, "1,234,568"), (0.12345, "0.123"), (1e-9, "1e-09"), (999.6, "1,000"), (math.nan, "-"),
+     (1e12, "1e+12"), (12.34, "12.3")],
+)  # fmt: skip
+def test_numbers_are_short(value: float, text: str) -> None:
+    assert tables.number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1 kB"), (35213, "35.2 kB"), (999_600, "1 MB"), (12_345_678, "12.3 MB"),
+     (5e9, "5 GB"), (math.nan, "-")],
+)  # fmt: skip
+def test_sizes_have_units(value: float, text: str) -> None:
+    assert tables.size(value) == text
+
+
+def test_durations_and_times() -> None:
+    assert tables.seconds(119.9) == "119.9 s"
+    assert tables.seconds(119.96) == "2 min 00 s"
+    assert tables.seconds(3 * 60 + 7.2) == "3 min 07 s"
+    assert tables.seconds(179.7) == "3 min 00 s"
+    assert tables.instant(START) == "2023-11-14T22:13:20Z"
+    assert tables.instant(12_500_000_000) == "12.500 s"
+
+
+def test_results_show_the_team_the_robots_and_the_frames() -> None:
+    text = rendered(tables.results(summary([tick_metrics(1), tick_metrics(2, settling=True)])))
+    assert "12.5 s" in text
+    assert "3.2 s (3.8 times real time)" in text
+    assert "1, and 1 to settle" in text
+    assert "it was over" in text
+    assert "90.00 % of all cells, 79.67 % of occupied cells" in text
+    assert "6 kB as uniform grid (sent: 2.51 % of it)" in text
+    assert "alpha" in text
+    assert "no pose" in text
+    assert "no label" not in text
+
+
+def test_results_fit_a_large_team_and_say_nothing_of_an_unknown_wall_time() -> None:
+    names = [f"a_long_robot_name_{index}" for index in range(12)]
+    robot = tick_metrics(500).robots[0]
+    big = {"num_leaves": 1_234_567, "observed_volume": 123_456.0, "agreement": 1.0, "agreement_occupied": 1.0}
+    robots: tuple[RobotMetrics, ...] = tuple(dataclasses.replace(robot, robot_id=name, **big) for name in names)
+    last = dataclasses.replace(tick_metrics(500), robots=robots)
+    text = rendered(tables.results(dataclasses.replace(summary([last]), wall_seconds=math.nan)), width=100)
+    assert "wall time" not in text
+    assert all(name in text for name in names)
+
+
+def test_a_share_of_nothing_is_a_dash() -> None:
+    last = tick_metrics(1)
+    robots = tuple(dataclasses.replace(robot, agreement=math.nan, agreement_occupied=math.nan) for robot in last.robots)
+    text = rendered(tables.results(summary([dataclasses.replace(last, robots=robots)])))
+    assert "- of all cells, - of occupied cells" in text
+
+
+def test_what_was_chosen_is_shown(tmp_path: Path) -> None:
+    config = team(tmp_path)
+    text = rendered(tables.chosen_inputs(config), tables.class_list(CLASSES))
+    assert "alpha.bag" in text
+    assert "depth         /depth" in text
+    assert "\u25a0 ground  \u25a0 tree" in text
+
+
+def test_points_are_answered_with_runners_up() -> None:
+    answer = PointQuery(
+        log_odds=np.array([[3.0, 1.0], [0.0, 0.0]], dtype=np.float32),
+        probabilities=np.array([[0.042, 0.844, 0.114], [1 / 3, 1 / 3, 1 / 3]], dtype=np.float32),
+        labels=np.array([1, 0], dtype=np.uint8),
+        known=np.array([True, False]),
+        sizes=np.array([0.4, 0.0]),
+    )
+    lines = rendered(
+        tables.point_answers(("free", "ground", "tree"), [(1.0, 2.5, -3.0), (9, 9, 9)], answer)
+    ).splitlines()
+    assert "1, 2.5, -3" in lines[2]
+    assert "ground    84.40 %  tree 11.40 %, free 4.20 %  0.4 m" in lines[2]
+    assert lines[3].split() == ["9,", "9,", "9", "unknown"]
+
+
+def test_a_box_is_answered_with_volumes() -> None:
+    text = rendered(tables.box_answer(("free", "ground", "tree"), leaf_table()))
+    rows = {line.split()[0]: line.split()[1:3] for line in text.splitlines()[2:]}
+    assert rows == {"free": ["1", "0.008"], "ground": ["2", "0.016"], "tree": ["1", "0.064"]}
+
+
+def test_logs_are_described_with_what_is_missing() -> None:
+    topics = (
+        TopicSummary("/camera/depth", "sensor_msgs/msg/Image", "cdr", 1200, 29.97, "16UC1 640x480"),
+        TopicSummary("/status", "acme_msgs/msg/Status", "protobuf", 1, None, ""),
+    )
+    log = LogSummary(Path("robot.mcap"), START, START + 40 * SECOND, 1201, topics, "it ends in the middle of a chunk")
+    robot = RobotConfig("robot", (Path("robot.mcap"),), depth_topic="/camera/depth")
+    found = RobotSummary(robot, START, START + 40 * SECOND, ("no pose",))
+    text = rendered(
+        tables.description(LogDescription((log,), (found,), (START, START + SECOND), CLASSES, ("a table",)))
+    )
+    assert "2023-11-14T22:13:20Z, 40.0 s, 1,201 messages" in text
+    assert "/camera/depth  sensor_msgs/Image" in text
+    assert "30 Hz" in text
+    assert "acme_msgs/Status (protobuf)" in text
+    assert "damaged: it ends in the middle of a chunk" in text
+    assert "missing for a run: robot: no pose" in text
+    assert "missing for a run: a table" in text
+    assert "nothing is missing" not in text
+
+
+def test_an_empty_log_is_described_too() -> None:
+    log = LogSummary(Path("robot.mcap"), None, None, 0, (), None)
+    text = rendered(tables.description(LogDescription((log,), (), None, None, ())))
+    assert "robot.mcap\nempty, 0 messages" in text
+
+
+def test_brackets_in_names_are_no_styles() -> None:
+    robot = RobotConfig("r[bold]1", (Path("a[red].mcap"),), depth_topic="/[/]depth")
+    text = rendered(tables.description(LogDescription((), (RobotSummary(robot, 0, 1, ()),), None, None, ())))
+    assert "r[bold]1" in text
+    assert "/[/]depth" in text

@@ -1,0 +1,302 @@
+"""A simulated team on disk: its logs, its team file and its ground truth, judged from what the files say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation, Slerp
+
+from fixtures.make_fixtures import FIXTURES
+from octoreplay.config import load_team_file
+from octoreplay.errors import ConfigError, OutputError
+from octoreplay.simulate import team
+from octoreplay.simulate.team import START_NS, SimulationConfig, midway, simulate_team
+from octoreplay.simulate.world import VILLAGE_CLASSES, make_village
+from stored_messages import matrix, pixels, read_messages, stamp_ns
+
+COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
+SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)
+EXACT = SimulationConfig(
+    num_robots=2, duration=6.0, rate=2.0, image=(80, 60), seed=6, world_size=24.0, label_noise=0.0, depth_noise=False
+)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("small") / "team"
+    simulate_team(folder, SMALL)
+    return folder
+
+
+def camera_pose(messages, robot_id: str, stamp: int) -> np.ndarray:
+    """The camera's pose in the map, interpolated as a reader of the log would."""
+    stamps = np.array([t for t, _ in messages[f"/{robot_id}/odom"]])
+    k = int(np.searchsorted(stamps, stamp, side="right")) - 1
+    first, second = (messages[f"/{robot_id}/odom"][i][1].pose.pose for i in (k, k + 1))
+    a, b = matrix(first.position, first.orientation), matrix(second.position, second.orientation)
+    share = (stamp - stamps[k]) / (stamps[k + 1] - stamps[k])
+    T = np.eye(4)
+    T[:3, :3] = Slerp([0, 1], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))(share).as_matrix()
+    T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    [(_, static)] = messages["/tf_static"]
+    mount = static.transforms[0].transform
+    return T @ matrix(mount.translation, mount.rotation)
+
+
+def measured_points(messages, robot_id: str, max_range: float = 10.0):
+    """World points (P, 3) and raw labels (P,) of every frame within a range."""
+    labels = dict(messages[f"/{robot_id}/camera/labels/image_raw"])
+    info = messages[f"/{robot_id}/camera/depth/camera_info"][0][1]
+    for stamp, image in messages[f"/{robot_id}/camera/depth/image_raw"]:
+        depth = pixels(image) / 1000.0
+        v, u = np.nonzero(depth)
+        z = depth[v, u]
+        points = np.stack([(u - info.k[2]) / info.k[0] * z, (v - info.k[5]) / info.k[4] * z, z], axis=1)
+        near = np.linalg.norm(points, axis=1) < max_range
+        T = camera_pose(messages, robot_id, stamp)
+        yield points[near] @ T[:3, :3].T + T[:3, 3], pixels(labels[stamp])[v, u][near]
+
+
+def truth_of(folder: Path) -> tuple[dict[tuple[int, ...], int], float]:
+    with np.load(folder / "world.npz") as archive:
+        keys, class_ids, resolution = archive["keys"].tolist(), archive["class_ids"].tolist(), archive["resolution"]
+    return dict(zip(map(tuple, keys), class_ids, strict=True)), float(resolution)
+
+
+def test_the_folder_holds_what_is_promised(small):
+    names = sorted(path.name for path in small.iterdir())
+    assert names == ["husky_1.mcap", "husky_2.mcap", "team.yaml", "world.npz", "world.ply"]
+
+
+def test_rosbags_reads_the_logs(small):
+    with AnyReader([small / "husky_2.mcap"]) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+    frames = 15
+    assert counts == {
+        "/husky_2/camera/depth/image_raw": frames,
+        "/husky_2/camera/depth/camera_info": frames,
+        "/husky_2/camera/labels/image_raw": frames,
+        "/husky_2/labels/label_info": 1,
+        "/husky_2/odom": 61,
+        "/tf": 61,
+        "/tf_static": 1,
+    }
+
+
+def test_the_team_file_is_read_back_and_moves_with_its_folder(small):
+    config = load_team_file(small / "team.yaml")
+    assert [robot.robot_id for robot in config.robots] == ["husky_1", "husky_2"]
+    assert [robot.logs for robot in config.robots] == [(small / f"husky_{k}.mcap",) for k in (1, 2)]
+    assert config.classes == VILLAGE_CLASSES
+    assert config.map.resolution == 0.3
+    assert str(small) not in (small / "team.yaml").read_text()
+    for robot in config.robots:
+        topics = read_messages(robot.logs[0])
+        named = (
+            robot.depth_topic,
+            robot.label_topic,
+            robot.camera_info_topic,
+            robot.pose_topic,
+            robot.label_info_topic,
+        )
+        assert all(topic in topics for topic in named)
+
+
+def test_stamps_are_fixed_ordered_and_paired(small):
+    messages = read_messages(small / "husky_1.mcap")
+    odometry = [stamp_ns(m) for _, m in messages["/husky_1/odom"]]
+    assert odometry[0] == START_NS
+    assert set(np.diff(odometry)) == {50_000_000}
+    depth = [stamp_ns(m) for _, m in messages["/husky_1/camera/depth/image_raw"]]
+    assert depth == [stamp_ns(m) for _, m in messages["/husky_1/camera/labels/image_raw"]]
+    assert set(np.diff(depth)) == {200_000_000}
+    assert odometry[0] < depth[0] < depth[-1] < odometry[-1]
+    # Never at a pose's own stamp: the poses have to be interpolated.
+    assert not set(depth) & set(odometry)
+    for found in messages.values():
+        assert all(t == stamp_ns(m) for t, m in found if hasattr(m, "header"))
+
+
+def test_robots_take_pictures_at_different_times(small):
+    stamps = [
+        {stamp_ns(m) for _, m in read_messages(small / f"{r}.mcap")[f"/{r}/camera/depth/image_raw"]}
+        for r in ("husky_1", "husky_2")
+    ]
+    assert not stamps[0] & stamps[1]
+
+
+def test_odometry_and_tf_tell_the_same_poses_and_the_twist_is_their_change(small):
+    messages = read_messages(small / "husky_1.mcap")
+    poses = []
+    for (_, odometry), (_, tf) in zip(messages["/husky_1/odom"], messages["/tf"], strict=True):
+        pose, transform = odometry.pose.pose, tf.transforms[0].transform
+        poses.append(matrix(pose.position, pose.orientation))
+        np.testing.assert_array_equal(poses[-1], matrix(transform.translation, transform.rotation))
+    speeds = np.array([m.twist.twist.linear.x for _, m in messages["/husky_1/odom"]])
+    moved = np.linalg.norm(np.diff([T[:2, 3] for T in poses], axis=0), axis=1)
+    np.testing.assert_allclose(speeds[:-1] * 0.05, moved, atol=1e-9)
+    assert speeds.max() > 0.5
+
+
+def test_robots_stand_on_the_ground(small):
+    terrain = make_village(SMALL.world_size, SMALL.seed).terrain
+    for _, odometry in read_messages(small / "husky_1.mcap")["/husky_1/odom"]:
+        T = matrix(odometry.pose.pose.position, odometry.pose.pose.orientation)
+        assert T[2, 3] == pytest.approx(terrain.height(T[:2, 3]) + 0.13, abs=1e-9)
+        np.testing.assert_allclose(T[:3, 2], terrain.normal(T[:2, 3]), atol=1e-9)
+
+
+def test_exact_pictures_put_the_world_where_the_ground_truth_has_it(tmp_path):
+    simulate_team(tmp_path / "team", EXACT)
+    truth, resolution = truth_of(tmp_path / "team")
+    total = known = agreed = 0
+    for robot_id in EXACT.robot_ids:
+        for points, labels in measured_points(read_messages(tmp_path / "team" / f"{robot_id}.mcap"), robot_id):
+            keys = np.floor(points / resolution).astype(int).tolist()
+            found = np.array([truth.get(tuple(key), 0) for key in keys])
+            total += len(found)
+            known += int((found > 0).sum())
+            agreed += int((found == labels).sum())
+    assert total > 20_000
+    # Pixels at a cell's edge fall to the other side by the rounding to millimetres.
+    assert known / total > 0.99
+    assert agreed / known > 0.95
+
+
+def test_noisy_labels_are_wrong_as_often_as_asked(small, tmp_path):
+    clean_folder = tmp_path / "clean"
+    simulate_team(clean_folder, SimulationConfig(**{**vars(SMALL), "label_noise": 0.0}))
+    topic = "/husky_1/camera/labels/image_raw"
+    noisy, clean = (
+        np.stack([pixels(m) for _, m in read_messages(folder / "husky_1.mcap")[topic]])
+        for folder in (small, clean_folder)
+    )
+    np.testing.assert_array_equal(noisy == 255, clean == 255)
+    measured = clean != 255
+    assert (noisy != clean)[measured].mean() == pytest.approx(0.1, abs=0.015)
+    depth = np.stack([pixels(m) for _, m in read_messages(small / "husky_1.mcap")["/husky_1/camera/depth/image_raw"]])
+    np.testing.assert_array_equal(depth == 0, noisy == 255)
+
+
+def test_same_options_give_the_same_bytes_and_another_seed_others(small, tmp_path):
+    simulate_team(tmp_path / "again", SMALL)
+    for path in small.iterdir():
+        assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
+    simulate_team(tmp_path / "other", SimulationConfig(**{**vars(SMALL), "seed": 99}))
+    assert (tmp_path / "other" / "husky_1.mcap").read_bytes() != (small / "husky_1.mcap").read_bytes()
+    assert (tmp_path / "other" / "world.npz").read_bytes() != (small / "world.npz").read_bytes()
+
+
+def test_summary_and_progress(tmp_path):
+    shares: list[float] = []
+    (tmp_path / "empty").mkdir()
+    summary = simulate_team(tmp_path / "empty", SMALL, shares.append)
+    assert summary.num_frames == 30
+    assert summary.team_file == tmp_path / "empty" / "team.yaml"
+    assert summary.num_bytes == sum(path.stat().st_size for path in (tmp_path / "empty").iterdir())
+    assert summary.num_cells == len(truth_of(tmp_path / "empty")[0])
+    assert all(log.is_file() for log in summary.logs)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_folder_that_is_not_empty_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="is not empty; give a new folder"):
+        simulate_team(tmp_path, SMALL)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(OutputError, match=r"notes\.txt: is a file"):
+        simulate_team(tmp_path / "notes.txt", SMALL)
+    with pytest.raises(OutputError, match="cannot be written"):
+        simulate_team(tmp_path / "notes.txt" / "team", SMALL)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_simulation_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, error, exists):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(team, "explore", fail)
+    folder = tmp_path / "team"
+    if exists:
+        folder.mkdir()
+    with pytest.raises(KeyboardInterrupt if error is KeyboardInterrupt else OutputError):
+        simulate_team(folder, SMALL)
+    assert folder.exists() == exists
+    assert not list(tmp_path.rglob("*.*"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"num_robots": 0}, {"duration": 0.5}, {"rate": 0.0}, {"image": (4, 120)}, {"image": (160, 1)}, {"seed": -1},
+     {"resolution": 0.0}, {"label_noise": 1.5}, {"world_size": 5.0}, {"max_depth": 66.0}, {"duration": float("nan")}],
+)  # fmt: skip
+def test_options_out_of_range_are_refused_by_name(options):
+    name = next(iter(options))
+    with pytest.raises(ConfigError, match=rf"{name}.*is not between"):
+        SimulationConfig(**options)
+
+
+def test_the_camera_is_the_huskies(small):
+    camera = SimulationConfig().camera
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (160, 120, 65.25, 65.25)
+    assert (camera.cx, camera.cy) == (79.5, 59.5)
+    info = read_messages(small / "husky_1.mcap")["/husky_1/camera/depth/camera_info"][0][1]
+    np.testing.assert_allclose(info.k, [13.05, 0, 15.5, 0, 13.05, 11.5, 0, 0, 1])
+
+
+@pytest.mark.parametrize("rate", [0.5, 3.0, 4.0, 30.0])
+def test_any_rate_gives_its_number_of_pictures(tmp_path, rate):
+    config = SimulationConfig(num_robots=1, duration=4.0, rate=rate, image=(8, 6), world_size=20.0, resolution=1.0)
+    assert abs(simulate_team(tmp_path / "team", config).num_frames - 4.0 * rate) <= 1
+
+
+def test_midway_is_slerp_at_one_half():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        a, b = np.eye(4), np.eye(4)
+        first = Rotation.random(random_state=rng.integers(1000))
+        second = first * Rotation.from_rotvec(rng.uniform(-1.0, 1.0, 3))
+        a[:3, :3], b[:3, :3] = first.as_matrix(), second.as_matrix()
+        a[:3, 3], b[:3, 3] = rng.normal(size=(2, 3))
+        middle = midway(a, b)
+        expected = Slerp([0, 1], Rotation.concatenate([first, second]))(0.5).as_matrix()
+        np.testing.assert_allclose(middle[:3, :3], expected, atol=1e-12)
+        np.testing.assert_allclose(middle[:3, 3], (a[:3, 3] + b[:3, 3]) / 2)
+
+
+def test_in_the_default_world_every_robot_measures_less_than_its_share(tmp_path):
+    # Coarse pictures, but the default village, team, camera and duration.
+    config = SimulationConfig(image=(40, 30), rate=1.0)
+    simulate_team(tmp_path / "team", config)
+    cells = []
+    for robot_id in config.robot_ids:
+        messages = read_messages(tmp_path / "team" / f"{robot_id}.mcap")
+        points = np.concatenate([points for points, _ in measured_points(messages, robot_id)])
+        cells.append({tuple(key) for key in np.unique(np.floor(points / 0.6).astype(int), axis=0).tolist()})
+    together = set.union(*cells)
+    assert len(together) > 10_000
+    assert max(len(own) for own in cells) < 0.4 * len(together)
+    assert sum(len(own) for own in cells) > 1.1 * len(together)
+
+
+@pytest.mark.parametrize("name", sorted(FIXTURES))
+def test_the_committed_fixtures_are_small_and_as_their_script_says(name):
+    folder, config = COMMITTED / name, FIXTURES[name]
+    stored = load_team_file(folder / "team.yaml")
+    assert [robot.robot_id for robot in stored.robots] == list(config.robot_ids)
+    assert {path.name for path in folder.iterdir()} == {f"{r}.mcap" for r in config.robot_ids} | {
+        "team.yaml",
+        "world.npz",
+    }
+    for path in folder.iterdir():
+        assert path.stat().st_size < 200_000
+    for robot in stored.robots:
+        messages = read_messages(robot.logs[0])
+        assert len(messages[robot.depth_topic]) == round(config.duration * config.rate)
+        first = messages[robot.depth_topic][0][1]
+        assert (first.width, first.height) == config.image

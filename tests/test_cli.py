@@ -1,0 +1,327 @@
+"""The command line, most of it run as a process on the small recorded teams."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from plyfile import PlyData
+
+from octoreplay import __version__, cli
+from octoreplay.config import PARAMETERS, RobotConfig, RunConfig, load_team_file
+from octoreplay.errors import ConfigError
+from octoreplay.result import open_result
+
+FIXTURES = Path(__file__).parent / "fixtures"
+PAIR = FIXTURES / "pair" / "team.yaml"
+COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "query", "import-rgbd")
+
+
+def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a process, 100 columns wide."""
+    return subprocess.run(
+        [sys.executable, "-m", "octoreplay", *map(str, arguments)], cwd=folder, text=True, capture_output=True,
+        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
+    )  # fmt: skip
+
+
+def fails(code: int, sentence: str, *arguments: object) -> None:
+    """A command ends with this code and one sentence on stderr, without a traceback."""
+    done = octoreplay(*arguments)
+    assert done.returncode == code, done.stderr
+    assert re.search(sentence, done.stderr), done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.fixture(scope="session")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result of the two robots' team."""
+    path = tmp_path_factory.mktemp("run") / "result.mcap"
+    done = octoreplay("run", PAIR, "-o", path, "--state-every", "1", "--view-every", "2")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "agreement, worst robot" in done.stdout
+    assert f"wrote {path}" in done.stdout
+    return path
+
+
+# --- options ----------------------------------------------------------------------------------------------------------
+
+
+def test_help_and_version_are_there_for_everything() -> None:
+    for arguments in ([], *([command] for command in COMMANDS)):
+        done = octoreplay(*arguments, "--help")
+        assert done.returncode == 0
+        assert "Usage: octoreplay" in done.stdout
+    assert octoreplay("--version").stdout == f"octoreplay, version {__version__}\n"
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = ("numba", "scipy", "matplotlib", "open3d", "rosbags", "mcap", "rich", "networkx")
+    code = (
+        "import sys; from octoreplay.cli import cli\n"
+        "try: cli.main(['run', '--help'], standalone_mode=False)\n"
+        f"finally: print('loaded', [name for name in {heavy!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=True)
+    assert done.stdout.endswith("loaded []\n")
+
+
+def test_every_parameter_is_an_option_of_run_by_its_name() -> None:
+    names = {name: option for option in cli.run.params for name in option.opts}
+    for name, parameter in PARAMETERS.items():
+        option = names[f"--{name.replace('_', '-')}"]
+        assert option.name == name
+        assert parameter.help in (option.help or "")
+
+
+def parsed(*arguments: str) -> dict[str, object]:
+    """What ``run`` would hand on from some arguments: only what was given."""
+    context = cli.run.make_context("run", list(arguments))
+    return {name: value for name, value in context.params.items() if value is not None and value != ()}
+
+
+def test_only_what_is_given_counts() -> None:
+    assert parsed("-o", "a.mcap") == {"output": Path("a.mcap")}
+    assert parsed("--miss", "-0.25", "--bounds", "-1,2.5", "--no-hash", "--settle", "0") == {
+        "miss": -0.25, "bounds": "-1,2.5", "hash": False, "settle": 0,
+    }  # fmt: skip
+
+
+def base() -> RunConfig:
+    return RunConfig(robots=tuple(RobotConfig(name, (Path(f"{name}.mcap"),)) for name in ("a", "b", "c")))
+
+
+def test_options_beat_the_preset_and_the_preset_beats_the_file() -> None:
+    file = base().with_parameters({"evidence": "cell-average", "gamma": 0.125, "hit": 2.0})
+    config = cli._with_options(file, "paper", None, {"gamma": 0.75})
+    assert config.consensus.evidence == "time-average"
+    assert config.consensus.gamma == 0.75
+    assert config.sensor.hit == 2.0
+    assert cli._with_options(file, None, None, {}) == file
+
+
+def test_edges_set_the_topology_and_the_weights() -> None:
+    config = cli._with_options(base(), None, "a:b, b:c", {})
+    assert (config.network.topology, config.network.weights) == ("edges", "metropolis")
+    assert config.network.edges == (("a", "b", None), ("b", "c", None))
+    weighted = cli._with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
+    assert (weighted.network.weights, weighted.network.edges[1]) == ("given", ("b", "c", 0.5))
+    back = cli._with_options(weighted, None, None, {"topology": "ring"})
+    assert (back.network.topology, back.network.weights, back.network.edges) == ("ring", "metropolis", ())
+    kept = cli._with_options(weighted, None, None, {"hit": 2.0})
+    assert kept.network == weighted.network
+
+
+@pytest.mark.parametrize(
+    ("edges", "sentence"),
+    [("a", "'a' is not A:B or A:B:WEIGHT"), ("a:b:c:d", "is not A:B"), ("a:b:x", "the weight in 'a:b:x' is not a"),
+     ("a:z", "robot 'z' is not in the team"), ("a:a", "cannot have a link to itself"), ("a::1", "is not A:B")],
+)  # fmt: skip
+def test_bad_edges_are_one_sentence(edges: str, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        cli._with_options(base(), None, edges, {})
+
+
+def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "teams").mkdir()
+    for name in ("a", "b", "c"):
+        Path(f"{name}.mcap").write_text("")
+    cli._save_team(base(), Path("teams/team.yaml"))
+    robots = load_team_file(tmp_path / "teams" / "team.yaml").robots
+    assert [log for robot in robots for log in robot.logs] == [tmp_path.resolve() / f"{n}.mcap" for n in "abc"]
+
+
+# --- bad usage --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "sentence"),
+    [
+        (["run", "-o", "x.mcap"], 2, "give a team file or logs"),
+        (["run", PAIR], 2, "give the result's name: -o OUT.mcap"),
+        (["run", PAIR, PAIR, "-o", "x.mcap"], 2, "give one team file, or logs, not both"),
+        (["run", PAIR, "-o", "x.mcap", "--config-from", "y.mcap"], 2, "--config-from y.mcap names the logs too"),
+        (["run", "none.yaml", "-o", "x.mcap"], 2, r"none\.yaml: cannot be read: No such file"),
+        (["run", "none.mcap", "-o", "x.mcap"], 1, r"none\.mcap"),
+        (["run", PAIR, "-o", "x.mcap", "--rule", "magic"], 2, "'magic' is not one of"),
+        (["run", PAIR, "-o", "x.mcap", "--hit", "-1"], 2, "hit: -1.0 must be greater than 0"),
+        (["run", PAIR, "-o", "x.mcap", "--bounds", "1"], 2, "bounds: expects 2 or 6 numbers, got 1"),
+        (["run", PAIR, "-o", "x.mcap", "--resolution", "small"], 2, "'small' is not a valid float"),
+        (["run", "--config-from", PAIR, "-o", "x.mcap"], 1, "not a finished MCAP file"),
+        (["info"], 2, "Missing argument"),
+        (["info", "none.mcap"], 1, r"none\.mcap"),
+        (["metrics", "none.mcap"], 1, r"none\.mcap: cannot be read"),
+        (["metrics", FIXTURES / "pair" / "husky_1.mcap"], 1, "no result of octoreplay"),
+        (["query", "none.mcap"], 2, "ask for a point, --at X Y Z, or a box"),
+        (["simulate", "x", "--image", "big"], 2, "image: expects WIDTHxHEIGHT such as 160x120, got 'big'"),
+        (["simulate", "x", "--robots", "0"], 2, "num_robots: 0 is not between 1 and 100"),
+        (["fly"], 2, "No such command 'fly'"),
+    ],
+)
+def test_bad_usage_is_one_sentence_and_a_code(
+    arguments: list[object], code: int, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert cli._exit_code([str(argument) for argument in arguments]) == code
+    captured = capsys.readouterr()
+    assert re.search(sentence, captured.err), captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+def test_the_same_command_gives_the_same_bytes_and_config_from_repeats_it(result: Path, tmp_path: Path) -> None:
+    for arguments in ((PAIR, "--state-every", "1", "--view-every", "2"), ("--config-from", result)):
+        again = tmp_path / "again.mcap"
+        done = octoreplay("run", *arguments, "-o", again)
+        assert done.returncode == 0, done.stderr
+        assert messages(again) == messages(result)
+    # In the same folder, where the logs have the same relative names, even the metadata is equal.
+    twin = result.with_name("twin.mcap")
+    assert octoreplay("run", "--config-from", result, "-o", twin).returncode == 0
+    assert twin.read_bytes() == result.read_bytes()
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        return [(channel.topic, m.log_time, m.data) for _, channel, m in make_reader(stream).iter_messages()]
+
+
+def test_logs_alone_are_enough_and_what_was_found_can_be_saved(tmp_path: Path) -> None:
+    logs = sorted((FIXTURES / "pair").glob("*.mcap"))
+    team_file = tmp_path / "team.yaml"
+    done = octoreplay("run", *logs, "--save-team", team_file, "--resolution", "0.4")
+    assert done.returncode == 0, done.stderr
+    assert "/husky_1/camera/depth/image_raw" in done.stdout
+    assert f"saved {team_file}" in done.stdout
+    config = load_team_file(team_file)
+    assert config.map.resolution == 0.4
+    assert [robot.robot_id for robot in config.robots] == ["husky_1", "husky_2"]
+    assert all(log.samefile(original) for log, original in zip((r.logs[0] for r in config.robots), logs, strict=True))
+    done = octoreplay("run", team_file, "-o", tmp_path / "out.mcap", "--settle", "0")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_changed_log_is_warned_of(tmp_path: Path) -> None:
+    for path in (FIXTURES / "pair").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    assert octoreplay("run", tmp_path / "team.yaml", "-o", first, "--settle", "0").returncode == 0
+    other = FIXTURES / "trio" / "husky_1.mcap"
+    (tmp_path / "husky_1.mcap").write_bytes(other.read_bytes())
+    done = octoreplay("run", "--config-from", first, "-o", second)
+    assert "husky_1.mcap: has changed since first.mcap was made from it" in done.stderr
+
+
+def test_a_cut_log_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
+    for path in (FIXTURES / "pair").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    log = tmp_path / "husky_2.mcap"
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.7)])
+    done = octoreplay("run", tmp_path / "team.yaml", "-o", tmp_path / "out.mcap", "--settle", "0")
+    assert done.returncode == 3, done.stderr
+    assert re.search(r"warning: .*husky_2\.mcap", done.stderr)
+    assert (tmp_path / "out.mcap").exists()
+
+
+def test_metrics_shows_the_table_and_writes_csv_and_figures(result: Path, tmp_path: Path) -> None:
+    done = octoreplay("metrics", result, "--csv", tmp_path / "m.csv", "--plot", tmp_path / "figures")
+    assert done.returncode == 0, done.stderr
+    assert "agreement, worst robot" in done.stdout
+    assert "wall time" not in done.stdout
+    with open_result(result) as opened:
+        assert len((tmp_path / "m.csv").read_text().splitlines()) == len(opened.metrics) + 1
+    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["disagreement.png", "packet_size.png"]
+
+
+def test_export_writes_what_it_says(result: Path, tmp_path: Path) -> None:
+    done = octoreplay("export", result, "-o", tmp_path / "map.ply", "--what", "voxels", "--robot", "husky_2")
+    assert done.returncode == 0, done.stderr
+    count = int(re.search(r"\(([\d,]+) cubes", done.stdout)[1].replace(",", ""))
+    data = PlyData.read(tmp_path / "map.ply")
+    assert (data["vertex"].count, data["face"].count) == (8 * count, 12 * count)
+    assert "octoreplay map of husky_2" in data.comments[0]
+    fails(1, "robot 'husky_9' not found; robots: husky_1, husky_2", "export", result, "-o", tmp_path / "x.ply",
+          "--robot", "husky_9")  # fmt: skip
+    fails(1, "no map of robot 'husky_1' is stored up to", "export", result, "-o", tmp_path / "x.ply", "--at", "-5")
+    fails(1, r"none/x\.ply: cannot be written", "export", result, "-o", tmp_path / "none" / "x.ply")
+    assert not (tmp_path / "x.ply").exists()
+
+
+def test_query_tells_what_is_where(result: Path) -> None:
+    with open_result(result) as opened:
+        stored = opened.map("husky_1")
+        leaves = stored.leaves()
+        index = int(leaves.log_odds.max(axis=1).argmax())
+        x, y, z = leaves.centers[index]
+        name = opened.class_table.names[int(leaves.log_odds[index].argmax())]
+    done = octoreplay("query", result, "--at", x, y, z, "--at", 1e6, 0, 0, "--box", *(-100.0,) * 3, *(100.0,) * 3)
+    assert done.returncode == 0, done.stderr
+    assert re.search(rf"{name} +\d+\.\d\d %", done.stdout)
+    assert re.search(r"1e\+06, 0, 0 +unknown", done.stdout)
+    assert "m\u00b3" in done.stdout
+
+
+def test_info_describes_logs() -> None:
+    done = octoreplay("info", *sorted((FIXTURES / "trio").glob("*.mcap")))
+    assert done.returncode == 0, done.stderr
+    assert "/husky_3/camera/depth/image_raw" in done.stdout
+    assert "nothing is missing for a run" in done.stdout
+    assert max(len(line) for line in done.stdout.splitlines()) <= 100
+
+
+def interrupted(arguments: list[object], ready: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
+    """A command that gets SIGINT once it is ready."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "octoreplay", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    while process.poll() is None and not ready():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def test_an_interrupted_run_leaves_a_partial_result_and_the_old_one(tmp_path: Path) -> None:
+    out, partial = tmp_path / "out.mcap", tmp_path / "out.partial.mcap"
+    out.write_text("the result of yesterday")
+    # Very long settling, so that the run is still going when the signal comes.
+    arguments = ["run", PAIR, "-o", out, "--settle", "100000", "--settle-max", "100000", "--state-every", "0.001"]
+    done = interrupted(arguments, lambda: partial.exists() and partial.stat().st_size > 20_000)
+    assert done.returncode == 130, done.stderr
+    assert f"interrupted; what was finished is in {partial}" in done.stderr
+    assert out.read_text() == "the result of yesterday"
+    with open_result(partial) as opened:
+        assert opened.summary.stop_reason == "interrupted"
+        assert len(opened.metrics) >= 1
+
+
+def test_demo_makes_everything_and_says_so(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    done = octoreplay("demo", "show", "--robots", 2, "--duration", 3, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for name in (
+        "logs/team.yaml",
+        "logs/world.ply",
+        "result.mcap",
+        "map.ply",
+        "metrics.csv",
+        "figures/disagreement.png",
+    ):
+        assert (tmp_path / "show" / name).exists()
+        assert (tmp_path / "show" / name).stat().st_size > 0
+    assert "Foxglove" in done.stdout
+    fails(1, "show.*logs: is not empty; give a new folder", "demo", tmp_path / "show")

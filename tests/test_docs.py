@@ -1,0 +1,51 @@
+"""The documentation names what there is."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from octoreplay import cli
+from octoreplay.io.messages import OCTOREPLAY_MSGS
+from octoreplay.io.result_writer import VIEW_DTYPE
+from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def named(page: str) -> set[str]:
+    """Everything that a page sets in code type."""
+    return set(re.findall(r"`([^`\n]+)`", (DOCS / page).read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("record", [TickMetrics, RobotMetrics, LinkMetrics])
+def test_every_metric_is_explained(record: type) -> None:
+    fields = {item.name for item in dataclasses.fields(record)}
+    assert fields - {"robots", "links", "robot_id", "sender", "receiver"} <= named("metrics.md")
+
+
+def test_every_message_and_field_of_the_result_is_explained() -> None:
+    words = named("result-format.md")
+    for name in ("MapState", "Packet", "TickMetrics"):
+        assert f"octoreplay_msgs/msg/{name}" in OCTOREPLAY_MSGS
+        assert f"octoreplay_msgs/msg/{name}" in words
+    assert set(VIEW_DTYPE.names or ()) <= words
+
+
+def test_every_command_and_option_is_explained() -> None:
+    text = (DOCS / "cli.md").read_text(encoding="utf-8")
+    for name, command in cli.cli.commands.items():
+        assert f"## octoreplay {name}" in text
+        section = text.split(f"## octoreplay {name}")[1].split("\n## ")[0]
+        if name == "run":
+            continue
+        for parameter in command.params:
+            if parameter.name not in ("output", "result", "folder", "logs"):
+                assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    for page in ("result-format.md", "metrics.md", "cli.md"):
+        for target in re.findall(r"\]\(([a-z-]+\.md)\)", (DOCS / page).read_text(encoding="utf-8")):
+            assert (DOCS / target).exists(), f"{page} -> {target}"
