@@ -455,20 +455,15 @@ def points_to_ends(points, class_ids, pose, resolution, min_range, max_range, ke
 
 
 @kernel
-def fill_axis_tables(low_brick, num_bricks, low_key, high_key, tables):
-    """Offsets of each local coordinate in the scratch grid, per axis (3, m): their sum over the axes is the cell.
+def fill_axis_tables(num_bricks, offsets):
+    """Offset of each local coordinate in the scratch grid, per axis (3, m): their sum over the axes is the cell.
 
-    The grid holds whole bricks, x fastest, each in Morton order. A coordinate outside [low_key, high_key] gets an offset
-    that makes every sum negative: those cells are outside the mapped region.
+    The grid holds ``num_bricks`` (3,) whole bricks, x fastest, each in Morton order.
     """
     stride = BRICK_CELLS
     for axis in range(3):
         for i in range(num_bricks[axis] * BRICK_EDGE):
-            key = low_brick[axis] * BRICK_EDGE + i
-            if key < low_key[axis] or key > high_key[axis]:
-                tables[axis, i] = -(1 << 50)
-            else:
-                tables[axis, i] = (i >> BRICK_BITS) * stride + (spread_bits(i & 7) << axis)
+            offsets[axis, i] = (i >> BRICK_BITS) * stride + (spread_bits(i & 7) << axis)
         stride *= num_bricks[axis]
 
 
@@ -485,23 +480,25 @@ def _mark(marks, cell, value, touched_flags, touched, count):
 
 
 @kernel
-def mark_ends(keys, kinds, num_classes, corner, tables, slots, votes, rays, marks, touched_flags, touched):
+def mark_ends(keys, kinds, num_classes, corner, offsets, mapped, slots, votes, rays, marks, touched_flags, touched):
     """Find the distinct end cells and mark the hit ones with 1 + the class that most points in them have.
 
-    ``slots`` is a zeroed scratch grid (left zeroed), ``votes`` (n, C + 1) zeroed, ``rays`` (n,) gets one input index
-    for each distinct end cell. Returns the number of distinct end cells and of touched bricks.
+    ``offsets`` (3, m) are the axis tables of the scratch grid with lowest cell ``corner`` (3,); in ``mapped`` coordinates
+    outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed and left
+    so; ``rays`` (n,) gets one input index for each distinct end cell. Returns the number of distinct end cells and of
+    touched bricks.
     """
     num_rays = 0
     num_touched = 0
     last_cell = np.int64(-1)
-    slot = 0
+    slot = np.int64(0)
     for i in range(keys.shape[0]):
-        x, y, z = keys[i, 0] - corner[0], keys[i, 1] - corner[1], keys[i, 2] - corner[2]
-        cell = (x >> 3) + tables[3, 0] * ((y >> 3) + tables[3, 1] * (z >> 3))
-        cell = cell * 512 + tables[4, x & 7] + (tables[4, y & 7] << 1) + (tables[4, z & 7] << 2)
+        cell = (
+            offsets[0, keys[i, 0] - corner[0]] + offsets[1, keys[i, 1] - corner[1]] + offsets[2, keys[i, 2] - corner[2]]
+        )
         if cell != last_cell:
             last_cell = cell
-            slot = slots[cell] - 1
+            slot = np.int64(slots[cell]) - 1
             if slot < 0:
                 slot = num_rays
                 slots[cell] = slot + 1
@@ -510,23 +507,21 @@ def mark_ends(keys, kinds, num_classes, corner, tables, slots, votes, rays, mark
         if kinds[i] != CUT and kinds[i] != 0:
             votes[slot, kinds[i] - 1] += 1
     for slot in range(num_rays):
-        i = rays[slot]
-        x, y, z = keys[i, 0] - corner[0], keys[i, 1] - corner[1], keys[i, 2] - corner[2]
-        cell = (x >> 3) + tables[3, 0] * ((y >> 3) + tables[3, 1] * (z >> 3))
-        cell = cell * 512 + tables[4, x & 7] + (tables[4, y & 7] << 1) + (tables[4, z & 7] << 2)
-        slots[cell] = 0
+        x, y, z = keys[rays[slot], 0] - corner[0], keys[rays[slot], 1] - corner[1], keys[rays[slot], 2] - corner[2]
+        slots[offsets[0, x] + offsets[1, y] + offsets[2, z]] = 0
         best, most = -1, 0
         for c in range(num_classes):
             if votes[slot, c] > most:
                 best, most = c, votes[slot, c]
-        inside = tables[0, x] + tables[1, y] + tables[2, z]
-        if best >= 0 and inside >= 0:
-            num_touched = _mark(marks, inside, np.uint8(best + 2), touched_flags, touched, num_touched)
+            votes[slot, c] = 0
+        cell = mapped[0, x] + mapped[1, y] + mapped[2, z]
+        if best >= 0 and cell >= 0:
+            num_touched = _mark(marks, cell, np.uint8(best + 2), touched_flags, touched, num_touched)
     return num_rays, num_touched
 
 
 @kernel
-def mark_free(origin, ends, end_keys, resolution, corner, tables, marks, touched_flags, touched, num_touched):
+def mark_free(origin, ends, end_keys, resolution, corner, mapped, marks, touched_flags, touched, num_touched):
     """Mark with 1 every unmarked cell that a ray passes before its end cell (Amanatides and Woo 1987).
 
     All rays start at ``origin`` (3,) and go to ``ends`` (n, 3) in the cells ``end_keys`` (n, 3). The walk takes exactly
@@ -537,7 +532,7 @@ def mark_free(origin, ends, end_keys, resolution, corner, tables, marks, touched
     start_y = np.int64(np.floor(origin[1] / resolution)) - corner[1]
     start_z = np.int64(np.floor(origin[2] / resolution)) - corner[2]
     if ends.shape[0] > 0:
-        cell = tables[0, start_x] + tables[1, start_y] + tables[2, start_z]
+        cell = mapped[0, start_x] + mapped[1, start_y] + mapped[2, start_z]
         if cell >= 0 and marks[cell] == 0:
             num_touched = _mark(marks, cell, np.uint8(1), touched_flags, touched, num_touched)
     for i in range(ends.shape[0]):
@@ -561,23 +556,23 @@ def mark_free(origin, ends, end_keys, resolution, corner, tables, marks, touched
         if left_z > 0:
             delta_z = resolution / abs(dz)
             next_z = ((z + corner[2] + (step_z > 0)) * resolution - origin[2]) / dz
-        part_x, part_y, part_z = tables[0, x], tables[1, y], tables[2, z]
+        part_x, part_y, part_z = mapped[0, x], mapped[1, y], mapped[2, z]
         for _ in range(left_x + left_y + left_z - 1):
             if next_x < next_y and next_x < next_z:
                 x += step_x
                 left_x -= 1
                 next_x = next_x + delta_x if left_x > 0 else np.inf
-                part_x = tables[0, x]
+                part_x = mapped[0, x]
             elif next_y < next_z and not next_x < next_y:
                 y += step_y
                 left_y -= 1
                 next_y = next_y + delta_y if left_y > 0 else np.inf
-                part_y = tables[1, y]
+                part_y = mapped[1, y]
             else:
                 z += step_z
                 left_z -= 1
                 next_z = next_z + delta_z if left_z > 0 else np.inf
-                part_z = tables[2, z]
+                part_z = mapped[2, z]
             cell = part_x + part_y + part_z
             if cell >= 0 and marks[cell] == 0:
                 num_touched = _mark(marks, cell, np.uint8(1), touched_flags, touched, num_touched)
@@ -727,13 +722,13 @@ def _load_evidence(target, addresses, tiers, column, count_column, scale, c, cou
             target[i] *= scale
 
 
-OWN, BASE, EVIDENCE, OLD_EVIDENCE, COUNTS, NEIGHBOURS = 0, 1, 2, 3, 4, 5
+OWN, BASE, EVIDENCE, OLD_EVIDENCE, NEIGHBOURS = 0, 1, 2, 3, 4
 """Columns of the address table of a consensus step: the robot's own map, the map that it published (the base of the
-differences), its evidence, its evidence at the last iteration, its scan counts, then the neighbours' maps."""
+differences), its evidence log q, its evidence at the last iteration, then the neighbours' maps."""
 
 
 @fast_kernel
-def consensus_step(addresses, tiers, weights, rule, gamma, scale, by_count, prior, num_classes, changes):
+def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes):
     """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
 
     ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of all
@@ -746,19 +741,17 @@ def consensus_step(addresses, tiers, weights, rule, gamma, scale, by_count, prio
     sigma = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
     base = np.empty(BRICK_CELLS, dtype=np.float32)
     other = np.empty(BRICK_CELLS, dtype=np.float32)
-    counts = np.empty(BRICK_CELLS, dtype=np.float32)
     top = np.empty(BRICK_CELLS, dtype=np.float32)
     total = np.empty(BRICK_CELLS, dtype=np.float32)
     dot = np.empty(BRICK_CELLS, dtype=np.float32)
     powers = np.empty(BRICK_CELLS, dtype=np.int32)
     scales = powers.view(np.float32)
-    count_column = COUNTS if by_count else -1
     for b in range(addresses.shape[0]):
         tier = tiers[b, OWN]
         width = num_classes if tier == VECTOR else 1
         terms = np.float32(1.0) if tier == VECTOR else np.float32(num_classes)
         cells = 1 if tier == UNIFORM else BRICK_CELLS
-        top[:] = -prior
+        top[:] = np.float32(0.0)
         for c in range(width):
             row = mixed[c, :cells]
             _load(row, addresses[b, OWN], tier, c, num_classes)
@@ -779,9 +772,7 @@ def consensus_step(addresses, tiers, weights, rule, gamma, scale, by_count, prio
                 _add_scaled(row, addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, np.float32(1.0), num_classes)
                 _add_scaled(row, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], c, np.float32(-1.0), num_classes)
             else:
-                _load_evidence(
-                    other[:cells], addresses[b], tiers[b], EVIDENCE, count_column, scale, c, counts[:cells], num_classes
-                )
+                _load(other[:cells], addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, num_classes)
                 for i in range(cells):
                     delta[c, i] = row[i] - other[i]
         if rule == NATURAL:
@@ -790,7 +781,7 @@ def consensus_step(addresses, tiers, weights, rule, gamma, scale, by_count, prio
                     mixed[c, i] -= gamma * delta[c, i]
         elif rule == GRADIENT and gamma != np.float32(0.0):
             for i in range(cells):
-                base[i] = -prior - top[i]
+                base[i] = -top[i]
             _exp_negative(base[:cells], total[:cells], powers[:cells], scales[:cells])
             dot[:] = np.float32(0.0)
             for c in range(width):
@@ -1050,17 +1041,25 @@ def _write_leaf(state, low, high, place, scalars, vectors, totals):
 
 
 @kernel
-def _brick_pyramid(bricks, index, prune, tolerance, low, high, cells, eights, groups):
-    """Node states of one brick: of its 512 ``cells``, 64 ``eights``, 8 ``groups``; returns the brick's own state."""
-    num_classes = bricks.vector.shape[1]
+def _word(states, start):
+    """The 16-bit word of a node: two bits for each of its eight children, the first in the lowest bits."""
+    word = 0
+    for k in range(8):
+        word |= np.int64(states[start + k]) << (2 * k)
+    return np.uint16(word)
+
+
+@kernel
+def _load_cells(bricks, index, low, high, cells):
+    """Values of a brick's cells as bounds ``low`` and ``high`` (C, 512) and the state of each cell."""
     tier = bricks.tiers[index]
-    width = num_classes if tier == VECTOR else 1
     if tier == UNIFORM:
         low[0, :] = bricks.values[index]
     elif tier == SCALAR:
         low[0, :] = bricks.scalar[bricks.rows[index]]
     else:
         low[:, :] = bricks.vector[bricks.rows[index]]
+    width = low.shape[0] if tier == VECTOR else 1
     high[:width, :] = low[:width, :]
     for i in range(BRICK_CELLS):
         if (bricks.known[index, i >> 3] >> (i & 7)) & 1 == 0:
@@ -1070,24 +1069,29 @@ def _brick_pyramid(bricks, index, prune, tolerance, low, high, cells, eights, gr
         for c in range(1, width):
             if low[c, i] != low[0, i]:
                 cells[i] = CHILD_VECTOR
-    limit = tolerance if prune else np.float32(-1.0)
-    for k in range(64):
-        eights[k] = _group_state(low, high, cells, 8 * k, limit, width)
-    for k in range(64):
-        if eights[k] >= CHILD_SCALAR:
-            low[:width, k] = low[:width, 8 * k]
-            high[:width, k] = high[:width, 8 * k]
-    return width, limit
+    return width
 
 
 @kernel
-def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors, roots, root_words, values, totals):
-    """Write each brick's subtree in depth-first order; bricks that are one leaf or unknown write nothing.
+def _reduce(low, high, states, limit, width, low_out, high_out, states_out):
+    """The nodes one level up: their bounds and states from those of their eight children each."""
+    for k in range(states_out.size):
+        states_out[k] = _group_state(low, high, states, 8 * k, limit, width)
+        for c in range(width):
+            low_out[c, k] = low[c, 8 * k]
+            high_out[c, k] = high[c, 8 * k]
 
-    ``order`` (n,) are brick indices by code. ``roots`` (n, 4) gets the state of the brick and where its words, scalars
-    and vectors start; ``values`` (n, C) the value of bricks that are one leaf. ``totals`` (3,) counts what was written.
+
+@kernel
+def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
+    """Write the octree over the bricks ``order`` (n,), sorted by code, in depth-first order.
+
+    ``words`` gets 16 bits per inner node, two for each child; ``scalars`` and ``vectors`` (m, C) the leaves' values.
+    Eight leaves that differ by at most ``tolerance`` are one leaf; nothing is merged without ``prune``.
+    Returns the number of words, scalars and vectors.
     """
     num_classes = bricks.vector.shape[1]
+    limit = tolerance if prune else np.float32(-1.0)
     low = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
     high = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
     low8 = np.empty((num_classes, 64), dtype=np.float32)
@@ -1097,57 +1101,171 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors, root
     cells = np.empty(BRICK_CELLS, dtype=np.uint8)
     eights = np.empty(64, dtype=np.uint8)
     groups = np.empty(8, dtype=np.uint8)
+    totals = np.zeros(3, dtype=np.int64)
+    # The open nodes from the root down: where each one's word stands, what was written before it, its children.
+    starts = np.zeros((BRICK_DEPTH + 1, 3), dtype=np.int64)
+    states = np.zeros((BRICK_DEPTH + 1, 8), dtype=np.uint8)
+    node_low = np.zeros((BRICK_DEPTH + 1, num_classes, 8), dtype=np.float32)
+    node_high = np.zeros((BRICK_DEPTH + 1, num_classes, 8), dtype=np.float32)
     for n in range(order.size):
         index = order[n]
-        roots[n, 1:] = totals
-        tier = bricks.tiers[index]
-        if tier == UNIFORM and prune:
-            roots[n, 0] = CHILD_SCALAR if bricks.known[index, 0] else CHILD_UNKNOWN
-            values[n, :] = bricks.values[index]
-            continue
-        width = num_classes if tier == VECTOR else 1
-        limit = tolerance if prune else np.float32(-1.0)
-        _load_cells(bricks, index, low, high, cells)
-        for k in range(64):
-            eights[k] = _group_state(low, high, cells, 8 * k, limit, width)
-            for c in range(width):
-                low8[c, k], high8[c, k] = low[c, 8 * k], high[c, 8 * k]
-        for k in range(8):
-            groups[k] = _group_state(low8, high8, eights, 8 * k, limit, width)
-            for c in range(width):
-                low64[c, k], high64[c, k] = low8[c, 8 * k], high8[c, 8 * k]
-        state = _group_state(low64, high64, groups, 0, limit, width)
-        roots[n, 0] = state
-        if state >= CHILD_SCALAR:
+        code = bricks.codes[index]
+        first = 0
+        if n > 0:
+            difference = code ^ bricks.codes[order[n - 1]]
+            while difference >> (3 * (BRICK_DEPTH - 1 - first)) == 0:
+                first += 1
+            for depth in range(BRICK_DEPTH - 1, first, -1):
+                _close(depth, bricks.codes[order[n - 1]], limit, starts, states, node_low, node_high,
+                       words, scalars, vectors, totals)  # fmt: skip
+            first += 1
+        for depth in range(first, BRICK_DEPTH):
+            starts[depth, :] = totals
+            states[depth, :] = CHILD_UNKNOWN
+            totals[0] += 1
+        parent = BRICK_DEPTH - 1
+        place = code & 7
+        if bricks.tiers[index] == UNIFORM and prune:
+            state = CHILD_SCALAR if bricks.known[index, 0] else CHILD_UNKNOWN
+            node_low[parent, :, place] = bricks.values[index]
+            node_high[parent, :, place] = bricks.values[index]
+        else:
+            width = _load_cells(bricks, index, low, high, cells)
+            _reduce(low, high, cells, limit, width, low8, high8, eights)
+            _reduce(low8, high8, eights, limit, width, low64, high64, groups)
+            state = _group_state(low64, high64, groups, 0, limit, width)
             for c in range(num_classes):
-                source = c if width > 1 else 0
-                values[n, c] = low64[source, 0] + (high64[source, 0] - low64[source, 0]) / np.float32(2.0)
-            continue
-        if state == CHILD_UNKNOWN:
-            continue
-        words[totals[0]] = _word(groups, 0)
-        totals[0] += 1
-        for g in range(8):
-            if groups[g] >= CHILD_SCALAR:
-                _write_leaf(groups[g], low64, high64, g, scalars, vectors, totals)
-            elif groups[g] == CHILD_INNER:
-                words[totals[0]] = _word(eights, 8 * g)
-                totals[0] += 1
-                for e in range(8 * g, 8 * g + 8):
-                    if eights[e] >= CHILD_SCALAR:
-                        _write_leaf(eights[e], low8, high8, e, scalars, vectors, totals)
-                    elif eights[e] == CHILD_INNER:
-                        words[totals[0]] = _word(cells, 8 * e)
-                        totals[0] += 1
-                        for i in range(8 * e, 8 * e + 8):
-                            if cells[i] != CHILD_UNKNOWN:
-                                _write_leaf(cells[i], low, high, i, scalars, vectors, totals)
+                node_low[parent, c, place] = low64[c if width > 1 else 0, 0]
+                node_high[parent, c, place] = high64[c if width > 1 else 0, 0]
+        states[parent, place] = state
+        if state >= CHILD_SCALAR:
+            _write_leaf(state, node_low[parent], node_high[parent], place, scalars, vectors, totals)
+        elif state == CHILD_INNER:
+            words[totals[0]] = _word(groups, 0)
+            totals[0] += 1
+            for g in range(8):
+                if groups[g] >= CHILD_SCALAR:
+                    _write_leaf(groups[g], low64, high64, g, scalars, vectors, totals)
+                elif groups[g] == CHILD_INNER:
+                    words[totals[0]] = _word(eights, 8 * g)
+                    totals[0] += 1
+                    for e in range(8 * g, 8 * g + 8):
+                        if eights[e] >= CHILD_SCALAR:
+                            _write_leaf(eights[e], low8, high8, e, scalars, vectors, totals)
+                        elif eights[e] == CHILD_INNER:
+                            words[totals[0]] = _word(cells, 8 * e)
+                            totals[0] += 1
+                            for i in range(8 * e, 8 * e + 8):
+                                if cells[i] != CHILD_UNKNOWN:
+                                    _write_leaf(cells[i], low, high, i, scalars, vectors, totals)
+    if order.size > 0:
+        for depth in range(BRICK_DEPTH - 1, -1, -1):
+            _close(depth, bricks.codes[order[order.size - 1]], limit, starts, states, node_low, node_high,
+                   words, scalars, vectors, totals)  # fmt: skip
+    return totals
 
 
 @kernel
-def _word(states, start):
-    """The 16-bit word of a node: two bits for each of its eight children, the first in the lowest bits."""
-    word = 0
-    for k in range(8):
-        word |= np.int64(states[start + k]) << (2 * k)
-    return np.uint16(word)
+def _close(depth, code, limit, starts, states, node_low, node_high, words, scalars, vectors, totals):
+    """Finish the open node at ``depth`` above the brick ``code``: write its word, or make it one leaf."""
+    width = node_low.shape[1]
+    state = CHILD_INNER
+    if depth > 0:
+        state = _group_state(node_low[depth], node_high[depth], states[depth], 0, limit, width)
+        parent, place = depth - 1, (code >> (3 * (BRICK_DEPTH - depth))) & 7
+        states[parent, place] = state
+        node_low[parent, :, place] = node_low[depth, :, 0]
+        node_high[parent, :, place] = node_high[depth, :, 0]
+    if state == CHILD_INNER:
+        words[starts[depth, 0]] = _word(states[depth], 0)
+        return
+    totals[:] = starts[depth]
+    if state >= CHILD_SCALAR:
+        _write_leaf(state, node_low[depth - 1], node_high[depth - 1], place, scalars, vectors, totals)
+
+
+@kernel
+def walk_leaves(words, codes, depths, is_vector):
+    """The leaves of a depth-first octree: Morton code of their lowest cell, depth and kind, (L,) each.
+
+    Returns the number of leaves, or -1 when the words are no octree of at most L leaves.
+    """
+    if words.size == 0:
+        return 0
+    path_word = np.zeros(KEY_BITS + 1, dtype=np.int64)
+    path_child = np.zeros(KEY_BITS + 1, dtype=np.int64)
+    path_code = np.zeros(KEY_BITS + 1, dtype=np.int64)
+    count = 0
+    used = 1
+    depth = 0
+    path_word[0] = words[0]
+    while depth >= 0:
+        child = path_child[depth]
+        if child == 8:
+            depth -= 1
+            continue
+        path_child[depth] = child + 1
+        state = (path_word[depth] >> (2 * child)) & 3
+        code = path_code[depth] | child << (3 * (KEY_BITS - 1 - depth))
+        if state == CHILD_INNER:
+            if depth == KEY_BITS - 1 or used == words.size:
+                return -1
+            depth += 1
+            path_word[depth] = words[used]
+            path_child[depth] = 0
+            path_code[depth] = code
+            used += 1
+        elif state >= CHILD_SCALAR:
+            if count == codes.size:
+                return -1
+            codes[count] = code
+            depths[count] = depth + 1
+            is_vector[count] = state == CHILD_VECTOR
+            count += 1
+    return count if used == words.size else -1
+
+
+@kernel
+def fill_from_leaves(bricks, codes, depths, is_vector, scalars, vectors):
+    """Write leaves (L,) into an octree without bricks. Room must be there."""
+    num_scalars, num_vectors = 0, 0
+    last_code, index = np.int64(-1), np.int64(-1)
+    for n in range(codes.size):
+        span = np.int64(1) << (3 * (KEY_BITS - depths[n]))
+        brick_code = codes[n] >> 9
+        if depths[n] <= BRICK_DEPTH:
+            for k in range(span >> 9):
+                index = add_brick(bricks, brick_code + k)
+                bricks.known[index, :] = 255
+                if is_vector[n]:
+                    _make_vector(bricks, index)
+                    for c in range(vectors.shape[1]):
+                        bricks.vector[bricks.rows[index], c, :] = vectors[num_vectors, c]
+                else:
+                    bricks.values[index] = scalars[num_scalars]
+        else:
+            if brick_code != last_code:
+                index = add_brick(bricks, brick_code)
+                last_code = brick_code
+                _make_scalar(bricks, index)
+            start = codes[n] & 511
+            if is_vector[n]:
+                _make_vector(bricks, index)
+            for i in range(start, start + span):
+                bricks.known[index, i >> 3] |= np.uint8(1 << (i & 7))
+            row = bricks.rows[index]
+            if is_vector[n]:
+                for c in range(vectors.shape[1]):
+                    for i in range(start, start + span):
+                        bricks.vector[row, c, i] = vectors[num_vectors, c]
+            elif bricks.tiers[index] == VECTOR:
+                for c in range(vectors.shape[1]):
+                    for i in range(start, start + span):
+                        bricks.vector[row, c, i] = scalars[num_scalars]
+            else:
+                for i in range(start, start + span):
+                    bricks.scalar[row, i] = scalars[num_scalars]
+        if is_vector[n]:
+            num_vectors += 1
+        else:
+            num_scalars += 1

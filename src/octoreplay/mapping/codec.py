@@ -1,0 +1,137 @@
+"""Map packets: an octree as bytes and back, bit for bit. docs/packet-format.md describes every byte."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import zstandard
+
+from octoreplay.errors import PacketError
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams, octree_from_streams
+from octoreplay.records import Int64Array
+
+MAGIC = b"OCTM"
+VERSION = 1
+FULL, DELTA = 0, 1
+CONTENT_FLOAT32 = 0
+NO_COMPRESSION, ZSTD = 0, 1
+ZSTD_LEVEL = 1
+
+_HEADER = struct.Struct("<4sBBBBHHdIIIII")
+"""magic, version, kind, content, compression, classes, 0, resolution, words, scalars, vectors, payload bytes, CRC."""
+
+HEADER_BYTES = _HEADER.size
+
+
+@dataclass(frozen=True)
+class PacketHeader:
+    """What a packet says of itself."""
+
+    kind: int
+    compression: int
+    num_classes: int
+    resolution: float
+    num_words: int
+    num_scalars: int
+    num_vectors: int
+    payload_bytes: int
+
+    @property
+    def raw_bytes(self) -> int:
+        """Size of the uncompressed octree."""
+        return 2 * self.num_words + 4 * self.num_scalars + 4 * self.num_vectors * self.num_classes
+
+
+def encode_packet(octree: SemanticOctree, *, compress: bool = True, tolerance: float = 0.0, prune: bool = True) -> bytes:
+    """A whole map as a packet (a key frame).
+
+    Sibling leaves that differ by at most ``tolerance`` are merged (0: lossless); without ``prune`` none are.
+    """
+    return pack(octree.streams(prune=prune, tolerance=tolerance), octree.resolution, FULL, compress=compress)
+
+
+def encode_delta(octree: SemanticOctree, indices: Int64Array, *, compress: bool = True) -> bytes:
+    """A packet with the bricks ``indices`` (n,) int64 of a map, whole and lossless."""
+    return pack(octree.streams(indices), octree.resolution, DELTA, compress=compress)
+
+
+def pack(streams: TreeStreams, resolution: float, kind: int, *, compress: bool) -> bytes:
+    """The packet of an octree's streams."""
+    payload = b"".join(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes() for array in streams)
+    if compress:
+        payload = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(payload)
+    fields = (
+        MAGIC, VERSION, kind, CONTENT_FLOAT32, ZSTD if compress else NO_COMPRESSION, streams.vectors.shape[1], 0,
+        resolution, streams.words.size, streams.scalars.size, streams.vectors.shape[0], len(payload),
+    )  # fmt: skip
+    checksum = zlib.crc32(payload, zlib.crc32(_HEADER.pack(*fields, 0)))
+    return _HEADER.pack(*fields, checksum) + payload
+
+
+def read_header(data: bytes) -> PacketHeader:
+    """The header of a packet whose checksum holds. Raises PacketError for anything else."""
+    if len(data) < HEADER_BYTES or data[:4] != MAGIC:
+        raise PacketError("not a map packet")
+    _, version, kind, content, compression, num_classes, zero, resolution, *sizes, checksum = _HEADER.unpack_from(data)
+    if version != VERSION:
+        raise PacketError(f"map packet of format version {version}, this octoreplay reads version {VERSION}")
+    payload = data[HEADER_BYTES:]
+    if len(payload) != sizes[3]:
+        raise PacketError(f"map packet cut: {len(payload)} bytes of payload, its header says {sizes[3]}")
+    if zlib.crc32(payload, zlib.crc32(data[: HEADER_BYTES - 4] + bytes(4))) != checksum:
+        raise PacketError("map packet damaged: its checksum does not match")
+    known = kind in (FULL, DELTA) and content == CONTENT_FLOAT32 and compression in (NO_COMPRESSION, ZSTD)
+    if not known or zero or not num_classes or not 0 < resolution < np.inf:
+        raise PacketError("map packet of a kind, content or compression that this octoreplay does not know")
+    return PacketHeader(kind, compression, num_classes, resolution, *sizes)
+
+
+def decode_packet(data: bytes) -> SemanticOctree:
+    """The map of a key-frame packet. Raises PacketError for a delta and for anything that is not a whole packet."""
+    header = read_header(data)
+    if header.kind != FULL:
+        raise PacketError("map packet is a delta; it needs the map that it changes")
+    return _decode(data, header)
+
+
+def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0) -> None:
+    """Replace the bricks that a delta packet holds, in place. Raises PacketError and then leaves the map as it was."""
+    header = read_header(data)
+    if header.kind != DELTA:
+        raise PacketError("map packet is a key frame, not a delta")
+    if header.resolution != octree.resolution or header.num_classes != octree.num_classes:
+        raise PacketError("map packet of another resolution or number of classes than the map that it changes")
+    changed = _decode(data, header)
+    octree.overwrite(changed, np.arange(changed.num_bricks), revision)
+
+
+def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
+    """The octree of a packet with a good header."""
+    payload = data[HEADER_BYTES:]
+    if header.compression == ZSTD:
+        try:
+            # A hostile payload cannot unpack to more than the header's counts explain.
+            payload = zstandard.ZstdDecompressor().decompress(payload, max_output_size=max(header.raw_bytes, 1))
+        except zstandard.ZstdError as error:
+            raise PacketError(f"map packet cannot be decompressed: {error}") from error
+    if len(payload) != header.raw_bytes:
+        raise PacketError("map packet damaged: its size does not match its counts")
+    words_end = 2 * header.num_words
+    scalars_end = words_end + 4 * header.num_scalars
+    streams = TreeStreams(
+        np.frombuffer(payload[:words_end], "<u2"),
+        np.frombuffer(payload[words_end:scalars_end], "<f4"),
+        np.frombuffer(payload[scalars_end:], "<f4").reshape(-1, header.num_classes),
+    )
+    try:
+        return octree_from_streams(streams, header.resolution)
+    except ValueError as error:
+        raise PacketError(f"map packet damaged: {error}") from error
+
+
+def grid_bytes(num_cells: int, num_classes: int) -> int:
+    """Size of the uniform-grid packet that octree packets are compared with: an 8-byte key and K float32 per cell."""
+    return num_cells * (8 + 4 * (num_classes + 1))

@@ -1,0 +1,283 @@
+"""The semantic octree: one log-odds per occupied class in every known cell, stored in bricks of 8 x 8 x 8 cells.
+
+Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. See kernels.py for the layout.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from octoreplay.errors import InputError
+from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import Bricks
+from octoreplay.records import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    LeafTable,
+    UInt8Array,
+)
+
+
+class TreeStreams(NamedTuple):
+    """A depth-first octree: ``words`` (W,) uint16, ``scalars`` (S,) and ``vectors`` (V, C) float32."""
+
+    words: np.ndarray[tuple[int], np.dtype[np.uint16]]
+    scalars: Float32Array
+    vectors: Float32Array
+
+    @property
+    def num_leaves(self) -> int:
+        """Number of leaves."""
+        return self.scalars.size + self.vectors.shape[0]
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the three arrays."""
+        return self.words.nbytes + self.scalars.nbytes + self.vectors.nbytes
+
+
+class SemanticOctree:
+    """An octree over the key space [-2^18, 2^18)^3 with ``num_classes`` occupied classes.
+
+    ``resolution`` is the finest leaf's edge in metres; key = floor(coordinate / resolution).
+    """
+
+    def __init__(self, resolution: float, num_classes: int) -> None:
+        self.resolution = resolution
+        self.num_classes = num_classes
+        self.bricks = Bricks(
+            codes=np.empty(0, np.int64), tiers=np.empty(0, np.uint8), rows=np.empty(0, np.int32),
+            values=np.empty(0, np.float32), known=np.empty((0, 64), np.uint8), revisions=np.empty(0, np.int64),
+            table=np.full(64, -1, np.int32), counters=np.zeros(4, np.int64), free_scalar=np.empty(0, np.int32),
+            scalar=np.empty((0, kernels.BRICK_CELLS), np.float32),
+            vector=np.empty((0, num_classes, kernels.BRICK_CELLS), np.float32),
+        )  # fmt: skip
+
+    @property
+    def num_bricks(self) -> int:
+        """Number of bricks, the partly known ones included."""
+        return int(self.bricks.counters[kernels.NUM_BRICKS])
+
+    @property
+    def codes(self) -> Int64Array:
+        """Morton codes of the bricks (n,), in order of creation."""
+        return self.bricks.codes[: self.num_bricks]
+
+    @property
+    def known(self) -> UInt8Array:
+        """Masks of the known cells (n, 64): bit j of byte b is cell 8 b + j."""
+        return self.bricks.known[: self.num_bricks]
+
+    @property
+    def revisions(self) -> Int64Array:
+        """The revision (n,) in which each brick changed last, as its writers numbered it."""
+        return self.bricks.revisions[: self.num_bricks]
+
+    @property
+    def num_cells(self) -> int:
+        """Number of known finest cells."""
+        return int(kernels.count_known(self.known))
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes allocated for the bricks in use: their values, masks and bookkeeping."""
+        counters = self.bricks.counters
+        rows = counters[kernels.NUM_SCALAR] - counters[kernels.NUM_FREE_SCALAR]
+        per_brick = sum(array.itemsize for array in self.bricks[:6]) + 64
+        return int(
+            self.num_bricks * per_brick
+            + self.bricks.table.nbytes
+            + rows * kernels.BRICK_CELLS * 4
+            + counters[kernels.NUM_VECTOR] * kernels.BRICK_CELLS * 4 * self.num_classes
+        )
+
+    def reserve(self, bricks: int = 0, scalar: int = 0, vector: int = 0) -> None:
+        """Make room for so many more bricks and rows of values."""
+        old = self.bricks
+        counters = old.counters
+        num = self.num_bricks
+        changes: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
+        if num + bricks > old.codes.size:
+            for name in ("codes", "tiers", "rows", "values", "known", "revisions"):
+                changes[name] = _grown(getattr(old, name), num, num + bricks)
+        free = int(counters[kernels.NUM_FREE_SCALAR])
+        used = int(counters[kernels.NUM_SCALAR])
+        if used + scalar - free > old.scalar.shape[0]:
+            changes["scalar"] = _grown(old.scalar, used, used + scalar - free)
+            changes["free_scalar"] = _grown(old.free_scalar, free, changes["scalar"].shape[0])
+        used = int(counters[kernels.NUM_VECTOR])
+        if used + vector > old.vector.shape[0]:
+            changes["vector"] = _grown(old.vector, used, used + vector)
+        size = old.table.size
+        while size < 2 * (num + bricks):
+            size *= 2
+        if size > old.table.size:
+            changes["table"] = np.full(size, -1, np.int32)
+        if changes:
+            self.bricks = old._replace(**changes)
+        if "table" in changes:
+            kernels.rebuild_table(self.bricks)
+
+    def find(self, codes: Int64Array) -> Int64Array:
+        """Index of each brick code (n,) int64, -1 where there is no such brick."""
+        indices = np.empty(codes.size, np.int64)
+        kernels.find_all(self.bricks, codes, indices)
+        return indices
+
+    def find_or_add(self, codes: Int64Array) -> Int64Array:
+        """Index of each brick code (n,) int64; missing bricks are added, all unknown."""
+        self.reserve(bricks=codes.size)
+        indices = np.empty(codes.size, np.int64)
+        kernels.find_or_add(self.bricks, codes, indices)
+        return indices
+
+    def raise_tiers(self, tiers: UInt8Array) -> None:
+        """Raise brick i to at least tier ``tiers[i]``, for all bricks (n,)."""
+        present = self.bricks.tiers[: self.num_bricks]
+        self.reserve(
+            scalar=int(np.count_nonzero((tiers == kernels.SCALAR) & (present == kernels.UNIFORM))),
+            vector=int(np.count_nonzero((tiers == kernels.VECTOR) & (present != kernels.VECTOR))),
+        )
+        kernels.make_tiers(self.bricks, tiers)
+
+    def addresses(self, indices: Int64Array) -> tuple[Int64Array, UInt8Array]:
+        """Memory addresses and tiers (n,) of the bricks ``indices`` (n,); valid until this octree grows."""
+        addresses = np.empty(indices.size, np.int64)
+        tiers = np.empty(indices.size, np.uint8)
+        kernels.brick_addresses(
+            self.bricks, indices, self.bricks.scalar.ctypes.data, self.bricks.vector.ctypes.data,
+            self.bricks.values.ctypes.data, addresses, tiers,
+        )  # fmt: skip
+        return addresses, tiers
+
+    def overwrite(self, source: SemanticOctree, indices: Int64Array, revision: int = 0) -> None:
+        """Replace the bricks that ``indices`` (n,) name in ``source`` by its values."""
+        own = self.find_or_add(source.codes[indices])
+        tiers = self.bricks.tiers[: self.num_bricks].copy()
+        tiers[own] = np.maximum(tiers[own], source.bricks.tiers[indices])
+        self.raise_tiers(tiers)
+        kernels.copy_bricks(source.bricks, indices, self.bricks, own)
+        self.bricks.revisions[own] = revision
+
+    def copy(self) -> Self:
+        """An octree with the same content."""
+        twin = type(self)(self.resolution, self.num_classes)
+        twin.bricks = Bricks(*(array.copy() for array in self.bricks))
+        return twin
+
+    def streams(
+        self, indices: Int64Array | None = None, *, prune: bool = True, tolerance: float = 0.0
+    ) -> TreeStreams:
+        """The octree (or the bricks ``indices`` (n,) of it) as a depth-first stream of words and leaf values.
+
+        Eight sibling leaves whose values differ by at most ``tolerance`` are one leaf; without ``prune`` every known
+        finest cell is a leaf.
+        """
+        chosen = np.arange(self.num_bricks) if indices is None else indices
+        order = chosen[np.argsort(self.bricks.codes[chosen], kind="stable")]
+        tiers = self.bricks.tiers[order]
+        num_vector = int(np.count_nonzero(tiers == kernels.VECTOR))
+        num_uniform = int(np.count_nonzero(tiers == kernels.UNIFORM)) if prune else 0
+        cells = (order.size - num_uniform) * kernels.BRICK_CELLS + num_uniform
+        words = np.empty(order.size * (kernels.BRICK_DEPTH + 73), np.uint16)
+        scalars = np.empty(cells, np.float32)
+        vectors = np.empty((num_vector * kernels.BRICK_CELLS, self.num_classes), np.float32)
+        totals = kernels.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors)
+        return TreeStreams(words[: totals[0]], scalars[: totals[1]], vectors[: totals[2]])
+
+    def leaves(self, prior: float = 0.0) -> LeafTable:
+        """All leaves in Morton order; ``prior`` h_0 is added to the deviations."""
+        streams = self.streams()
+        codes, depths, is_vector = leaf_list(streams)
+        sizes = np.exp2(kernels.KEY_BITS - depths.astype(np.float64)) * self.resolution
+        keys = np.empty((codes.size, 3), np.int64)
+        kernels.codes_to_keys(codes, keys)
+        centers = keys * self.resolution + sizes[:, None] / 2
+        return LeafTable(centers, sizes, leaf_values(streams, is_vector) + np.float32(prior))
+
+    def lookup(self, coords: Float64Array) -> tuple[Float32Array, BoolArray, Float64Array]:
+        """What is at each coordinate (P, 3) [m]: deviations (P, C) float32, known (P,), size of the leaf (P,) [m].
+
+        An unknown place has deviation 0 and the size 0.
+        """
+        streams = self.streams()
+        codes, depths, is_vector = leaf_list(streams)
+        with np.errstate(invalid="ignore"):
+            keys = np.floor(np.asarray(coords, np.float64) / self.resolution)
+            inside = np.all(np.abs(keys) < kernels.KEY_OFFSET, axis=1)
+            keys = np.where(inside[:, None], keys, 0).astype(np.int64)
+        cell_codes = np.array([kernels.key_to_code(*key) for key in keys], np.int64)
+        leaf = np.searchsorted(codes, cell_codes, side="right") - 1
+        spans = np.int64(1) << (3 * (kernels.KEY_BITS - depths.astype(np.int64)))
+        known = inside & (leaf >= 0)
+        known[known] = cell_codes[known] < (codes + spans)[leaf[known]]
+        log_odds = np.zeros((len(keys), self.num_classes), np.float32)
+        log_odds[known] = leaf_values(streams, is_vector)[leaf[known]]
+        sizes = np.zeros(len(keys))
+        sizes[known] = np.exp2(kernels.KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
+        return log_odds, known, sizes
+
+
+def _grown(
+    array: np.ndarray[tuple[int, ...], np.dtype[np.generic]], used: int, wanted: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.generic]]:
+    """A copy of the first ``used`` rows with room for at least ``wanted``, growing by half."""
+    larger = np.empty((max(wanted, array.shape[0] * 3 // 2, 64), *array.shape[1:]), array.dtype)
+    larger[:used] = array[:used]
+    return larger
+
+
+def leaf_list(streams: TreeStreams) -> tuple[Int64Array, Int32Array, BoolArray]:
+    """Each leaf's Morton code (of its lowest finest cell), depth and whether it holds a vector: (L,) each.
+
+    Raises ValueError when the words are no octree with so many leaves.
+    """
+    count = streams.num_leaves
+    codes = np.empty(count, np.int64)
+    depths = np.empty(count, np.int32)
+    is_vector = np.empty(count, np.bool_)
+    found = kernels.walk_leaves(streams.words, codes, depths, is_vector)
+    if found != count or np.count_nonzero(is_vector) != streams.vectors.shape[0]:
+        raise ValueError("the words are no octree with that many leaves")
+    return codes, depths, is_vector
+
+
+def leaf_values(streams: TreeStreams, is_vector: BoolArray) -> Float32Array:
+    """Values (L, C) float32 of the leaves in order."""
+    values = np.empty((is_vector.size, streams.vectors.shape[1]), np.float32)
+    values[is_vector] = streams.vectors
+    values[~is_vector] = streams.scalars[:, None]
+    return values
+
+
+MAX_BRICKS = 1 << 24
+"""Most bricks of one octree that is built from leaves: 8.6e9 cells."""
+
+
+def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctree:
+    """The octree of a depth-first stream. Raises ValueError when the stream is no octree."""
+    codes, depths, is_vector = leaf_list(streams)
+    octree = SemanticOctree(resolution, streams.vectors.shape[1])
+    large = depths <= kernels.BRICK_DEPTH
+    spans = np.int64(1) << (3 * np.maximum(kernels.BRICK_DEPTH - depths[large].astype(np.int64), 0))
+    small_codes = codes[~large] >> 9
+    num_small = np.unique(small_codes).size
+    num_bricks = int(spans.sum(dtype=np.float64)) + num_small
+    if num_bricks > MAX_BRICKS:
+        raise ValueError("the stream holds more space than an octree may")
+    num_vector = int(spans[is_vector[large]].sum()) + np.unique(small_codes[is_vector[~large]]).size
+    octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
+    kernels.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
+    return octree
+
+
+def check_key_space(resolution: float, coords: Float64Array, what: str) -> None:
+    """Raise InputError when coordinates (n, 3) [m] lie outside the key space of this resolution."""
+    reach = kernels.KEY_OFFSET * resolution
+    if not np.all(np.abs(coords) < reach):
+        raise InputError(f"{what}: lies outside the map, which reaches {reach:g} m from its origin at {resolution:g} m")

@@ -1,0 +1,131 @@
+"""What of a run goes into the result: metrics and poses every tick, maps every few seconds, the summary at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from octoreplay.config import RunConfig
+from octoreplay.io.result_writer import ResultWriter
+from octoreplay.mapping import codec
+from octoreplay.records import FrameCounts, MapState, RunSummary, TickMetrics
+
+if TYPE_CHECKING:
+    from octoreplay.replay.session import Tick
+
+STATES_PER_KEY_FRAME = 12
+"""Every so many stored states of a robot, the first included, is a key frame."""
+
+
+class Recorder:
+    """Writes ticks to a result (or nowhere) and sums them up."""
+
+    def __init__(self, config: RunConfig, writer: ResultWriter | None) -> None:
+        self.start_ns = 0
+        self.last: Tick | None = None
+        self._config = config
+        self._writer = writer
+        self._num_states = {robot.robot_id: 0 for robot in config.robots}
+        self._state_tick = -1
+        self._view_tick = -1
+        self._num_settling = 0
+        self._peak = 0.0
+        self._peak_all = 0.0
+        self._bytes = np.zeros(3)
+        self._num_published = 0
+        self._sent_bytes = 0
+
+    def record(self, tick: Tick) -> None:
+        """Take one tick in."""
+        if self.last is None:
+            self.start_ns = tick.stamp_ns
+        self.last = tick
+        self._add_up(tick.metrics)
+        if self._writer is None:
+            return
+        self._writer.write_metrics(tick.metrics)
+        self._writer.write_poses(tick.stamp_ns, tick.poses)
+        ids = tick.graph.robot_ids
+        self._writer.write_graph(tick.stamp_ns, [(ids[a], ids[b]) for a, b in tick.graph.links], tick.poses)
+        if self._config.output.keep_packets:
+            for robot_id, published in zip(ids, tick.published, strict=True):
+                if published is not None:
+                    self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, published.packet)
+        if self._is_due(tick, self._config.output.state_every):
+            self._write_states(tick)
+        if self._is_due(tick, self._config.output.view_every):
+            self._write_views(tick)
+
+    def finish(self, stop_reason: str, counts: Mapping[str, FrameCounts], wall_seconds: float) -> RunSummary:
+        """Store the last maps and sum the run up; at least one tick was recorded."""
+        tick = self.last
+        assert tick is not None  # noqa: S101  a session without a tick raises
+        if self._writer is not None:
+            if self._state_tick < tick.number:
+                self._write_states(tick)
+            if self._view_tick < tick.number:
+                self._write_views(tick)
+        means = self._bytes / max(self._num_published, 1)
+        return RunSummary(
+            num_ticks=tick.number + 1,
+            num_settling_ticks=self._num_settling,
+            stop_reason=stop_reason,
+            log_seconds=(tick.stamp_ns - self.start_ns) / 1e9 - self._num_settling * self._config.network.publish_period,
+            wall_seconds=wall_seconds,
+            last=tick.metrics,
+            peak_total_distance=self._peak,
+            peak_total_distance_all=self._peak_all,
+            mean_packet_bytes=float(means[0]),
+            mean_octree_bytes=float(means[1]),
+            mean_grid_bytes=float(means[2]),
+            total_sent_bytes=self._sent_bytes,
+            frame_counts=counts,
+            warnings=(),
+        )
+
+    def _add_up(self, metrics: TickMetrics) -> None:
+        """Sums and peaks over the ticks."""
+        self._num_settling += metrics.settling
+        self._peak = max(self._peak, metrics.total_distance)
+        self._peak_all = max(self._peak_all, metrics.total_distance_all)
+        for robot in metrics.robots:
+            if robot.packet_bytes:
+                self._bytes += (robot.packet_bytes, robot.octree_bytes, robot.grid_bytes)
+                self._num_published += 1
+        self._sent_bytes += sum(link.sent_bytes for link in metrics.links)
+
+    def _is_due(self, tick: Tick, every: float) -> bool:
+        """True when a multiple of ``every`` seconds of log time fell into the period that ends with this tick."""
+        period = round(self._config.network.publish_period * 1e9)
+        interval = max(round(every * 1e9), 1)
+        elapsed = tick.stamp_ns - self.start_ns
+        return elapsed // interval > (elapsed - period) // interval
+
+    def _write_states(self, tick: Tick) -> None:
+        """Store every robot's map: a key frame now and then, otherwise the bricks that changed since the last state."""
+        if self._writer is None:
+            return
+        for robot_id, octree in zip(tick.graph.robot_ids, tick.maps, strict=True):
+            sequence = self._num_states[robot_id]
+            is_key_frame = sequence % STATES_PER_KEY_FRAME == 0
+            if is_key_frame:
+                data = codec.encode_packet(octree)
+            else:
+                data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self._state_tick))
+            base = sequence if is_key_frame else sequence - 1
+            self._writer.write_state(
+                MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
+            )
+            self._num_states[robot_id] = sequence + 1
+        self._state_tick = tick.number
+
+    def _write_views(self, tick: Tick) -> None:
+        """Store every robot's map for viewing."""
+        if self._writer is None:
+            return
+        for robot_id, octree in zip(tick.graph.robot_ids, tick.maps, strict=True):
+            prior = self._config.map.prior(octree.num_classes)
+            self._writer.write_view(robot_id, tick.stamp_ns, octree.leaves(prior))
+        self._view_tick = tick.number

@@ -1,0 +1,170 @@
+"""One robot of the team: what its own scans say, and the map that it agrees on with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoreplay.config import RunConfig
+from octoreplay.mapping import codec
+from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.sensor import (
+    COUNT_SCANS,
+    ScanCaster,
+    add_scan,
+    clamped_increments,
+    unclamped_increments,
+)
+from octoreplay.records import Float64Array, Frame, Int64Array
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedMap:
+    """A map as it went over the air in one tick: the packet, and what every receiver decodes from it."""
+
+    packet: bytes
+    octree: SemanticOctree
+    octree_bytes: int
+    grid_bytes: int
+    unpruned_bytes: int
+    unpruned_compressed_bytes: int
+
+
+class Robot:
+    """A robot's evidence s_i, its map h_i and the iterations that bring them together.
+
+    ``tick`` numbers, which grow, mark what changed when. Methods of different robots may run in parallel threads.
+    """
+
+    def __init__(self, robot_id: str, config: RunConfig, num_classes: int) -> None:
+        self.robot_id = robot_id
+        self.num_scans = 0
+        self.num_iterations = 0
+        self.T_team_sensor: Float64Array | None = None
+        self._config = config
+        self._caster = ScanCaster(config.sensor, config.map, num_classes)
+        self._increments = clamped_increments(config.sensor)
+        self._is_average = config.consensus.evidence != "sum"
+        if self._is_average:
+            self._increments = unclamped_increments(config.sensor)
+
+        def octree(classes: int = num_classes) -> SemanticOctree:
+            return SemanticOctree(config.map.resolution, classes)
+
+        self._own_sum = octree()
+        self._scan_counts = octree(1) if config.consensus.evidence == "cell-average" else None
+        self._log_likelihood = octree() if self._is_average else self._own_sum
+        self._last_log_likelihood = octree()
+        self._likelihood_tick = -1
+        self.map = octree()
+        self.streams: TreeStreams = self.map.streams()
+
+    @property
+    def evidence(self) -> Evidence:
+        """How log q_i follows from the robot's own sums."""
+        if self._config.consensus.evidence == "time-average":
+            return Evidence(self._own_sum, scale=1.0 / max(self.num_scans, 1))
+        return Evidence(self._own_sum, scan_counts=self._scan_counts)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the robot's own octrees: evidence, map and what the rule keeps beside them."""
+        octrees = {id(o): o for o in (self._own_sum, self._log_likelihood, self._last_log_likelihood, self.map)}
+        if self._scan_counts is not None:
+            octrees[id(self._scan_counts)] = self._scan_counts
+        return sum(o.memory_bytes for o in octrees.values())
+
+    def integrate(self, frames: Sequence[Frame], tick: int) -> None:
+        """Add the robot's scans of one tick to its evidence."""
+        for frame in frames:
+            cells = self._caster.cast(frame)
+            add_scan(self._own_sum, cells, self._increments, tick)
+            if self._scan_counts is not None:
+                add_scan(self._scan_counts, cells, COUNT_SCANS, tick)
+            self.num_scans += 1
+            self.T_team_sensor = frame.T_team_sensor
+
+    def changed_evidence(self, tick: int) -> Int64Array:
+        """Codes of the bricks whose log q_i changed in this tick; all of them when every scan rescales all cells."""
+        changed = self._own_sum.revisions >= tick
+        if self._config.consensus.evidence == "time-average" and changed.any():
+            return self._own_sum.codes.copy()
+        return self._own_sum.codes[changed]
+
+    def publish(self, *, compare_sizes: bool = True) -> PublishedMap:
+        """The robot's map as a packet, with the sizes it would have in other encodings."""
+        compress = self._config.network.packet_compression == "zstd"
+        resolution = self.map.resolution
+        packet = codec.pack(self.streams, resolution, codec.FULL, compress=compress)
+        unpruned = self.map.streams(prune=False)
+        squeezed = codec.pack(unpruned, resolution, codec.FULL, compress=True) if compare_sizes else b""
+        return PublishedMap(
+            packet=packet,
+            octree=codec.decode_packet(packet),
+            octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
+            grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
+            unpruned_bytes=codec.HEADER_BYTES + unpruned.num_bytes,
+            unpruned_compressed_bytes=len(squeezed),
+        )
+
+    def iterate(
+        self, own: PublishedMap | None, arrived: Sequence[tuple[SemanticOctree, float]], factor: float, tick: int
+    ) -> float:
+        """All iterations of one tick; ``arrived`` are the neighbours' maps with their step weights 2 epsilon A_ij.
+
+        ``factor`` scales gamma (settling ramps it to 0). Returns the largest change of a log-odds.
+        """
+        consensus = self._config.consensus
+        self._update_log_likelihood(tick)
+        if consensus.rule == "local":
+            change = self._follow_evidence(tick)
+        elif consensus.mode == "sync" or not arrived:
+            lossy = self._config.map.prune_tolerance > 0
+            change = self._step(own.octree if own and lossy else None, arrived, factor, tick)
+        else:
+            # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
+            base = own.octree if own is not None and consensus.rule == "bayes" else None
+            share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
+            change = sum(self._step(base, [arrival], share, tick) for arrival in arrived)
+        self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
+        return change
+
+    def _step(
+        self, base: SemanticOctree | None, arrived: Sequence[tuple[SemanticOctree, float]], factor: float, tick: int
+    ) -> float:
+        """One iteration of the rule."""
+        consensus = self._config.consensus
+        change = consensus_step(
+            self.map,
+            [octree for octree, _ in arrived],
+            [weight for _, weight in arrived],
+            self._log_likelihood,
+            rule=consensus.rule,
+            gamma=factor * gamma_at(consensus, self.num_iterations),
+            revision=tick,
+            base=base,
+            last_log_likelihood=self._last_log_likelihood,
+        )
+        self.num_iterations += 1
+        if consensus.rule == "bayes":
+            changed = np.flatnonzero(self._log_likelihood.revisions > self._likelihood_tick)
+            self._last_log_likelihood.overwrite(self._log_likelihood, changed)
+            self._likelihood_tick = tick
+        return change
+
+    def _follow_evidence(self, tick: int) -> float:
+        """The rule ``local``: h_i = log q_i."""
+        before = self._log_likelihood.revisions
+        changed = np.flatnonzero(before > self._likelihood_tick)
+        self.map.overwrite(self._log_likelihood, changed, tick)
+        self._likelihood_tick = tick
+        self.num_iterations += 1
+        return float(changed.size > 0)
+
+    def _update_log_likelihood(self, tick: int) -> None:
+        """Bring log q_i up to the scans of this tick; for ``sum`` it is the evidence itself."""
+        if self._is_average:
+            sum_of_evidence(self._log_likelihood, [self.evidence], self.changed_evidence(tick), tick)

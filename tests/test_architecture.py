@@ -1,0 +1,81 @@
+"""Who may import whom, and that a breach is seen."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+TWIN_CONTRACT = """
+[tool.importlinter]
+root_packages = ["octoreplay", "reference"]
+
+[[tool.importlinter.contracts]]
+name = "The reference twin shares no code with what it judges"
+type = "forbidden"
+source_modules = ["reference"]
+forbidden_modules = ["octoreplay.mapping", "octoreplay.replay"]
+ignore_imports = ["octoreplay -> octoreplay.**"]
+"""
+"""Beside the contracts of pyproject.toml, because the twin is found among the tests only."""
+
+BREACHES = {
+    "octoreplay.errors imports octoreplay.cli": ("errors.py", "from octoreplay import cli"),
+    "octoreplay.mapping imports octoreplay.io": ("mapping/__init__.py", "from octoreplay.io import poses"),
+    "octoreplay.io imports octoreplay.mapping": ("io/poses.py", "from octoreplay.mapping import kernels"),
+    "octoreplay.mapping imports mcap": ("mapping/__init__.py", "import mcap"),
+}
+
+
+def check_contracts(config: Path, *folders: Path) -> subprocess.CompletedProcess[str]:
+    """Run import-linter on the packages in some folders."""
+    code = (
+        "import sys; from importlinter.cli import lint_imports;"
+        " sys.exit(lint_imports(config_filename=sys.argv[1], no_cache=True))"
+    )
+    # The working folder is where import-linter looks for packages first.
+    return subprocess.run(
+        [sys.executable, "-c", code, str(config)],
+        cwd=folders[0], env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
+        text=True, capture_output=True, check=False,
+    )  # fmt: skip
+
+
+def copied(folder: Path, to: Path) -> Path:
+    shutil.copytree(folder, to, ignore=shutil.ignore_patterns("__pycache__"))
+    return to
+
+
+def add_line(path: Path, line: str) -> None:
+    path.write_text(f"{path.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
+
+
+def test_the_contracts_hold() -> None:
+    done = check_contracts(ROOT / "pyproject.toml", ROOT / "src")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("breach", BREACHES)
+def test_a_breach_is_seen(breach: str, tmp_path: Path) -> None:
+    package = copied(ROOT / "src" / "octoreplay", tmp_path / "octoreplay")
+    file, line = BREACHES[breach]
+    add_line(package / file, line)
+    done = check_contracts(ROOT / "pyproject.toml", tmp_path)
+    assert done.returncode == 1, done.stdout + done.stderr
+    importer, imported = breach.split(" imports ")
+    assert f"{importer} is not allowed to import {imported}" in done.stdout
+
+
+@pytest.mark.parametrize("breach", ["", "from octoreplay.mapping import kernels", "import octoreplay.result"])
+def test_the_reference_twin_shares_no_code_with_what_it_judges(breach: str, tmp_path: Path) -> None:
+    twin = copied(ROOT / "tests" / "reference", tmp_path / "reference")
+    add_line(twin / "rules.py", breach)
+    config = tmp_path / "contract.toml"
+    config.write_text(TWIN_CONTRACT, encoding="utf-8")
+    done = check_contracts(config, tmp_path, ROOT / "src")
+    assert done.returncode == bool(breach), done.stdout + done.stderr
+    assert ("reference is not allowed to import octoreplay.mapping" in done.stdout) == bool(breach)
