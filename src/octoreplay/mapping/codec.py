@@ -45,7 +45,9 @@ class PacketHeader:
         return 2 * self.num_words + 4 * self.num_scalars + 4 * self.num_vectors * self.num_classes
 
 
-def encode_packet(octree: SemanticOctree, *, compress: bool = True, tolerance: float = 0.0, prune: bool = True) -> bytes:
+def encode_packet(
+    octree: SemanticOctree, *, compress: bool = True, tolerance: float = 0.0, prune: bool = True
+) -> bytes:
     """A whole map as a packet (a key frame).
 
     Sibling leaves that differ by at most ``tolerance`` are merged (0: lossless); without ``prune`` none are.

@@ -12,7 +12,7 @@ from octoreplay.mapping import kernels
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float32Array, Int64Array, UInt8Array
 
-_RULES = {"gradient": kernels.GRADIENT, "natural": kernels.NATURAL, "bayes": kernels.BAYES}
+_RULES = {"gradient": kernels.GRADIENT, "natural": kernels.NATURAL, "bayes": kernels.BAYES, "local": kernels.LOCAL}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +47,11 @@ def consensus_step(
     2 epsilon A_ij; ``base`` b_i is the robot's own published map (default: ``own`` itself). Then, with log q_i =
     ``log_likelihood``:
 
-    - ``gradient`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), D = h~ - log q_i, sigma = softmax(h~);
+    - ``gradient`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
+      sigma = softmax(h~);
     - ``natural``: h_i = h~ + gamma (log q_i - h~);
-    - ``bayes``: h_i = h~ + log q_i - ``last_log_likelihood`` (log q_i at the last iteration).
+    - ``bayes``: h_i = h~ + log q_i - ``last_log_likelihood`` (log q_i at the last iteration);
+    - ``local``: h_i = log q_i.
 
     h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same step done cell by cell.
     """
@@ -65,14 +67,20 @@ def consensus_step(
     addresses, tiers = address_table(columns, codes)
     changes = np.empty(codes.size, np.float32)
     kernels.consensus_step(
-        addresses, tiers, np.asarray(step_weights, np.float32), _RULES[rule], np.float32(gamma), own.num_classes, changes
+        addresses,
+        tiers,
+        np.asarray(step_weights, np.float32),
+        _RULES[rule],
+        np.float32(gamma),
+        own.num_classes,
+        changes,
     )
     kernels.finish_step(own.bricks, changes, known_changed, revision)
     return float(changes.max(initial=0.0))
 
 
 def _take_known(own: SemanticOctree, sources: Sequence[SemanticOctree]) -> UInt8Array:
-    """Add the cells that the sources know to the robot's map; a flag (n,) for each brick where that changed anything."""
+    """Add the cells that the sources know to the robot's map; a flag (n,) for each brick where that changed it."""
     indices = [own.find_or_add(source.codes) for source in sources]
     changed = np.zeros(own.num_bricks, np.uint8)
     for source, places in zip(sources, indices, strict=True):
@@ -81,7 +89,7 @@ def _take_known(own: SemanticOctree, sources: Sequence[SemanticOctree]) -> UInt8
 
 
 def address_table(octrees: Sequence[SemanticOctree], codes: Int64Array) -> tuple[Int64Array, UInt8Array]:
-    """Memory addresses and tiers (n, len(octrees)) of the bricks ``codes`` (n,); valid until one of the octrees grows."""
+    """Memory addresses and tiers (n, len(octrees)) of the bricks ``codes`` (n,); valid until an octree grows."""
     addresses = np.empty((codes.size, len(octrees)), np.int64)
     tiers = np.empty((codes.size, len(octrees)), np.uint8)
     for column, octree in enumerate(octrees):
@@ -89,9 +97,7 @@ def address_table(octrees: Sequence[SemanticOctree], codes: Int64Array) -> tuple
     return addresses, tiers
 
 
-def sum_of_evidence(
-    target: SemanticOctree, evidence: Sequence[Evidence], codes: Int64Array, revision: int
-) -> None:
+def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes: Int64Array, revision: int) -> None:
     """Write sum_i log q_i of the bricks ``codes`` (n,) into ``target``: the oracle, or one robot's log q_i.
 
     All robots read their evidence the same way. Bricks that are written get ``revision``.

@@ -37,7 +37,7 @@ CHILD_UNKNOWN, CHILD_INNER, CHILD_SCALAR, CHILD_VECTOR = 0, 1, 2, 3
 CUT = 255
 """Kind of a ray that was cut at max_range; other kinds are class ids, 0 for an ignored label."""
 
-GRADIENT, NATURAL, BAYES = 0, 1, 2
+GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
 logger = logging.getLogger(__name__)
 
@@ -258,10 +258,10 @@ def make_tiers(bricks, tiers):
 @kernel
 def _all_known(known):
     """True when all 512 cells of a brick are known."""
+    missing = 0
     for byte in range(64):
-        if known[byte] != 255:
-            return False
-    return True
+        missing += known[byte] != 255
+    return missing == 0
 
 
 @kernel
@@ -483,8 +483,8 @@ def _mark(marks, cell, value, touched_flags, touched, count):
 def mark_ends(keys, kinds, num_classes, corner, offsets, mapped, slots, votes, rays, marks, touched_flags, touched):
     """Find the distinct end cells and mark the hit ones with 1 + the class that most points in them have.
 
-    ``offsets`` (3, m) are the axis tables of the scratch grid with lowest cell ``corner`` (3,); in ``mapped`` coordinates
-    outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed and left
+    ``offsets`` (3, m) are the axis tables of the scratch grid with lowest cell ``corner`` (3,); in ``mapped``,
+    coordinates outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed and left
     so; ``rays`` (n,) gets one input index for each distinct end cell. Returns the number of distinct end cells and of
     touched bricks.
     """
@@ -665,7 +665,7 @@ def clear_marks(marks, touched_flags, touched):
 
 @fast_kernel
 def _exp_negative(x, out, powers, scales):
-    """exp of ``x`` (512,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
+    """Exp of ``x`` (512,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
 
     ``powers`` (512,) int32 and ``scales``, the same memory seen as float32, are scratch.
     """
@@ -687,7 +687,7 @@ def _exp_negative(x, out, powers, scales):
 
 @inline_kernel
 def _add_scaled(target, address, tier, c, factor, num_classes):
-    """target (512,) += factor x class c of the brick at ``address``."""
+    """Target (512,) += factor x class c of the brick at ``address``."""
     if tier == UNIFORM:
         value = carray(_float_pointer(address), (1,))[0] * factor
         for i in range(target.size):
@@ -704,14 +704,14 @@ def _add_scaled(target, address, tier, c, factor, num_classes):
 
 @inline_kernel
 def _load(target, address, tier, c, num_classes):
-    """target (512,) = class c of the brick at ``address``, 0 where there is none."""
+    """Target (512,) = class c of the brick at ``address``, 0 where there is none."""
     target[:] = np.float32(0.0)
     _add_scaled(target, address, tier, c, np.float32(1.0), num_classes)
 
 
 @inline_kernel
 def _load_evidence(target, addresses, tiers, column, count_column, scale, c, counts, num_classes):
-    """target (512,) = class c of log q: the evidence times ``scale``, or divided by the cells' scan counts."""
+    """Target (512,) = class c of log q: the evidence times ``scale``, or divided by the cells' scan counts."""
     _load(target, addresses[column], tiers[column], c, num_classes)
     if count_column >= 0:
         _load(counts, addresses[count_column], tiers[count_column], 0, 1)
@@ -731,8 +731,8 @@ differences), its evidence log q, its evidence at the last iteration, then the n
 def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes):
     """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
 
-    ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of all
-    others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``changes`` (n,) gets each brick's largest change of a log-odds.
+    ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of
+    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``changes`` (n,) gets each brick's largest change.
     All classes of a brick that is not VECTOR are equal; the sums over classes then are ``num_classes`` times one term.
     """
     num_neighbours = weights.size
@@ -771,6 +771,8 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes)
             if rule == BAYES:
                 _add_scaled(row, addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, np.float32(1.0), num_classes)
                 _add_scaled(row, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], c, np.float32(-1.0), num_classes)
+            elif rule == LOCAL:
+                _load(row, addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, num_classes)
             else:
                 _load(other[:cells], addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, num_classes)
                 for i in range(cells):
@@ -864,7 +866,7 @@ def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targ
 
 @fast_kernel
 def _brick_labels(address, tier, prior, num_classes, labels, best, row):
-    """argmax class (512,) of a brick and its log-odds; free is 0, ties go to the lower id."""
+    """Argmax class (512,) of a brick and its log-odds; free is 0, ties go to the lower id."""
     labels[:] = 0
     best[:] = np.float32(0.0)
     width = num_classes if tier == VECTOR else 1
@@ -883,8 +885,8 @@ def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distanc
 
     ``known`` (n, N, 64) are the robots' masks and ``link_ends`` (L, 2) the links' robots. Outputs per brick:
     ``distances`` (n, 2): sum of squared differences over the links, and over all pairs of robots;
-    ``counts`` (n, 3 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing labels;
-    then per robot known cells, agreeing cells, agreeing cells that the oracle calls occupied;
+    ``counts`` (n, 3 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
+    labels; then per robot known cells, agreeing cells, agreeing cells that the oracle calls occupied;
     ``entropies`` (n, N): sum over the robot's known cells in nats.
     """
     robots = known.shape[1]

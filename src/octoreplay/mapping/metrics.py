@@ -94,7 +94,15 @@ class MapComparer:
         counts = np.empty((rows.size, self._counts.shape[1]), np.int64)
         entropies = np.empty((rows.size, len(maps)))
         kernels.compare_maps(
-            addresses, tiers, known, link_ends, np.float32(self._prior), maps[0].num_classes, distances, counts, entropies
+            addresses,
+            tiers,
+            known,
+            link_ends,
+            np.float32(self._prior),
+            maps[0].num_classes,
+            distances,
+            counts,
+            entropies,
         )
         self._distances[rows] = distances
         self._counts[rows] = counts
@@ -124,5 +132,5 @@ class MapComparer:
 
 
 def _share(parts: Int64Array, whole: int) -> Float64Array:
-    """parts / whole, where a share of nothing is 1."""
+    """Parts / whole, where a share of nothing is 1."""
     return parts / whole if whole else np.ones(len(parts))

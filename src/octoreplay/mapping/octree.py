@@ -5,11 +5,11 @@ Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. S
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from octoreplay.errors import InputError
 from octoreplay.mapping import kernels
 from octoreplay.mapping.kernels import Bricks
 from octoreplay.records import (
@@ -26,14 +26,14 @@ from octoreplay.records import (
 class TreeStreams(NamedTuple):
     """A depth-first octree: ``words`` (W,) uint16, ``scalars`` (S,) and ``vectors`` (V, C) float32."""
 
-    words: np.ndarray[tuple[int], np.dtype[np.uint16]]
+    words: npt.NDArray[np.uint16]
     scalars: Float32Array
     vectors: Float32Array
 
     @property
     def num_leaves(self) -> int:
         """Number of leaves."""
-        return self.scalars.size + self.vectors.shape[0]
+        return int(self.scalars.size + self.vectors.shape[0])
 
     @property
     def num_bytes(self) -> int:
@@ -101,7 +101,7 @@ class SemanticOctree:
         old = self.bricks
         counters = old.counters
         num = self.num_bricks
-        changes: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
+        changes: dict[str, Any] = {}
         if num + bricks > old.codes.size:
             for name in ("codes", "tiers", "rows", "values", "known", "revisions"):
                 changes[name] = _grown(getattr(old, name), num, num + bricks)
@@ -167,12 +167,10 @@ class SemanticOctree:
     def copy(self) -> Self:
         """An octree with the same content."""
         twin = type(self)(self.resolution, self.num_classes)
-        twin.bricks = Bricks(*(array.copy() for array in self.bricks))
+        twin.bricks = Bricks(*(cast("Any", array).copy() for array in self.bricks))
         return twin
 
-    def streams(
-        self, indices: Int64Array | None = None, *, prune: bool = True, tolerance: float = 0.0
-    ) -> TreeStreams:
+    def streams(self, indices: Int64Array | None = None, *, prune: bool = True, tolerance: float = 0.0) -> TreeStreams:
         """The octree (or the bricks ``indices`` (n,) of it) as a depth-first stream of words and leaf values.
 
         Eight sibling leaves whose values differ by at most ``tolerance`` are one leaf; without ``prune`` every known
@@ -223,9 +221,7 @@ class SemanticOctree:
         return log_odds, known, sizes
 
 
-def _grown(
-    array: np.ndarray[tuple[int, ...], np.dtype[np.generic]], used: int, wanted: int
-) -> np.ndarray[tuple[int, ...], np.dtype[np.generic]]:
+def _grown(array: npt.NDArray[Any], used: int, wanted: int) -> npt.NDArray[Any]:
     """A copy of the first ``used`` rows with room for at least ``wanted``, growing by half."""
     larger = np.empty((max(wanted, array.shape[0] * 3 // 2, 64), *array.shape[1:]), array.dtype)
     larger[:used] = array[:used]
@@ -274,10 +270,3 @@ def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctr
     octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
     kernels.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
     return octree
-
-
-def check_key_space(resolution: float, coords: Float64Array, what: str) -> None:
-    """Raise InputError when coordinates (n, 3) [m] lie outside the key space of this resolution."""
-    reach = kernels.KEY_OFFSET * resolution
-    if not np.all(np.abs(coords) < reach):
-        raise InputError(f"{what}: lies outside the map, which reaches {reach:g} m from its origin at {resolution:g} m")

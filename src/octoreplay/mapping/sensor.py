@@ -104,7 +104,7 @@ class ScanCaster:
         )  # fmt: skip
         if self._sensor.rays == "cells":
             keys = keys[self._rays[:num_rays]]
-            ends = (keys + 0.5) * self._resolution
+            ends = (keys.astype(np.float64) + 0.5) * self._resolution
         num_touched = kernels.mark_free(
             origin, ends, keys, self._resolution, corner, mapped, self._marks, self._flags, self._touched, num_touched
         )
@@ -134,8 +134,9 @@ class ScanCaster:
         reach = kernels.KEY_OFFSET * self._resolution
         if count < 0 or not np.all(np.abs(pose[:3, 3]) < reach):
             raise InputError(
-                f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches {reach:g} m "
-                f"from its origin at {self._resolution:g} m: check the poses, or give T_team_map or a coarser resolution"
+                f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches "
+                f"{reach:g} m from its origin at a resolution of {self._resolution:g} m; check the poses, or give "
+                "T_team_map or a coarser resolution"
             )
         return keys[:count], kinds[:count], ends[:count]
 
@@ -172,7 +173,7 @@ class ScanCaster:
     def _grid(
         self, keys: Int32Array, origin: Float64Array
     ) -> tuple[Int64Array, tuple[Int64Array, Int64Array], Int64Array]:
-        """The scratch grid around a scan: its lowest cell, (axis offsets, edge lengths), offsets of mapped cells only."""
+        """The scratch grid around a scan: its lowest cell, (axis offsets, edges), offsets of mapped cells only."""
         start = np.floor(origin / self._resolution).astype(np.int64)
         low = np.minimum(start, keys.min(axis=0, initial=kernels.KEY_OFFSET)) >> kernels.BRICK_BITS
         high = np.maximum(start, keys.max(axis=0, initial=-kernels.KEY_OFFSET)) >> kernels.BRICK_BITS

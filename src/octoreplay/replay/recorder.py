@@ -61,7 +61,7 @@ class Recorder:
     def finish(self, stop_reason: str, counts: Mapping[str, FrameCounts], wall_seconds: float) -> RunSummary:
         """Store the last maps and sum the run up; at least one tick was recorded."""
         tick = self.last
-        assert tick is not None  # noqa: S101  a session without a tick raises
+        assert tick is not None
         if self._writer is not None:
             if self._state_tick < tick.number:
                 self._write_states(tick)
@@ -72,7 +72,8 @@ class Recorder:
             num_ticks=tick.number + 1,
             num_settling_ticks=self._num_settling,
             stop_reason=stop_reason,
-            log_seconds=(tick.stamp_ns - self.start_ns) / 1e9 - self._num_settling * self._config.network.publish_period,
+            log_seconds=(tick.stamp_ns - self.start_ns) / 1e9
+            - self._num_settling * self._config.network.publish_period,
             wall_seconds=wall_seconds,
             last=tick.metrics,
             peak_total_distance=self._peak,
@@ -115,9 +116,7 @@ class Recorder:
             else:
                 data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self._state_tick))
             base = sequence if is_key_frame else sequence - 1
-            self._writer.write_state(
-                MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
-            )
+            self._writer.write_state(MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data))
             self._num_states[robot_id] = sequence + 1
         self._state_tick = tick.number
 

@@ -58,6 +58,7 @@ class Robot:
         self._scan_counts = octree(1) if config.consensus.evidence == "cell-average" else None
         self._log_likelihood = octree() if self._is_average else self._own_sum
         self._last_log_likelihood = octree()
+        self._scan_tick = -1
         self._likelihood_tick = -1
         self.map = octree()
         self.streams: TreeStreams = self.map.streams()
@@ -85,29 +86,29 @@ class Robot:
             if self._scan_counts is not None:
                 add_scan(self._scan_counts, cells, COUNT_SCANS, tick)
             self.num_scans += 1
+            self._scan_tick = tick
             self.T_team_sensor = frame.T_team_sensor
 
     def changed_evidence(self, tick: int) -> Int64Array:
         """Codes of the bricks whose log q_i changed in this tick; all of them when every scan rescales all cells."""
         changed = self._own_sum.revisions >= tick
-        if self._config.consensus.evidence == "time-average" and changed.any():
+        if self._config.consensus.evidence == "time-average" and self._scan_tick >= tick:
             return self._own_sum.codes.copy()
         return self._own_sum.codes[changed]
 
-    def publish(self, *, compare_sizes: bool = True) -> PublishedMap:
+    def publish(self) -> PublishedMap:
         """The robot's map as a packet, with the sizes it would have in other encodings."""
         compress = self._config.network.packet_compression == "zstd"
         resolution = self.map.resolution
         packet = codec.pack(self.streams, resolution, codec.FULL, compress=compress)
         unpruned = self.map.streams(prune=False)
-        squeezed = codec.pack(unpruned, resolution, codec.FULL, compress=True) if compare_sizes else b""
         return PublishedMap(
             packet=packet,
             octree=codec.decode_packet(packet),
             octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
             grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
             unpruned_bytes=codec.HEADER_BYTES + unpruned.num_bytes,
-            unpruned_compressed_bytes=len(squeezed),
+            unpruned_compressed_bytes=len(codec.pack(unpruned, resolution, codec.FULL, compress=True)),
         )
 
     def iterate(
@@ -119,16 +120,18 @@ class Robot:
         """
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
-        if consensus.rule == "local":
-            change = self._follow_evidence(tick)
-        elif consensus.mode == "sync" or not arrived:
+        if consensus.mode == "sync" or not arrived:
             lossy = self._config.map.prune_tolerance > 0
             change = self._step(own.octree if own and lossy else None, arrived, factor, tick)
         else:
             # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
             base = own.octree if own is not None and consensus.rule == "bayes" else None
             share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
-            change = sum(self._step(base, [arrival], share, tick) for arrival in arrived)
+            before = self.map.copy()
+            for arrival in arrived:
+                self._step(base, [arrival], share, tick)
+            # What one arrival changes another may undo; what counts is the change over the tick.
+            change = consensus_step(before, (), (), self.map, rule="local", gamma=0.0, revision=tick)
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
         return change
 
@@ -154,15 +157,6 @@ class Robot:
             self._last_log_likelihood.overwrite(self._log_likelihood, changed)
             self._likelihood_tick = tick
         return change
-
-    def _follow_evidence(self, tick: int) -> float:
-        """The rule ``local``: h_i = log q_i."""
-        before = self._log_likelihood.revisions
-        changed = np.flatnonzero(before > self._likelihood_tick)
-        self.map.overwrite(self._log_likelihood, changed, tick)
-        self._likelihood_tick = tick
-        self.num_iterations += 1
-        return float(changed.size > 0)
 
     def _update_log_likelihood(self, tick: int) -> None:
         """Bring log q_i up to the scans of this tick; for ``sum`` it is the evidence itself."""

@@ -22,6 +22,7 @@ from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
+    Frame,
     FrameCounts,
     LinkMetrics,
     RobotMetrics,
@@ -146,7 +147,7 @@ class Session:
 
     def _integrate(self, number: int, stamp_ns: int) -> None:
         """Every scan with a stamp before the tick goes into its robot's evidence."""
-        frames = {robot_id: [] for robot_id in self._robot_ids}
+        frames: dict[str, list[Frame]] = {robot_id: [] for robot_id in self._robot_ids}
         for frame in self._timeline.frames_before(stamp_ns):
             frames[frame.robot_id].append(frame)
         self._each(lambda robot: robot.integrate(frames[robot.robot_id], number), self._robots)
@@ -284,7 +285,7 @@ def replay_team(
     """
     started = time.monotonic()
     config = resolve(config)
-    assert config.classes is not None  # noqa: S101  resolve() always fills it
+    assert config.classes is not None
     with ExitStack() as stack:
         logs = [stack.enter_context(RobotLog(robot, config.time, config.classes)) for robot in config.robots]
         session = Session(config, logs, num_threads=num_threads)
@@ -320,8 +321,8 @@ def _causes(logs: Sequence[RobotLog]) -> str:
 
     def text(counts: FrameCounts) -> str:
         causes = {
-            "without a label": counts.no_label, "without a pose": counts.no_pose, "without intrinsics": counts.no_intrinsics,
-            "late": counts.late, "unreadable": counts.undecodable,
+            "without a label": counts.no_label, "without a pose": counts.no_pose,
+            "without intrinsics": counts.no_intrinsics, "late": counts.late, "unreadable": counts.undecodable,
         }  # fmt: skip
         return ", ".join(f"{number} {cause}" for cause, number in causes.items() if number) or "no frames"
 
