@@ -33,8 +33,12 @@ class MapDifference:
 def compare_map(keys: Int64Array, tick: TwinTick, robot: int, leaves: LeafTable, resolution: float) -> MapDifference:
     """How one robot's leaves (log-odds with the prior) differ from the twin's map over ``recording.keys``."""
     leaf_keys, leaf_log_odds = expand_leaves(leaves, resolution)
-    row_of = {key: row for row, key in enumerate(map(tuple, leaf_keys.tolist()))}
-    rows = np.array([row_of.get(key, -1) for key in map(tuple, keys.tolist())], dtype=np.int64)
+    distinct, first = np.unique(_codes(leaf_keys), return_index=True)
+    places = np.minimum(np.searchsorted(distinct, _codes(keys)), max(len(distinct) - 1, 0))
+    rows = np.full(len(keys), -1, dtype=np.int64)
+    if len(distinct):
+        found = distinct[places] == _codes(keys)
+        rows[found] = first[places[found]]
     held = rows >= 0
     theirs = np.full((len(keys), tick.maps.shape[2] - 1), tick.prior)
     theirs[held] = leaf_log_odds[rows[held]]
@@ -45,10 +49,18 @@ def compare_map(keys: Int64Array, tick: TwinTick, robot: int, leaves: LeafTable,
     return MapDifference(
         max_abs=float(difference[worst]),
         missing=int((known & ~held).sum()),
-        spurious=int((held & ~known).sum()) + len(row_of) - int(held.sum()),
-        overlapping=len(leaf_keys) - len(row_of),
+        spurious=int((held & ~known).sum()) + len(distinct) - int(held.sum()),
+        overlapping=len(leaf_keys) - len(distinct),
         worst_key=(x, y, z),
     )
+
+
+def _codes(keys: Int64Array) -> Int64Array:
+    """One integer per key."""
+    if len(keys) and np.abs(keys).max() >= 1 << 20:
+        raise AssertionError("a cell lies more than 2^20 cells from the origin")
+    codes: Int64Array = ((keys[:, 0] + (1 << 20)) << 42) | ((keys[:, 1] + (1 << 20)) << 21) | (keys[:, 2] + (1 << 20))
+    return codes
 
 
 def expand_leaves(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Float64Array]:

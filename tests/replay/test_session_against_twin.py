@@ -34,13 +34,16 @@ STOP_REASONS = {STOPPED_CONVERGED: CONVERGED, STOPPED_MAX: SETTLE_MAX, STOPPED_O
 
 SMALL = TeamShape(num_robots=4, num_ticks=16, image=(12, 9), resolution=0.4, scan_period=0.4, sensors="mixed")
 FOUR = TeamShape(num_robots=4, sensors="mixed")
-SIX = TeamShape(num_robots=6, sensors="mixed", image=(22, 16))
+SIX = TeamShape(num_robots=6, scan_period=0.8, sensors="mixed")
 
 EDGES = {
-    4: (("robot_0", "robot_1", 0.4), ("robot_1", "robot_2", 0.25), ("robot_3", "robot_1", 0.3), ("robot_0", "robot_2", 0.1)),
+    4: (
+        ("robot_0", "robot_1", 0.4), ("robot_1", "robot_2", 0.25), ("robot_3", "robot_1", 0.3),
+        ("robot_0", "robot_2", 0.1),
+    ),
     6: (
-        ("robot_0", "robot_1", 0.3), ("robot_1", "robot_2", 0.2), ("robot_2", "robot_3", 0.45), ("robot_4", "robot_1", 0.35),
-        ("robot_5", "robot_4", 0.5), ("robot_5", "robot_0", 0.15),
+        ("robot_0", "robot_1", 0.3), ("robot_1", "robot_2", 0.2), ("robot_2", "robot_3", 0.45),
+        ("robot_4", "robot_1", 0.35), ("robot_5", "robot_4", 0.5), ("robot_5", "robot_0", 0.15),
     ),
 }  # fmt: skip
 
@@ -188,3 +191,361 @@ def _near_ties(deviation, prior):
     """Where the two largest log-odds are within NEAR_TIE."""
     top = np.partition(_absolute(deviation, prior), -2, axis=-1)[..., -2:]
     return top[..., 1] - top[..., 0] < NEAR_TIE
+
+
+# --- large teams: at least 100 ticks and 20,000 cells ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rule", "mode", "topology"),
+    [
+        ("gradient", "sync", "ring"), ("gradient", "on-arrival", "edges"), ("bayes", "sync", "edges"),
+        ("bayes", "on-arrival", "line"), ("natural", "sync", "star"), ("natural", "on-arrival", "complete"),
+        ("local", "sync", "complete"), ("local", "on-arrival", "ring"),
+    ],
+)  # fmt: skip
+def test_four_robots(rule, mode, topology):
+    with_metrics = (rule, mode) == ("gradient", "sync")
+    outcome = _compare(FOUR, topology=topology, rule=rule, mode=mode, settle=0, every=25, with_metrics=with_metrics)
+    assert outcome.num_ticks >= 100
+    assert len(outcome.twin_tick.oracle) >= 20_000
+    assert outcome.num_compared_maps >= 20
+
+
+@pytest.mark.parametrize(
+    ("rule", "mode", "topology"),
+    [("gradient", "sync", "complete"), ("bayes", "on-arrival", "ring"), ("natural", "sync", "line")],
+)
+def test_six_robots(rule, mode, topology):
+    outcome = _compare(SIX, topology=topology, rule=rule, mode=mode, settle=0, every=40)
+    assert outcome.num_ticks >= 100
+    assert len(outcome.twin_tick.oracle) >= 20_000
+    saturated = (np.abs(outcome.twin_tick.evidence[..., 1:]) >= 5.0).any(axis=2)
+    assert (saturated.sum(axis=1) > 1000).all()
+    assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
+
+
+# --- every rule, mode and topology, with settling and metrics --------------------------------------------------------
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_mode_and_topology(rule, mode, topology):
+    """The tolerance is far above float32's rounding, so that both stop settling in the same tick."""
+    outcome = _compare(
+        SMALL, topology=topology, rule=rule, mode=mode, settle=6, settle_tolerance=1e-3, every=4, with_metrics=True
+    )
+    assert outcome.num_settling_ticks >= 1
+    assert outcome.num_compared_maps >= 4 * 6
+    if rule != "local":
+        assert outcome.tick.metrics.total_distance_all < 1e-3 * outcome.peak_all
+
+
+@pytest.mark.parametrize(("settle_max", "num_settling_ticks"), [(7, 7), (1, 1)])
+def test_settling_ends_at_its_maximum(settle_max, num_settling_ticks):
+    outcome = _compare(SMALL, topology="line", rule="natural", settle=5, settle_max=settle_max)
+    assert outcome.num_settling_ticks == num_settling_ticks
+
+
+# --- readings, priors, regions, sensors, schedules -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("evidence", ["time-average", "cell-average"])
+@pytest.mark.parametrize("rule", RULES)
+def test_average_readings(rule, evidence, mode):
+    _compare(SMALL, topology="line", rule=rule, mode=mode, evidence=evidence, settle=0, with_metrics=True, every=5)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_prior(rule):
+    prior = {"prob_free": 0.35}
+    outcome = _compare(SMALL, topology="ring", rule=rule, settle=0, with_metrics=True, every=5, sensor_parameters=prior)
+    assert outcome.twin_tick.prior == pytest.approx(np.log(0.65 / 5 / 0.35))
+
+
+SENSOR_VARIANTS = {
+    "height band": {"bounds": (-0.3, 0.7)},
+    "box": {"bounds": (-2.1, -1.3, -0.5, 3.0, 2.6, 1.0)},
+    "one ray per point": {"rays": "all"},
+    "one ray per point in a box": {"rays": "all", "bounds": (-2.0, -1.4, -0.4, 3.0, 2.4, 1.0)},
+    "increments": {"hit": 1.7, "miss": -0.45, "hit_other": -0.9},
+    "tight clamping": {"clamp_min": -0.5, "clamp_max": 1.5},
+    "no clamping": {"clamp_min": -1e9, "clamp_max": 1e9},
+    "no free space": {"miss": 0.0, "hit_other": -0.2},
+    "long minimum": {"min_range": 1.5, "max_range": 3.1},
+    "no return": {"no_return_depth": (65535.0,)},
+    "invalid": {"invalid_depth": (0.0, 1234.0)},
+    "fine": {"resolution": 0.13},
+    "coarse": {"resolution": 1.0},
+}
+
+
+@pytest.mark.parametrize("rule", ["gradient", "bayes"])
+@pytest.mark.parametrize("variant", SENSOR_VARIANTS)
+def test_sensor_models(variant, rule):
+    outcome = _compare(SMALL, rule=rule, settle=0, every=8, sensor_parameters=SENSOR_VARIANTS[variant])
+    assert outcome.twin_tick.known.any()
+
+
+@pytest.mark.parametrize("sensors", ["depth16", "depth32", "cloud"])
+def test_kinds_of_sensors(sensors):
+    shape = dataclasses.replace(SMALL, sensors=sensors)
+    _compare(shape, seed=4, topology="line", rule="gradient", settle=0, every=8)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("topology", ["complete", "star"])
+@pytest.mark.parametrize("rule", RULES)
+def test_robots_that_leave(rule, topology, mode):
+    outcome = _compare(
+        SMALL, topology=topology, rule=rule, mode=mode, after_end="leave", settle=4, settle_tolerance=1e-3, every=3,
+        with_metrics=True,
+    )  # fmt: skip
+    assert outcome.twin_tick.active == (True, True, False, True)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"weights": "degree"}, {"weights": "degree", "epsilon": 0.21}, {"epsilon": 0.9}, {"gamma": 1.0},
+        {"gamma": 0.9, "gamma_power": 1.0, "gamma_decay": 3.0}, {"gamma_per_arrival": "full"}, {"publish_period": 0.37},
+        {"publish_period": 5.0}, {"packet_compression": "none"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_steps_and_schedules(parameters, mode):
+    _compare(SMALL, topology="star", rule="natural", mode=mode, settle=0, every=9, **parameters)
+    _compare(SMALL, topology="star", rule="gradient", mode=mode, settle=0, every=9, **parameters)
+
+
+def test_the_papers_preset():
+    parameters = {key: value for key, value in PRESETS["paper"].items() if key != "topology"}
+    _compare(SMALL, with_metrics=True, every=3, **parameters)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_one_robot_alone(rule):
+    scenario = _scenario(1, SMALL)
+    config = dataclasses.replace(scenario.config(rule=rule, settle=0), robots=scenario.base_config.robots[:1])
+    frames = [frame for frame in scenario.frames if frame.robot_id == "robot_0"]
+    outcome = _compare_frames(config, frames, every=4, with_metrics=True)
+    assert outcome.tick.graph.links == ()
+
+
+# --- by hand ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("rule", RULES)
+def test_a_robot_that_never_scans(rule, mode):
+    frames = [ray("a", 0.0, 1), ray("b", 0.4, 2), ray("a", 2.0, 1, distance=1.0)]
+    _compare_frames(team_config("abc", rule=rule, mode=mode, settle=2), frames, with_metrics=True)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("evidence", ["sum", "time-average", "cell-average"])
+def test_a_scan_that_touches_nothing_counts(rule, evidence):
+    empty = dataclasses.replace(cloud(np.zeros((0, 3)), []), stamp_ns=ray("a", 2.3, 1).stamp_ns)
+    frames = [ray("a", 0.0, 1), ray("b", 0.4, 2), ray("b", 1.0, 2), empty, ray("b", 5.0, 1)]
+    outcome = _compare_frames(team_config("ab", rule=rule, evidence=evidence, settle=0), frames, with_metrics=True)
+    assert outcome.twin_tick.num_scans == (2, 3)
+
+
+@pytest.mark.parametrize("evidence", ["sum", "time-average", "cell-average"])
+def test_scans_on_the_tick_and_the_last_tick(evidence):
+    frames = [ray("a", 0.0, 1), ray("b", 1.0, 2), ray("a", 1.0, 2), ray("b", 3.0, 1)]
+    outcome = _compare_frames(team_config("ab", rule="bayes", evidence=evidence, settle=0), frames, with_metrics=True)
+    assert outcome.num_ticks == 5
+
+
+@pytest.mark.parametrize("num_classes", [1, 2, 254])
+@pytest.mark.parametrize("rule", RULES)
+def test_numbers_of_classes(rule, num_classes):
+    frames = [ray("a", 0.0, 1), ray("b", 0.5, num_classes), ray("a", 1.5, 1), ray("b", 2.5, num_classes, distance=1.0)]
+    config = team_config("ab", num_classes, rule=rule, settle=2, settle_tolerance=1e-3)
+    _compare_frames(config, frames, with_metrics=True)
+
+
+# --- threads ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rule", "mode"), [("gradient", "sync"), ("bayes", "on-arrival"), ("local", "sync")])
+def test_threads_do_not_change_a_byte(rule, mode):
+    scenario = _scenario(1, SMALL)
+    config = scenario.config(rule=rule, mode=mode, topology="ring", settle=2)
+    runs = []
+    for num_threads in (1, 2, 4):
+        session = Session(config, _sources(config, scenario.frames), num_threads=num_threads)
+        run = []
+        for tick in session.ticks():
+            run.append((tick.metrics, [published and published.packet for published in tick.published]))
+        runs.append((run, [octree.leaves().log_odds.tobytes() for octree in tick.maps]))
+    assert any(packet for _, packets in runs[0][0] for packet in packets) == (rule != "local")
+    assert runs[0] == runs[1] == runs[2]
+
+
+# --- faults that the comparison must see -----------------------------------------------------------------------------
+
+
+def _wrong_sign(monkeypatch):
+    right = robot_module.consensus_step
+
+    def wrong(own, neighbours, step_weights, *args, **kwargs):
+        return right(own, neighbours, [-0.1 * weight for weight in step_weights], *args, **kwargs)
+
+    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+
+
+def _wrong_gradient_sign(monkeypatch):
+    right = robot_module.consensus_step
+    monkeypatch.setattr(
+        robot_module, "consensus_step", lambda *args, gamma, **kwargs: right(*args, gamma=-0.1 * gamma, **kwargs)
+    )
+
+
+def _current_maps_in_place_of_published_ones(monkeypatch):
+    right = Session._iterate
+
+    def wrong(self, graph, published, factor, number):
+        swapped = [
+            entry and dataclasses.replace(entry, octree=robot.map)
+            for entry, robot in zip(published, self._robots, strict=True)
+        ]
+        return right(self, graph, swapped, factor, number)
+
+    monkeypatch.setattr(Session, "_iterate", wrong)
+
+
+def _maps_of_the_tick_before(monkeypatch):
+    right = Session._iterate
+    last = {}
+
+    def wrong(self, graph, published, factor, number):
+        stale = last.get("maps", published)
+        last["maps"] = published
+        return right(
+            self, graph, [old if new else None for old, new in zip(stale, published, strict=True)], factor, number
+        )
+
+    monkeypatch.setattr(Session, "_iterate", wrong)
+
+
+def _free_is_not_reset(monkeypatch):
+    """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
+    right = robot_module.consensus_step
+
+    def wrong(own, neighbours, step_weights, log_likelihood, *, gamma, **kwargs):
+        mixed = own.copy()
+        right(mixed, neighbours, step_weights, log_likelihood, gamma=0.0, **kwargs)
+        change = right(own, neighbours, step_weights, log_likelihood, gamma=gamma, **kwargs)
+        codes = own.codes[own.bricks.tiers[: own.num_bricks] == kernels.VECTOR]
+        after = own.bricks.vector[own.bricks.rows[own.find(codes)]]
+        before = mixed.bricks.vector[mixed.bricks.rows[mixed.find(codes)]]
+        own.bricks.vector[own.bricks.rows[own.find(codes)]] = after + (after - before).sum(axis=1, keepdims=True)
+        return change
+
+    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+
+
+def _free_is_not_reset_in_the_twin(monkeypatch):
+    monkeypatch.setattr(rules, "free_is_zero", lambda log_odds: log_odds)
+
+
+def _evidence_of_the_last_iteration_is_forgotten(monkeypatch):
+    right = robot_module.consensus_step
+
+    def wrong(own, neighbours, step_weights, log_likelihood, *, last_log_likelihood, **kwargs):
+        nothing = type(own)(own.resolution, own.num_classes)
+        return right(own, neighbours, step_weights, log_likelihood, last_log_likelihood=nothing, **kwargs)
+
+    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+
+
+def _scans_of_the_tick_come_late(monkeypatch):
+    right = Session._integrate
+    monkeypatch.setattr(Session, "_integrate", lambda self, number, stamp_ns: right(self, number, stamp_ns - 10**9))
+
+
+def _hits_add_too_little(monkeypatch):
+    right = robot_module.clamped_increments
+    monkeypatch.setattr(
+        robot_module, "clamped_increments", lambda config: dataclasses.replace(right(config), hit=config.hit - 0.01)
+    )
+
+
+def _clamping_is_forgotten(monkeypatch):
+    monkeypatch.setattr(robot_module, "clamped_increments", sensor.unclamped_increments)
+
+
+def _half_a_step(monkeypatch):
+    right = session_module.step_size
+    monkeypatch.setattr(session_module, "step_size", lambda *args: 0.5 * right(*args))
+
+
+def _neighbours_cells_are_not_taken(monkeypatch):
+    right = consensus._take_known
+
+    def wrong(own, sources):
+        return right(own, sources[:1])
+
+    monkeypatch.setattr(consensus, "_take_known", wrong)
+
+
+LOG_ODDS_DIFFER = "log-odds differ"
+MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious"
+
+
+@pytest.mark.parametrize(
+    ("rule", "mode", "fault", "message"),
+    [
+        ("gradient", "sync", _wrong_sign, LOG_ODDS_DIFFER), ("gradient", "on-arrival", _wrong_sign, LOG_ODDS_DIFFER),
+        ("natural", "sync", _wrong_sign, LOG_ODDS_DIFFER), ("bayes", "sync", _wrong_sign, LOG_ODDS_DIFFER),
+        ("bayes", "on-arrival", _wrong_sign, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _wrong_gradient_sign, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("gradient", "on-arrival", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("natural", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("bayes", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("bayes", "on-arrival", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("gradient", "sync", _maps_of_the_tick_before, MAPS_DIFFER),
+        ("bayes", "on-arrival", _maps_of_the_tick_before, MAPS_DIFFER),
+        ("gradient", "sync", _free_is_not_reset, LOG_ODDS_DIFFER),
+        ("gradient", "on-arrival", _free_is_not_reset, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _free_is_not_reset_in_the_twin, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _evidence_of_the_last_iteration_is_forgotten, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _scans_of_the_tick_come_late, "scans differ|active robots differ"),
+        ("local", "sync", _hits_add_too_little, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _hits_add_too_little, LOG_ODDS_DIFFER),
+        ("local", "sync", _clamping_is_forgotten, LOG_ODDS_DIFFER), ("gradient", "sync", _half_a_step, LOG_ODDS_DIFFER),
+        ("natural", "sync", _neighbours_cells_are_not_taken, "cells are missing"),
+    ],
+)  # fmt: skip
+def test_a_fault_turns_the_comparison_red(monkeypatch, rule, mode, fault, message):
+    parameters = {"topology": "line", "rule": rule, "mode": mode, "settle": 0, "every": 5}
+    _compare(SMALL, **parameters)
+    fault(monkeypatch)
+    with pytest.raises(AssertionError, match=message):
+        _compare(SMALL, **parameters)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("total_distance", lambda value: value * 1.01), ("total_distance_all", lambda value: value * 0.99),
+        ("num_known_cells", lambda value: value + 1), ("max_change", lambda value: value + 0.1),
+        ("label_disagreement", lambda value: value + 0.1),
+    ],
+)  # fmt: skip
+def test_a_wrong_metric_turns_the_comparison_red(monkeypatch, name, wrong):
+    right = Session._measure
+
+    def measure(self, *args):
+        metrics = right(self, *args)
+        return dataclasses.replace(metrics, **{name: wrong(getattr(metrics, name))})
+
+    monkeypatch.setattr(Session, "_measure", measure)
+    with pytest.raises(AssertionError):
+        _compare(SMALL, topology="line", rule="gradient", settle=0, every=50, with_metrics=True)

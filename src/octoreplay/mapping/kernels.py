@@ -59,7 +59,11 @@ class Bricks(NamedTuple):
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Any:
-    """numba.njit with the on-disk cache where a cache folder can be written, without it elsewhere."""
+    """numba.njit with the on-disk cache where a cache folder can be written, without it elsewhere.
+
+    No fast-math: reordered sums come out differently when callees are linked from the cache instead of inlined, and the
+    same input must give the same bytes. Loops over a brick run as vectors all the same when they sum element by element.
+    """
     settings = {"nogil": True, "error_model": "numpy", **options}
     try:
         return njit(cache=True, **settings)(function)
@@ -69,13 +73,8 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile with exact floating point: used where rounding must not depend on the order of a sum."""
+    """Compile for plain arrays."""
     return _compile(function)
-
-
-def fast_kernel(function: Callable[..., Any]) -> Any:
-    """Compile with reordered sums and fused multiply-add, so that loops over a brick run as vectors."""
-    return _compile(function, fastmath={"reassoc", "contract", "nsz"})
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
@@ -663,7 +662,7 @@ def clear_marks(marks, touched_flags, touched):
 # --- consensus -------------------------------------------------------------------------------------------------------
 
 
-@fast_kernel
+@kernel
 def _exp_negative(x, out, powers, scales):
     """Exp of ``x`` (512,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
 
@@ -727,7 +726,7 @@ OWN, BASE, EVIDENCE, OLD_EVIDENCE, NEIGHBOURS = 0, 1, 2, 3, 4
 differences), its evidence log q, its evidence at the last iteration, then the neighbours' maps."""
 
 
-@fast_kernel
+@kernel
 def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes):
     """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
 
@@ -744,6 +743,7 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes)
     top = np.empty(BRICK_CELLS, dtype=np.float32)
     total = np.empty(BRICK_CELLS, dtype=np.float32)
     dot = np.empty(BRICK_CELLS, dtype=np.float32)
+    moved = np.empty(BRICK_CELLS, dtype=np.float32)
     powers = np.empty(BRICK_CELLS, dtype=np.int32)
     scales = powers.view(np.float32)
     for b in range(addresses.shape[0]):
@@ -799,17 +799,15 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes)
             for c in range(width):
                 for i in range(cells):
                     mixed[c, i] += gamma * (sigma[c, i] * total[i]) * (dot[i] - delta[c, i])
-        largest = np.float32(0.0)
+        moved[:cells] = np.float32(0.0)
         for c in range(width):
-            _load(base[:cells], addresses[b, OWN], tier, c, num_classes)
+            target = carray(_float_pointer(addresses[b, OWN] + c * BRICK_CELLS * 4), (cells,))
             for i in range(cells):
-                base[i] = abs(mixed[c, i] - base[i])
-            for i in range(cells):
-                largest = max(largest, base[i])
-            if largest > np.float32(0.0):
-                target = carray(_float_pointer(addresses[b, OWN] + c * BRICK_CELLS * 4), (cells,))
-                for i in range(cells):
-                    target[i] = mixed[c, i]
+                moved[i] = max(moved[i], abs(mixed[c, i] - target[i]))
+                target[i] = mixed[c, i]
+        largest = np.float32(0.0)
+        for i in range(cells):
+            largest = max(largest, moved[i])
         changes[b] = largest
 
 
@@ -833,7 +831,7 @@ def needed_tiers(tiers, needed):
         needed[b] = highest
 
 
-@fast_kernel
+@kernel
 def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targets, target_tiers):
     """The sum over robots of log q for each brick, written to ``targets`` (n,) addresses: the oracle.
 
@@ -864,7 +862,7 @@ def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targ
 # --- metrics ---------------------------------------------------------------------------------------------------------
 
 
-@fast_kernel
+@kernel
 def _brick_labels(address, tier, prior, num_classes, labels, best, row):
     """Argmax class (512,) of a brick and its log-odds; free is 0, ties go to the lower id."""
     labels[:] = 0
@@ -879,7 +877,7 @@ def _brick_labels(address, tier, prior, num_classes, labels, best, row):
             best[i] = value if higher else best[i]
 
 
-@fast_kernel
+@kernel
 def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distances, counts, entropies):
     """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``addresses``) and the oracle (column N).
 
@@ -954,19 +952,23 @@ def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distanc
                     counts[b, 3 + 3 * r] += 1
                     counts[b, 4 + 3 * r] += agrees
                     counts[b, 5 + 3 * r] += agrees and occupied
-        _brick_distances(addresses[b], tiers[b], link_ends, num_classes, rows, row, distances[b])
+        _brick_distances(
+            addresses[b], tiers[b], link_ends, num_classes, rows, row, weighted, total, distances[b]
+        )
 
 
-@fast_kernel
-def _brick_distances(addresses, tiers, link_ends, num_classes, rows, mean, distances):
+@kernel
+def _brick_distances(
+    addresses, tiers, link_ends, num_classes, rows, mean, over_links, over_pairs, distances
+):  # fmt: skip
     """Squared differences of one brick, summed over the links and over all pairs: N sum_i ||h_i - mean||^2."""
     robots = rows.shape[0]
     width = 1
     for r in range(robots):
         if tiers[r] == VECTOR:
             width = num_classes
-    over_links = 0.0
-    over_pairs = 0.0
+    over_links[:] = np.float32(0.0)
+    over_pairs[:] = np.float32(0.0)
     for c in range(width):
         mean[:] = np.float32(0.0)
         for r in range(robots):
@@ -978,21 +980,17 @@ def _brick_distances(addresses, tiers, link_ends, num_classes, rows, mean, dista
         for i in range(BRICK_CELLS):
             mean[i] /= np.float32(robots)
         for r in range(robots):
-            part = np.float32(0.0)
             for i in range(BRICK_CELLS):
                 difference = (rows[r, i] - rows[0, i]) - mean[i]
-                part += difference * difference
-            over_pairs += part
+                over_pairs[i] += difference * difference
         for k in range(link_ends.shape[0]):
             a, z = link_ends[k, 0], link_ends[k, 1]
-            part = np.float32(0.0)
             for i in range(BRICK_CELLS):
                 difference = rows[a, i] - rows[z, i]
-                part += difference * difference
-            over_links += part
+                over_links[i] += difference * difference
     repeats = num_classes if width == 1 else 1
-    distances[0] = over_links * repeats
-    distances[1] = over_pairs * repeats * robots
+    distances[0] = over_links.sum() * repeats
+    distances[1] = over_pairs.sum() * repeats * robots
 
 
 # --- packets ---------------------------------------------------------------------------------------------------------
@@ -1052,26 +1050,27 @@ def _word(states, start):
 
 
 @kernel
-def _load_cells(bricks, index, low, high, cells):
-    """Values of a brick's cells as bounds ``low`` and ``high`` (C, 512) and the state of each cell."""
+def _load_cells(bricks, index, low, cells):
+    """Values of a brick's cells (C, 512) and the state of each cell; returns how many classes have their own values."""
     tier = bricks.tiers[index]
+    cells[:] = CHILD_SCALAR
     if tier == UNIFORM:
         low[0, :] = bricks.values[index]
     elif tier == SCALAR:
         low[0, :] = bricks.scalar[bricks.rows[index]]
     else:
-        low[:, :] = bricks.vector[bricks.rows[index]]
-    width = low.shape[0] if tier == VECTOR else 1
-    high[:width, :] = low[:width, :]
-    for i in range(BRICK_CELLS):
-        if (bricks.known[index, i >> 3] >> (i & 7)) & 1 == 0:
-            cells[i] = CHILD_UNKNOWN
-            continue
-        cells[i] = CHILD_SCALAR
-        for c in range(1, width):
-            if low[c, i] != low[0, i]:
-                cells[i] = CHILD_VECTOR
-    return width
+        low[0, :] = bricks.vector[bricks.rows[index], 0]
+        for c in range(1, low.shape[0]):
+            row = bricks.vector[bricks.rows[index], c]
+            for i in range(BRICK_CELLS):
+                low[c, i] = row[i]
+                cells[i] |= np.uint8(row[i] != low[0, i])
+    if not _all_known(bricks.known[index]):
+        for byte in range(64):
+            for j in range(8):
+                if (bricks.known[index, byte] >> j) & 1 == 0:
+                    cells[8 * byte + j] = CHILD_UNKNOWN
+    return low.shape[0] if tier == VECTOR else 1
 
 
 @kernel
@@ -1095,11 +1094,13 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
     num_classes = bricks.vector.shape[1]
     limit = tolerance if prune else np.float32(-1.0)
     low = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    high = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
     low8 = np.empty((num_classes, 64), dtype=np.float32)
-    high8 = np.empty((num_classes, 64), dtype=np.float32)
     low64 = np.empty((num_classes, 8), dtype=np.float32)
-    high64 = np.empty((num_classes, 8), dtype=np.float32)
+    # The bounds of a node's values; without a tolerance they are equal, and one array serves as both.
+    lossy = limit > np.float32(0.0)
+    high = np.empty_like(low) if lossy else low
+    high8 = np.empty_like(low8) if lossy else low8
+    high64 = np.empty_like(low64) if lossy else low64
     cells = np.empty(BRICK_CELLS, dtype=np.uint8)
     eights = np.empty(64, dtype=np.uint8)
     groups = np.empty(8, dtype=np.uint8)
@@ -1132,7 +1133,9 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
             node_low[parent, :, place] = bricks.values[index]
             node_high[parent, :, place] = bricks.values[index]
         else:
-            width = _load_cells(bricks, index, low, high, cells)
+            width = _load_cells(bricks, index, low, cells)
+            if lossy:
+                high[:width, :] = low[:width, :]
             _reduce(low, high, cells, limit, width, low8, high8, eights)
             _reduce(low8, high8, eights, limit, width, low64, high64, groups)
             state = _group_state(low64, high64, groups, 0, limit, width)

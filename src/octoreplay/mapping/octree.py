@@ -255,6 +255,11 @@ MAX_BRICKS = 1 << 24
 """Most bricks of one octree that is built from leaves: 8.6e9 cells."""
 
 
+def _num_distinct(ordered: Int64Array) -> int:
+    """Number of distinct values of an array in order."""
+    return int(np.count_nonzero(ordered[1:] != ordered[:-1])) + (ordered.size > 0)
+
+
 def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctree:
     """The octree of a depth-first stream. Raises ValueError when the stream is no octree."""
     codes, depths, is_vector = leaf_list(streams)
@@ -262,11 +267,11 @@ def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctr
     large = depths <= kernels.BRICK_DEPTH
     spans = np.int64(1) << (3 * np.maximum(kernels.BRICK_DEPTH - depths[large].astype(np.int64), 0))
     small_codes = codes[~large] >> 9
-    num_small = np.unique(small_codes).size
+    num_small = _num_distinct(small_codes)
     num_bricks = int(spans.sum(dtype=np.float64)) + num_small
     if num_bricks > MAX_BRICKS:
         raise ValueError("the stream holds more space than an octree may")
-    num_vector = int(spans[is_vector[large]].sum()) + np.unique(small_codes[is_vector[~large]]).size
+    num_vector = int(spans[is_vector[large]].sum()) + _num_distinct(small_codes[is_vector[~large]])
     octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
     kernels.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
     return octree
