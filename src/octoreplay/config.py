@@ -280,8 +280,8 @@ class RunConfig:
                     raise ConfigError(f"edges: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
             if sender == receiver:
                 raise ConfigError(f"edges: '{sender}' cannot have a link to itself")
-            if weight is not None and weight < 0:
-                raise ConfigError(f"edges: the weight of {sender} - {receiver} is negative")
+            if weight is not None and not 0 <= weight < math.inf:
+                raise ConfigError(f"edges: the weight of {sender} - {receiver} must be a finite number from 0 on")
 
     def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
         """This configuration with flat parameters replaced.
@@ -399,11 +399,12 @@ _CLASS_KEYS = ("name", "color", "raw_labels")
 _TEAM_KEYS = ("robots", "classes", "ignored_raw_labels", "edges")
 
 
-def load_team_file(path: Path) -> RunConfig:
+def load_team_file(path: str | Path) -> RunConfig:
     """Read a team file. Log paths in it are relative to its folder.
 
     Raises ConfigError with the file and the key for anything that is not understood.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

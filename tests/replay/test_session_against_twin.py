@@ -136,7 +136,7 @@ def _compare_course(expected, tick):
     assert tuple(robot.active for robot in robots) == expected.active, f"active robots differ in tick {tick.number}"
     assert tick.graph.links == expected.links, f"links differ in tick {tick.number}"
     assert tuple(robot.num_scans for robot in robots) == expected.num_scans, f"scans differ in tick {tick.number}"
-    assert tuple(robot.num_iterations for robot in robots) == expected.num_iterations
+    assert tuple(robot.num_iterations for robot in robots) == expected.num_iterations, "iterations differ"
 
 
 def _compare_maps(keys, expected, tick, config, outcome):
@@ -221,7 +221,7 @@ def test_six_robots(rule, mode, topology):
     assert outcome.num_ticks >= 100
     assert len(outcome.twin_tick.oracle) >= 20_000
     saturated = (np.abs(outcome.twin_tick.evidence[..., 1:]) >= 5.0).any(axis=2)
-    assert (saturated.sum(axis=1) > 1000).all()
+    assert (saturated.sum(axis=1) > 250).all()
     assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
 
 
@@ -495,7 +495,7 @@ def _neighbours_cells_are_not_taken(monkeypatch):
 
 
 LOG_ODDS_DIFFER = "log-odds differ"
-MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious"
+MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious|iterations differ"
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,7 @@ class ResultReader:
             raise InputError(f"{self.path}: damaged at topic '{topic}': {error}") from error
 
 
-_DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OSError)
+_DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
 """What reading a damaged file raises."""
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
 

@@ -19,6 +19,9 @@ FULL, DELTA = 0, 1
 CONTENT_FLOAT32 = 0
 NO_COMPRESSION, ZSTD = 0, 1
 ZSTD_LEVEL = 1
+MAX_ZSTD_RATIO = 1 << 15
+"""A zstd block of at least 4 bytes holds at most 2^17."""
+MAX_CLASSES = 254
 
 _HEADER = struct.Struct("<4sBBBBHHdIIIII")
 """magic, version, kind, content, compression, classes, 0, resolution, words, scalars, vectors, payload bytes, CRC."""
@@ -86,7 +89,7 @@ def read_header(data: bytes) -> PacketHeader:
     if zlib.crc32(payload, zlib.crc32(data[: HEADER_BYTES - 4] + bytes(4))) != checksum:
         raise PacketError("map packet damaged: its checksum does not match")
     known = kind in (FULL, DELTA) and content == CONTENT_FLOAT32 and compression in (NO_COMPRESSION, ZSTD)
-    if not known or zero or not num_classes or not 0 < resolution < np.inf:
+    if not known or zero or not 0 < num_classes <= MAX_CLASSES or not 0 < resolution < np.inf:
         raise PacketError("map packet of a kind, content or compression that this octoreplay does not know")
     return PacketHeader(kind, compression, num_classes, resolution, *sizes)
 
@@ -114,11 +117,7 @@ def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
     """The octree of a packet with a good header."""
     payload = data[HEADER_BYTES:]
     if header.compression == ZSTD:
-        try:
-            # A hostile payload cannot unpack to more than the header's counts explain.
-            payload = zstandard.ZstdDecompressor().decompress(payload, max_output_size=max(header.raw_bytes, 1))
-        except zstandard.ZstdError as error:
-            raise PacketError(f"map packet cannot be decompressed: {error}") from error
+        payload = _unpack(payload, header.raw_bytes)
     if len(payload) != header.raw_bytes:
         raise PacketError("map packet damaged: its size does not match its counts")
     words_end = 2 * header.num_words
@@ -132,6 +131,18 @@ def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
         return octree_from_streams(streams, header.resolution)
     except ValueError as error:
         raise PacketError(f"map packet damaged: {error}") from error
+
+
+def _unpack(payload: bytes, size: int) -> bytes:
+    """The content of one zstd frame, which must say itself that it holds ``size`` bytes."""
+    try:
+        parameters = zstandard.get_frame_parameters(payload)
+        # Memory is allocated for what the frame says, so that has to be possible for a frame of this length.
+        if parameters.content_size != size or size > MAX_ZSTD_RATIO * len(payload):
+            raise PacketError("map packet damaged: its size does not match its counts")
+        return zstandard.ZstdDecompressor().decompress(payload, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise PacketError(f"map packet cannot be decompressed: {error}") from error
 
 
 def grid_bytes(num_cells: int, num_classes: int) -> int:

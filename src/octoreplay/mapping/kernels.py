@@ -357,10 +357,10 @@ def merge_known(known, indices, other_known):
 
 @inline_kernel
 def _in_list(value, numbers):
-    """True when ``value`` is one of ``numbers``."""
+    """True when ``value`` is one of ``numbers``; NaN equals NaN."""
     found = False
     for i in range(numbers.size):
-        if value == numbers[i]:
+        if value == numbers[i] or (value != value and numbers[i] != numbers[i]):
             found = True
     return found
 
@@ -530,10 +530,7 @@ def mark_free(origin, ends, end_keys, resolution, corner, mapped, marks, touched
     start_x = np.int64(np.floor(origin[0] / resolution)) - corner[0]
     start_y = np.int64(np.floor(origin[1] / resolution)) - corner[1]
     start_z = np.int64(np.floor(origin[2] / resolution)) - corner[2]
-    if ends.shape[0] > 0:
-        cell = mapped[0, start_x] + mapped[1, start_y] + mapped[2, start_z]
-        if cell >= 0 and marks[cell] == 0:
-            num_touched = _mark(marks, cell, np.uint8(1), touched_flags, touched, num_touched)
+    origin_cell = mapped[0, start_x] + mapped[1, start_y] + mapped[2, start_z]
     for i in range(ends.shape[0]):
         x, y, z = start_x, start_y, start_z
         left_x = end_keys[i, 0] - corner[0] - x
@@ -545,32 +542,32 @@ def mark_free(origin, ends, end_keys, resolution, corner, mapped, marks, touched
         step_z = 1 if left_z > 0 else -1
         left_x, left_y, left_z = abs(left_x), abs(left_y), abs(left_z)
         next_x = next_y = next_z = np.inf
-        delta_x = delta_y = delta_z = 0.0
+        # The wall ahead of local cell k is at (k + ahead) x resolution; crossings are never summed up, so nothing drifts.
+        ahead_x, ahead_y, ahead_z = corner[0] + (step_x > 0), corner[1] + (step_y > 0), corner[2] + (step_z > 0)
         if left_x > 0:
-            delta_x = resolution / abs(dx)
-            next_x = ((x + corner[0] + (step_x > 0)) * resolution - origin[0]) / dx
+            next_x = ((x + ahead_x) * resolution - origin[0]) / dx
         if left_y > 0:
-            delta_y = resolution / abs(dy)
-            next_y = ((y + corner[1] + (step_y > 0)) * resolution - origin[1]) / dy
+            next_y = ((y + ahead_y) * resolution - origin[1]) / dy
         if left_z > 0:
-            delta_z = resolution / abs(dz)
-            next_z = ((z + corner[2] + (step_z > 0)) * resolution - origin[2]) / dz
+            next_z = ((z + ahead_z) * resolution - origin[2]) / dz
         part_x, part_y, part_z = mapped[0, x], mapped[1, y], mapped[2, z]
+        if left_x + left_y + left_z > 0 and origin_cell >= 0 and marks[origin_cell] == 0:
+            num_touched = _mark(marks, origin_cell, np.uint8(1), touched_flags, touched, num_touched)
         for _ in range(left_x + left_y + left_z - 1):
             if next_x < next_y and next_x < next_z:
                 x += step_x
                 left_x -= 1
-                next_x = next_x + delta_x if left_x > 0 else np.inf
+                next_x = ((x + ahead_x) * resolution - origin[0]) / dx if left_x > 0 else np.inf
                 part_x = mapped[0, x]
             elif next_y < next_z and not next_x < next_y:
                 y += step_y
                 left_y -= 1
-                next_y = next_y + delta_y if left_y > 0 else np.inf
+                next_y = ((y + ahead_y) * resolution - origin[1]) / dy if left_y > 0 else np.inf
                 part_y = mapped[1, y]
             else:
                 z += step_z
                 left_z -= 1
-                next_z = next_z + delta_z if left_z > 0 else np.inf
+                next_z = ((z + ahead_z) * resolution - origin[2]) / dz if left_z > 0 else np.inf
                 part_z = mapped[2, z]
             cell = part_x + part_y + part_z
             if cell >= 0 and marks[cell] == 0:
@@ -952,9 +949,7 @@ def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distanc
                     counts[b, 3 + 3 * r] += 1
                     counts[b, 4 + 3 * r] += agrees
                     counts[b, 5 + 3 * r] += agrees and occupied
-        _brick_distances(
-            addresses[b], tiers[b], link_ends, num_classes, rows, row, weighted, total, distances[b]
-        )
+        _brick_distances(addresses[b], tiers[b], link_ends, num_classes, rows, row, weighted, total, distances[b])
 
 
 @kernel

@@ -253,6 +253,8 @@ def leaf_values(streams: TreeStreams, is_vector: BoolArray) -> Float32Array:
 
 MAX_BRICKS = 1 << 24
 """Most bricks of one octree that is built from leaves: 8.6e9 cells."""
+MAX_BYTES = 1 << 32
+"""Most memory for the values of one octree that is built from leaves."""
 
 
 def _num_distinct(ordered: Int64Array) -> int:
@@ -272,6 +274,8 @@ def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctr
     if num_bricks > MAX_BRICKS:
         raise ValueError("the stream holds more space than an octree may")
     num_vector = int(spans[is_vector[large]].sum()) + _num_distinct(small_codes[is_vector[~large]])
+    if (num_small + num_vector * octree.num_classes) * kernels.BRICK_CELLS * 4 > MAX_BYTES:
+        raise ValueError("the stream holds more values than an octree may")
     octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
     kernels.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
     return octree

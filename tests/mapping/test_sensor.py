@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.mapping import kernels
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.sensor import (
+    COUNT_SCANS,
+    ScanCaster,
+    add_scan,
+    clamped_increments,
+    unclamped_increments,
+)
+from octoreplay.records import CameraModel, CloudFrame, DepthFrame
+from octree_factory import cells_of
+from reference.hand_made import FACING_X, cloud, depth_frame, facing_x
+from reference.scenarios import TeamShape, make_scenario
+from reference.sensor import scan_update
+
+NUM_CLASSES = 5
+SENSOR = SensorConfig(max_range=4.0)
+MAP = MapConfig(resolution=0.2)
+
+
+def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
+    """(freed keys, {hit key: class_id}) of a scan as the caster finds them."""
+    touched = (caster or ScanCaster(sensor, region, num_classes)).cast(frame)
+    assert len(set(touched.codes.tolist())) == len(touched.codes)
+    marks = touched.marks.reshape(-1, kernels.BRICK_CELLS)[touched.touched]
+    rows, cells = np.nonzero(marks)
+    keys = np.empty((len(rows), 3), np.int64)
+    kernels.codes_to_keys((touched.codes[rows] << 9) + cells, keys)
+    kinds = marks[rows, cells].tolist()
+    content = dict(zip(map(tuple, keys.tolist()), kinds, strict=True))
+    freed = {key for key, kind in content.items() if kind == 1}
+    return freed, {key: kind - 1 for key, kind in content.items() if kind > 1}
+
+
+def _expected(frame, sensor=SENSOR, region=MAP):
+    update = scan_update(frame, sensor, region)
+    freed = {tuple(key) for key in update.freed.tolist()}
+    return freed, dict(zip(map(tuple, update.hit.tolist()), update.hit_classes.tolist(), strict=True))
+
+
+def _agree(frame, sensor=SENSOR, region=MAP):
+    freed, hit = _cells(frame, sensor, region)
+    expected_freed, expected_hit = _expected(frame, sensor, region)
+    assert hit == expected_hit
+    assert freed - expected_freed == set()
+    assert expected_freed - freed == set()
+    return freed, hit
+
+
+def _random_pose(rng, spread=3.0):
+    """A rotation from a random quaternion, somewhere around the origin."""
+    x, y, z, w = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = rng.uniform(-spread, spread, 3)
+    return pose
+
+
+def _random_depth(rng, dtype=np.float32, size=(11, 14)):
+    depth = rng.uniform(0.0, 6.0, size)
+    image = depth.astype(np.float32) if dtype == np.float32 else (depth * 1000).astype(np.uint16)
+    classes = rng.integers(0, NUM_CLASSES + 1, size).astype(np.uint8)
+    camera = CameraModel(size[1], size[0], 9.0, 8.5, 6.3, 5.2)
+    return DepthFrame("r", 0, image, 1.0 if dtype == np.float32 else 0.001, classes, camera, _random_pose(rng))
+
+
+def _random_cloud(rng, dtype=np.float32, size=150):
+    points = (rng.normal(size=(size, 3)) * 2.5).astype(dtype)
+    points[rng.random(size) < 0.1] = np.nan
+    classes = rng.integers(0, NUM_CLASSES + 1, size).astype(np.uint8)
+    return CloudFrame("r", 0, points, classes, _random_pose(rng))
+
+
+# --- against the reference -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rays", ["cells", "all"])
+@pytest.mark.parametrize("seed", range(12))
+def test_random_scans(seed, rays):
+    rng = np.random.default_rng(seed)
+    sensor = dataclasses.replace(SENSOR, rays=rays, min_range=0.4)
+    region = MapConfig(resolution=(0.2, 0.13, 0.25, 0.5)[seed % 4])
+    for frame in (
+        _random_depth(rng), _random_depth(rng, np.uint16), _random_cloud(rng), _random_cloud(rng, np.float64),
+    ):  # fmt: skip
+        freed, hit = _agree(frame, sensor, region)
+        assert freed
+        assert hit
+
+
+@pytest.mark.parametrize(
+    "bounds", [(-0.5, 0.6), (-1.0, -1.1, -0.7, 1.3, 0.9, 1.1), (0.2, 0.4), (-0.3, 0.7), (5.0, 9.0)]
+)
+def test_random_scans_in_a_region(bounds):
+    rng = np.random.default_rng(3)
+    for _ in range(4):
+        for rays in ("cells", "all"):
+            frame, sensor = _random_depth(rng), dataclasses.replace(SENSOR, rays=rays)
+            _agree(frame, sensor, MapConfig(resolution=0.2, bounds=bounds))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    origin=st.tuples(*[st.integers(-24, 24)] * 3),
+    ends=st.lists(st.tuples(*[st.integers(-30, 30)] * 3), min_size=1, max_size=6),
+    rays=st.sampled_from(["cells", "all"]),
+)
+def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
+    """Everything is a multiple of an eighth and cells are a quarter: walls are met exactly, several at once."""
+    pose = np.eye(4)
+    pose[:3, 3] = np.array(origin) / 8
+    frame = CloudFrame("r", 0, np.array(ends) / 8, None, pose)
+    _agree(frame, dataclasses.replace(SENSOR, rays=rays, max_range=100.0), MapConfig(resolution=0.25))
+
+
+@pytest.mark.parametrize("resolution", [0.1, 0.2, 0.3])
+def test_walls_at_decimal_places(resolution):
+    """Origins at centres and on walls of cells whose edge is no binary fraction; rays to cell centres."""
+    places = [k * resolution / 2 for k in range(-5, 6)]
+    ends = np.array(list(itertools.product((-1.7, -0.35, 0.0, 0.25, 1.5), repeat=3)))
+    for origin in itertools.product(places[::2], places[1::3], places[::5]):
+        pose = np.eye(4)
+        pose[:3, 3] = origin
+        _agree(CloudFrame("r", 0, ends, None, pose), SENSOR, MapConfig(resolution=resolution))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rays", ["cells", "all"])
+def test_rays_along_an_axis(axis, sign, rays):
+    point = np.zeros(3)
+    point[axis] = 2.0 * sign
+    sensor = dataclasses.replace(SENSOR, rays=rays)
+    freed, hit = _agree(cloud([point], [3]), sensor, MapConfig(resolution=0.25))
+    end = [2, 2, 2]
+    end[axis] += 8 if sign > 0 else -8
+    assert hit == {tuple(end): 3}
+    assert len(freed) == 8
+
+
+def test_negative_coordinates_by_hand():
+    frame = depth_frame(np.array([[1.0]], np.float32), [[2]], pose=facing_x(-3.1, -0.5, -2.5))
+    freed, hit = _agree(frame, SENSOR, MapConfig(resolution=1.0))
+    assert freed == {(-4, -1, -3)}
+    assert hit == {(-3, -1, -3): 2}
+
+
+@pytest.mark.parametrize("distance", [3.9, np.nextafter(4.0, 0), 4.0, np.nextafter(4.0, 9), 4.1])
+def test_a_point_at_exactly_max_range_is_a_hit(distance):
+    for frame in (
+        depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2]),
+    ):  # fmt: skip
+        freed, hit = _agree(frame, SENSOR, MapConfig(resolution=1.0))
+        within = float(np.float32(distance) if isinstance(frame, DepthFrame) else distance) <= 4.0
+        assert hit == ({(int(distance + 0.5), 0, 0): 2} if within else {})
+        assert len(freed) == int(min(distance, 4.0) + 0.5)
+
+
+def test_a_point_at_exactly_min_range_is_used():
+    sensor = dataclasses.replace(SENSOR, min_range=2.0)
+    for distance, used in ((2.0, True), (np.nextafter(np.float32(2.0), np.float32(0)), False)):
+        for frame in (depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2])):
+            assert bool(_agree(frame, sensor, MapConfig(resolution=1.0))[0]) == used
+
+
+def test_a_scan_in_the_origins_own_cell():
+    assert _agree(cloud([[0.01, 0.0, 0.0]], [1])) == (set(), {(2, 2, 2): 1})
+    assert _agree(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), set())
+    freed, hit = _agree(cloud([[0.01, 0.0, 0.0], [1.0, 0.0, 0.0]], [1, 2]))
+    assert (2, 2, 2) in hit
+    assert (2, 2, 2) not in freed
+
+
+def test_the_majority_of_points_decides_and_ties_go_to_the_lower_id():
+    near = np.array([[2.0, 0.0, 0.0]]) + np.arange(6)[:, None] * 1e-3
+    assert set(_agree(cloud(near, [4, 2, 2, 4, 4, 0]))[1].values()) == {4}
+    assert set(_agree(cloud(near, [4, 2, 2, 4, 0, 0]))[1].values()) == {2}
+    assert _agree(cloud(near, [0] * 6))[1] == {}
+
+
+def test_scans_without_points():
+    assert _agree(cloud(np.zeros((0, 3)), [])) == (set(), set())
+    assert _agree(cloud([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]], [1, 1, 1])) == (set(), set())
+    assert _agree(depth_frame(np.zeros((3, 4), np.uint16), unit=0.001)) == (set(), set())
+    assert _agree(depth_frame(np.zeros((0, 0), np.float32))) == (set(), set())
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_values_without_information(dtype):
+    values = [0, 1, 2, 3, 7, 8]
+    values += [np.nan, np.inf, -np.inf, -1.0, 2.1] if dtype == np.float32 else [np.iinfo(dtype).max]
+    image = np.array([values], dtype)
+    options = [{}, {"invalid_depth": (7.0, 2.1)}, {"no_return_depth": (0.0, 3.0)}, {"invalid_depth": (3.0,)}]
+    options += [{"invalid_depth": (3.0, np.nan), "no_return_depth": (3.0, 2.1)}]
+    options += [{"no_return_depth": (float(np.iinfo(dtype).max),)}] if dtype != np.float32 else []
+    options += [{"no_return_depth": (np.nan, np.inf, -1.0)}, {"no_return_depth": (2.1, np.nan), "min_range": 1.5}]
+    for option in options:
+        _agree(depth_frame(image), dataclasses.replace(SENSOR, max_range=7.5, **option), MapConfig(resolution=0.5))
+
+
+# --- layouts of the input --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_layouts_of_images_do_not_matter(dtype):
+    frame = _random_depth(np.random.default_rng(1), dtype)
+    expected = _cells(frame)
+    for layout in (np.asfortranarray, _strided, lambda a: a[::-1][::-1], lambda a: _read_only(a)):
+        other = dataclasses.replace(
+            frame, depth_image=layout(frame.depth_image), class_image=layout(frame.class_image),
+            T_team_sensor=np.asfortranarray(frame.T_team_sensor),
+        )  # fmt: skip
+        assert _cells(other) == expected
+    big_endian = dataclasses.replace(
+        frame, depth_image=frame.depth_image.astype(frame.depth_image.dtype.newbyteorder(">"))
+    )
+    assert _cells(big_endian) == expected
+    assert _cells(dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32))) == _cells(
+        dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32).astype(np.float64))
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_layouts_of_clouds_do_not_matter(dtype):
+    frame = _random_cloud(np.random.default_rng(2), dtype)
+    expected = _cells(frame)
+    for layout in (np.asfortranarray, _strided, lambda a: a[::-1][::-1], _read_only):
+        other = dataclasses.replace(frame, points=layout(frame.points), class_ids=layout(frame.class_ids))
+        assert _cells(other) == expected
+    swapped = dataclasses.replace(frame, points=frame.points.astype(frame.points.dtype.newbyteorder(">")))
+    assert _cells(swapped) == expected
+
+
+def _strided(array):
+    """The same values with gaps between them."""
+    wide = np.zeros(tuple(2 * n for n in array.shape), array.dtype)
+    view = wide[tuple(slice(None, None, 2) for _ in array.shape)]
+    view[...] = array
+    return view
+
+
+def _read_only(array):
+    copy = array.copy()
+    copy.setflags(write=False)
+    return copy
+
+
+def test_one_caster_gives_the_same_for_every_scan_as_a_new_one():
+    """Its scratch memory grows, shrinks and moves; nothing of a scan may stay behind."""
+    scenario = make_scenario(3, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), sensors="mixed"))
+    caster = ScanCaster(SENSOR, MAP, NUM_CLASSES)
+    rng = np.random.default_rng(0)
+    for frame in scenario.frames:
+        moved = dataclasses.replace(frame, T_team_sensor=_random_pose(rng, spread=50.0))
+        assert _cells(moved, caster=caster) == _cells(moved)
+
+
+# --- the edge of the key space ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_scans_that_leave_the_key_space_are_refused(axis, sign):
+    region = MapConfig(resolution=0.25)
+    reach = kernels.KEY_OFFSET * 0.25
+    pose = np.eye(4)
+    pose[axis, 3] = sign * (reach - 3.1)
+    point = np.zeros(3)
+    point[axis] = sign * 1.0
+    inside = CloudFrame("r", 0, np.array([point]), None, pose)
+    freed, hit = _agree(inside, SENSOR, region)
+    assert len(freed) == 4
+    assert len(hit) == 1
+    far = CloudFrame("robot_7", 5, np.array([point * 3.5]), None, pose)
+    with pytest.raises(
+        InputError, match=r"robot 'robot_7', 5 ns: the scan lies outside the map, which reaches 65536 m"
+    ):
+        _cells(far, SENSOR, region)
+    pose = pose.copy()
+    pose[axis, 3] = sign * (reach + 1.0)
+    for origin in (pose, np.full((4, 4), np.nan), pose * 1e30):
+        with pytest.raises(InputError, match="outside the map"):
+            _cells(CloudFrame("r", 0, np.array([-2.0 * point]), None, origin), SENSOR, region)
+        with pytest.raises(InputError, match="outside the map"):
+            _cells(CloudFrame("r", 0, np.zeros((0, 3)), None, origin), SENSOR, region)
+
+
+def test_a_resolution_too_fine_for_the_range_is_refused():
+    frame = cloud([[100.0, 100.0, 100.0]], [1])
+    with pytest.raises(ConfigError, match=r"resolution: 0.01 m is too fine for max_range 500 m"):
+        _cells(frame, SensorConfig(max_range=500.0), MapConfig(resolution=0.01))
+
+
+# --- sums ------------------------------------------------------------------------------------------------------------
+
+
+def _sums(frames, increments, num_classes=NUM_CLASSES, sensor=SENSOR, region=MAP):
+    octree = SemanticOctree(region.resolution, num_classes)
+    caster = ScanCaster(sensor, region, NUM_CLASSES)
+    for revision, frame in enumerate(frames):
+        add_scan(octree, caster.cast(frame), increments, revision)
+    return octree
+
+
+@pytest.mark.parametrize("increments", ["clamped", "unclamped", "count"])
+def test_sums_of_many_scans_are_those_of_the_reference(increments):
+    sensor = SensorConfig(max_range=4.0, hit=0.75, miss=-0.5, hit_other=-0.25, clamp_min=-2.0, clamp_max=1.5)
+    steps = {
+        "clamped": clamped_increments(sensor), "unclamped": unclamped_increments(sensor), "count": COUNT_SCANS,
+    }[increments]  # fmt: skip
+    num_classes = 1 if increments == "count" else NUM_CLASSES
+    scenario = make_scenario(2, TeamShape(num_robots=2, num_ticks=15, image=(12, 9), resolution=0.4, sensors="mixed"))
+    region = MapConfig(resolution=0.4)
+    octree = _sums(scenario.frames, steps, num_classes, sensor, region)
+    expected = {}
+    for frame in scenario.frames:
+        freed, hit = _expected(frame, sensor, region)
+        for key in freed | hit.keys():
+            change = np.full(num_classes, steps.miss)
+            if key in hit:
+                change[:] = steps.hit_other
+                if num_classes > 1:
+                    change[hit[key] - 1] = steps.hit
+                else:
+                    change[:] = steps.hit
+            expected[key] = np.clip(expected.get(key, np.zeros(num_classes)) + change, steps.least, steps.most)
+    # All increments are multiples of a quarter, so that float32 sums are exact.
+    assert cells_of(octree) == {key: value.astype(np.float32).tobytes() for key, value in expected.items()}
+
+
+def test_one_class_and_254_classes():
+    pose = np.eye(4)
+    pose[:3, :3] = FACING_X
+    for num_classes, class_id in ((1, 1), (254, 254), (254, 1)):
+        frame = depth_frame(np.array([[2.0]], np.float32), [[class_id]])
+        octree = SemanticOctree(1.0, num_classes)
+        caster = ScanCaster(SENSOR, MapConfig(resolution=1.0), num_classes)
+        add_scan(octree, caster.cast(frame), clamped_increments(SENSOR), 3)
+        values = np.frombuffer(cells_of(octree)[2, 0, 0], np.float32)
+        expected = np.full(num_classes, -0.3, np.float32)
+        expected[class_id - 1] = 1.0
+        np.testing.assert_array_equal(values, expected)
+        assert octree.revisions.tolist() == [3]
+
+
+def test_saturated_free_space_becomes_uniform_and_stays_unchanged():
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(4000, 3))
+    points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * 3.9
+    pose = np.eye(4)
+    pose[:3, 3] = 0.8
+    frame = CloudFrame("r", 0, points, np.zeros(len(points), np.uint8), pose)
+    octree = _sums([frame] * 20, clamped_increments(SENSOR))
+    centre = octree.find(np.array([kernels.key_to_code(0, 0, 0) >> 9]))[0]
+    assert octree.bricks.tiers[centre] == kernels.UNIFORM
+    assert octree.bricks.values[centre] == -5.0
+    assert octree.revisions[centre] < 19
