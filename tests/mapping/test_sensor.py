@@ -115,6 +115,15 @@ def test_random_scans_in_a_region(bounds):
             _agree(frame, sensor, MapConfig(resolution=0.2, bounds=bounds))
 
 
+@pytest.mark.parametrize(("resolution", "low", "high"), [(0.7, 89.25, 91.35), (0.3, -0.45, 0.15), (0.2, 0.5, 0.7)])
+def test_bounds_through_cell_centres(resolution, low, high):
+    pose = np.eye(4)
+    pose[:3, 3] = (0.01, 0.02, low - 3 * resolution)
+    frame = CloudFrame("r", 0, np.array([[0.0, 0.0, 10 * resolution]]), None, pose)
+    freed, _ = _agree(frame, dataclasses.replace(SENSOR, max_range=50.0), MapConfig(resolution, bounds=(low, high)))
+    assert freed
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     origin=st.tuples(*[st.integers(-24, 24)] * 3),
@@ -181,7 +190,7 @@ def test_a_point_at_exactly_min_range_is_used():
 
 def test_a_scan_in_the_origins_own_cell():
     assert _agree(cloud([[0.01, 0.0, 0.0]], [1])) == (set(), {(2, 2, 2): 1})
-    assert _agree(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), set())
+    assert _agree(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), {})
     freed, hit = _agree(cloud([[0.01, 0.0, 0.0], [1.0, 0.0, 0.0]], [1, 2]))
     assert (2, 2, 2) in hit
     assert (2, 2, 2) not in freed
@@ -195,10 +204,10 @@ def test_the_majority_of_points_decides_and_ties_go_to_the_lower_id():
 
 
 def test_scans_without_points():
-    assert _agree(cloud(np.zeros((0, 3)), [])) == (set(), set())
-    assert _agree(cloud([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]], [1, 1, 1])) == (set(), set())
-    assert _agree(depth_frame(np.zeros((3, 4), np.uint16), unit=0.001)) == (set(), set())
-    assert _agree(depth_frame(np.zeros((0, 0), np.float32))) == (set(), set())
+    assert _agree(cloud(np.zeros((0, 3)), [])) == (set(), {})
+    assert _agree(cloud([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]], [1, 1, 1])) == (set(), {})
+    assert _agree(depth_frame(np.zeros((3, 4), np.uint16), unit=0.001)) == (set(), {})
+    assert _agree(depth_frame(np.zeros((0, 0), np.float32))) == (set(), {})
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])

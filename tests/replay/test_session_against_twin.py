@@ -167,7 +167,7 @@ def _compare_metrics(expected, metrics, peak_all):
     assert metrics.num_known_cells == theirs.num_known_cells
     assert metrics.max_change == pytest.approx(theirs.max_change, rel=1e-3, abs=1e-5)
     close = _near_ties(expected.maps, expected.prior) & expected.known
-    close_oracle = _near_ties(expected.oracle, expected.prior)
+    close_oracle = _near_ties(expected.oracle, expected.prior) & expected.known.any(axis=0)
     known = max(theirs.num_known_cells, 1)
     assert metrics.label_disagreement == pytest.approx(theirs.label_disagreement, abs=close.any(axis=0).sum() / known)
     num_occupied = max(int((_absolute(expected.oracle, expected.prior).argmax(axis=1) > 0).sum()), 1)
@@ -537,6 +537,10 @@ def test_a_fault_turns_the_comparison_red(monkeypatch, rule, mode, fault, messag
         ("total_distance", lambda value: value * 1.01), ("total_distance_all", lambda value: value * 0.99),
         ("num_known_cells", lambda value: value + 1), ("max_change", lambda value: value + 0.1),
         ("label_disagreement", lambda value: value + 0.1),
+        ("robots", lambda robots: _each_robot(robots, "agreement", 0.05)),
+        ("robots", lambda robots: _each_robot(robots, "agreement_occupied", -0.05)),
+        ("robots", lambda robots: _each_robot(robots, "entropy_bits", 0.001)),
+        ("robots", lambda robots: _each_robot(robots, "num_cells", 1)),
     ],
 )  # fmt: skip
 def test_a_wrong_metric_turns_the_comparison_red(monkeypatch, name, wrong):
@@ -549,3 +553,7 @@ def test_a_wrong_metric_turns_the_comparison_red(monkeypatch, name, wrong):
     monkeypatch.setattr(Session, "_measure", measure)
     with pytest.raises(AssertionError):
         _compare(SMALL, topology="line", rule="gradient", settle=0, every=50, with_metrics=True)
+
+
+def _each_robot(robots, name, change):
+    return tuple(dataclasses.replace(robot, **{name: getattr(robot, name) + change}) for robot in robots)

@@ -35,7 +35,7 @@ NUM_BRICKS, NUM_SCALAR, NUM_VECTOR, NUM_FREE_SCALAR = 0, 1, 2, 3
 CHILD_UNKNOWN, CHILD_INNER, CHILD_SCALAR, CHILD_VECTOR = 0, 1, 2, 3
 
 CUT = 255
-"""Kind of a ray that was cut at max_range; other kinds are class ids, 0 for an ignored label."""
+"""Kind of a ray that was cut at max_range, above every class_id; other kinds are class ids, 0 for an ignored label."""
 
 GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
@@ -61,8 +61,8 @@ class Bricks(NamedTuple):
 def _compile(function: Callable[..., Any], **options: Any) -> Any:
     """numba.njit with the on-disk cache where a cache folder can be written, without it elsewhere.
 
-    No fast-math: reordered sums come out differently when callees are linked from the cache instead of inlined, and the
-    same input must give the same bytes. Loops over a brick run as vectors all the same when they sum element by element.
+    No fast-math: reordered sums come out differently when callees are linked from the cache instead of inlined, and
+    the same input must give the same bytes. Loops over a brick run as vectors when they sum element by element.
     """
     settings = {"nogil": True, "error_model": "numpy", **options}
     try:
@@ -122,6 +122,13 @@ def gather_bits(code):
 def key_to_code(x, y, z):
     """Morton code of a finest cell's key; the key space's lowest corner has code 0."""
     return spread_bits(x + KEY_OFFSET) | spread_bits(y + KEY_OFFSET) << 1 | spread_bits(z + KEY_OFFSET) << 2
+
+
+@kernel
+def keys_to_codes(keys, codes):
+    """Morton codes (n,) of the cells with these keys (n, 3)."""
+    for i in range(codes.size):
+        codes[i] = key_to_code(keys[i, 0], keys[i, 1], keys[i, 2])
 
 
 @kernel
@@ -403,18 +410,18 @@ def depth_to_ends(
                 kind = np.uint8(CUT)
             x = ratios[u] * z
             y = y_ratio * z
-            wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-            wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-            wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-            if not _store_end(wx, wy, wz, kind, resolution, keys, kinds, ends, count):
+            if not _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, count):
                 return -1
             count += 1
     return count
 
 
 @kernel
-def _store_end(wx, wy, wz, kind, resolution, keys, kinds, ends, place):
-    """Write one ray's end; False when its key is outside the key space."""
+def _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, place):
+    """Write one ray's end, given in the sensor's frame; False when its key is outside the key space."""
+    wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+    wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+    wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     kx, ky, kz = np.floor(wx / resolution), np.floor(wy / resolution), np.floor(wz / resolution)
     if not (abs(kx) < KEY_OFFSET and abs(ky) < KEY_OFFSET and abs(kz) < KEY_OFFSET):
         return False
@@ -444,10 +451,7 @@ def points_to_ends(points, class_ids, pose, resolution, min_range, max_range, ke
             scale = max_range / distance
             x, y, z = x * scale, y * scale, z * scale
             kind = np.uint8(CUT)
-        wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-        wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-        wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if not _store_end(wx, wy, wz, kind, resolution, keys, kinds, ends, count):
+        if not _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, count):
             return -1
         count += 1
     return count
@@ -483,9 +487,9 @@ def mark_ends(keys, kinds, num_classes, corner, offsets, mapped, slots, votes, r
     """Find the distinct end cells and mark the hit ones with 1 + the class that most points in them have.
 
     ``offsets`` (3, m) are the axis tables of the scratch grid with lowest cell ``corner`` (3,); in ``mapped``,
-    coordinates outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed and left
-    so; ``rays`` (n,) gets one input index for each distinct end cell. Returns the number of distinct end cells and of
-    touched bricks.
+    coordinates outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed
+    and left so; ``rays`` (n,) gets one input index for each distinct end cell. Returns the number of distinct end
+    cells and of touched bricks.
     """
     num_rays = 0
     num_touched = 0
@@ -503,7 +507,7 @@ def mark_ends(keys, kinds, num_classes, corner, offsets, mapped, slots, votes, r
                 slots[cell] = slot + 1
                 rays[slot] = i
                 num_rays += 1
-        if kinds[i] != CUT and kinds[i] != 0:
+        if 0 < kinds[i] <= num_classes:
             votes[slot, kinds[i] - 1] += 1
     for slot in range(num_rays):
         x, y, z = keys[rays[slot], 0] - corner[0], keys[rays[slot], 1] - corner[1], keys[rays[slot], 2] - corner[2]
@@ -542,7 +546,7 @@ def mark_free(origin, ends, end_keys, resolution, corner, mapped, marks, touched
         step_z = 1 if left_z > 0 else -1
         left_x, left_y, left_z = abs(left_x), abs(left_y), abs(left_z)
         next_x = next_y = next_z = np.inf
-        # The wall ahead of local cell k is at (k + ahead) x resolution; crossings are never summed up, so nothing drifts.
+        # The wall ahead of local cell k is at (k + ahead) x resolution; crossings are not summed up, so nothing drifts.
         ahead_x, ahead_y, ahead_z = corner[0] + (step_x > 0), corner[1] + (step_y > 0), corner[2] + (step_z > 0)
         if left_x > 0:
             next_x = ((x + ahead_x) * resolution - origin[0]) / dx

@@ -207,9 +207,10 @@ class SemanticOctree:
         codes, depths, is_vector = leaf_list(streams)
         with np.errstate(invalid="ignore"):
             keys = np.floor(np.asarray(coords, np.float64) / self.resolution)
-            inside = np.all(np.abs(keys) < kernels.KEY_OFFSET, axis=1)
+            inside = np.all((keys >= -kernels.KEY_OFFSET) & (keys < kernels.KEY_OFFSET), axis=1)
             keys = np.where(inside[:, None], keys, 0).astype(np.int64)
-        cell_codes = np.array([kernels.key_to_code(*key) for key in keys], np.int64)
+        cell_codes = np.empty(len(keys), np.int64)
+        kernels.keys_to_codes(keys, cell_codes)
         leaf = np.searchsorted(codes, cell_codes, side="right") - 1
         spans = np.int64(1) << (3 * (kernels.KEY_BITS - depths.astype(np.int64)))
         known = inside & (leaf >= 0)

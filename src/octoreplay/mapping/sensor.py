@@ -72,8 +72,7 @@ class ScanCaster:
         self._sensor = sensor
         self._resolution = map_config.resolution
         self._num_classes = num_classes
-        box = np.array(map_config.box).reshape(2, 3) / map_config.resolution
-        self._low_key, self._high_key = np.ceil(box[0] - 0.5), np.ceil(box[1] - 0.5) - 1
+        self._low, self._high = np.array(map_config.box).reshape(2, 3, 1)
         self._invalid = np.array(sensor.invalid_depth, np.float64)
         self._no_return = np.array(sensor.no_return_depth, np.float64)
         self._marks = np.zeros(0, np.uint8)
@@ -149,11 +148,14 @@ class ScanCaster:
         largest = float(np.iinfo(depth.dtype).max) if depth.dtype.kind in "ui" else np.inf
         camera = frame.camera
         classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
+        # A float image stores a value such as 2.1 as its nearest float32, and that is what it is to be compared with.
+        stored = np.float32 if kind is np.float32 else np.float64
+        invalid, no_return = (a.astype(stored).astype(np.float64) for a in (self._invalid, self._no_return))
         return int(
             kernels.depth_to_ends(
                 np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
                 np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-                self._sensor.max_range, largest, self._invalid, self._no_return, keys, kinds, ends,
+                self._sensor.max_range, largest, invalid, no_return, keys, kinds, ends,
             )
         )  # fmt: skip
 
@@ -187,8 +189,8 @@ class ScanCaster:
             )
         offsets = np.zeros((3, int(edges.max())), np.int64)
         kernels.fill_axis_tables(num_bricks, offsets)
-        local = np.arange(offsets.shape[1])[None, :] + corner[:, None]
-        outside = (local < self._low_key[:, None]) | (local > self._high_key[:, None])
+        centers = (np.arange(offsets.shape[1])[None, :] + corner[:, None] + 0.5) * self._resolution
+        outside = (centers < self._low) | (centers >= self._high)
         return corner, (offsets, edges), np.where(outside, np.int64(-(1 << 50)), offsets)
 
     def _make_room(self, num_cells: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +10,7 @@ from octoreplay.config import RunConfig
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.records import FrameCounts, MapState, RunSummary, TickMetrics
-
-if TYPE_CHECKING:
-    from octoreplay.replay.session import Tick
+from octoreplay.replay.tick import Tick
 
 STATES_PER_KEY_FRAME = 12
 """Every so many stored states of a robot, the first included, is a key frame."""

@@ -39,6 +39,7 @@ from octoreplay.replay.graph import (
 )
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.robot import PublishedMap, Robot
+from octoreplay.replay.tick import Tick
 from octoreplay.replay.timeline import FrameSource, Timeline
 
 CONVERGED = "converged"
@@ -57,21 +58,6 @@ class Progress:
     tick: int
     total_distance: float
     settling: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Tick:
-    """The team after one tick. ``maps`` are the robots' octrees h_i - h_0 themselves: valid until the next tick."""
-
-    number: int
-    stamp_ns: int
-    settling: bool
-    graph: CommunicationGraph
-    published: tuple[PublishedMap | None, ...]
-    maps: tuple[SemanticOctree, ...]
-    oracle: SemanticOctree
-    poses: tuple[RobotPose, ...]
-    metrics: TickMetrics
 
 
 class Session:

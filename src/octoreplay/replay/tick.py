@@ -1,0 +1,25 @@
+"""What one consensus tick leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.records import RobotPose, TickMetrics
+from octoreplay.replay.graph import CommunicationGraph
+from octoreplay.replay.robot import PublishedMap
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """The team after one tick. ``maps`` are the robots' octrees h_i - h_0 themselves: valid until the next tick."""
+
+    number: int
+    stamp_ns: int
+    settling: bool
+    graph: CommunicationGraph
+    published: tuple[PublishedMap | None, ...]
+    maps: tuple[SemanticOctree, ...]
+    oracle: SemanticOctree
+    poses: tuple[RobotPose, ...]
+    metrics: TickMetrics

@@ -1,0 +1,269 @@
+"""One iteration against the reference's rules, and what whole runs must keep and reach."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from octoreplay.mapping import kernels
+from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
+from octoreplay.replay.session import CONVERGED, Session
+from octree_factory import cells_of, cube, octree_of
+from reference import rules
+from reference.hand_made import team_config
+from reference.scenarios import TeamShape, make_scenario
+
+NUM_CLASSES = 3
+RULES = ("gradient", "natural", "bayes", "local")
+TOPOLOGIES = ("complete", "ring", "line", "star")
+
+
+# --- one iteration ---------------------------------------------------------------------------------------------------
+
+
+def _random_cells(rng, scale=3.0):
+    """Cubes with one value for all classes, cubes with one per class, and single cells, overlapping now and then."""
+    cells = {}
+    for _ in range(rng.integers(0, 4)):
+        edge = int(rng.choice([1, 3, 8]))
+        corner = (rng.integers(-2, 2, 3) * (8 if edge == 8 else 5)).tolist()
+        values = (rng.normal(size=NUM_CLASSES) * scale).astype(np.float32)
+        cells.update(cube(corner, edge, values if rng.random() < 0.5 else np.full(NUM_CLASSES, values[0])))
+    return cells
+
+
+def _dense(keys, cells):
+    """(M, K) float64 of a map, 0 where it knows nothing, the column of free space included."""
+    dense = np.zeros((len(keys), NUM_CLASSES + 1))
+    for row, key in enumerate(keys):
+        if key in cells:
+            dense[row, 1:] = cells[key]
+    return dense
+
+
+def _expected(rule, own, base, neighbours, weights, log_q, last, gamma):
+    """The reference's step; weights are 2 epsilon A_ij, so epsilon is a half."""
+    mixed = rules.mix(own, [(w, other - base) for w, other in zip(weights, neighbours, strict=True)], 0.5)
+    if rule == "gradient":
+        return rules.gradient_step(mixed, log_q, gamma)
+    if rule == "natural":
+        return rules.natural_step(mixed, log_q, gamma)
+    return rules.bayes_step(mixed, log_q, last) if rule == "bayes" else log_q
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 100_000),
+    rule=st.sampled_from(RULES),
+    gamma=st.sampled_from([0.0, 0.5, 1.0]),
+    with_base=st.booleans(),
+)
+def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, rule, gamma, with_base):
+    """All cells, the ones that only some of the maps hold included, in bricks of any kind."""
+    rng = np.random.default_rng(seed)
+    own, base, log_q, last = (_random_cells(rng) for _ in range(4))
+    neighbours = [_random_cells(rng) for _ in range(rng.integers(0, 4))]
+    neighbours = [] if rule == "local" else neighbours
+    weights = rng.uniform(0.0, 0.5, len(neighbours)).astype(np.float32)
+    keys = sorted(set().union(own, base, log_q, last, *neighbours))
+    dense_own = _dense(keys, own)
+    expected = _expected(
+        rule, dense_own, _dense(keys, base) if with_base else dense_own, [_dense(keys, n) for n in neighbours], weights,
+        _dense(keys, log_q), _dense(keys, last), gamma,
+    )  # fmt: skip
+    octree = _octree(own)
+    change = consensus_step(
+        octree, [_octree(n) for n in neighbours], weights.tolist(), _octree(log_q), rule=rule, gamma=gamma, revision=4,
+        base=_octree(base) if with_base else None, last_log_likelihood=_octree(last),
+    )  # fmt: skip
+    found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
+    known = set().union(own, log_q, *neighbours)
+    assert found.keys() == known
+    # Cells of the base or of old evidence alone do not occur in a run: what a robot published, it knows.
+    compared = [row for row, key in enumerate(keys) if key in known]
+    for row in compared:
+        np.testing.assert_allclose(found[keys[row]], expected[row, 1:], atol=3e-5, rtol=1e-5)
+    most = np.abs(expected - dense_own)[compared].max(initial=0.0)
+    assert change == pytest.approx(most, rel=1e-4, abs=3e-5) or change > most
+    changed = {key for key in known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
+    revised = set(octree.codes[octree.revisions == 4].tolist())
+    assert {int(kernels.key_to_code(*key)) >> 9 for key in changed} <= revised
+
+
+def _octree(cells):
+    return octree_of(cells, num_classes=NUM_CLASSES)
+
+
+def _step(own, log_q, rule="gradient", gamma=1.0, neighbours=(), weights=(), num_classes=2, **others):
+    octree = octree_of({(0, 0, 0): own}, num_classes=num_classes)
+    evidence = octree_of({(0, 0, 0): log_q}, num_classes=num_classes)
+    maps = [octree_of({(0, 0, 0): values}, num_classes=num_classes) for values in neighbours]
+    consensus_step(octree, maps, weights, evidence, rule=rule, gamma=gamma, revision=1, **others)
+    return np.frombuffer(cells_of(octree)[0, 0, 0], np.float32)
+
+
+def test_the_gradient_by_hand():
+    """sigma = 1/3 each, D = (0, -3, 0): g_1 = 1/3 (-1 + 3) and g_2 = 1/3 (-1 - 0)."""
+    np.testing.assert_allclose(_step([0.0, 0.0], [3.0, 0.0]), [2 / 3, -1 / 3], rtol=1e-6)
+
+
+def test_the_mixture_by_hand():
+    found = _step([1.0, 0.0], [0.0, 0.0], "natural", 0.0, neighbours=[[3.0, -1.0], [0.0, 2.0]], weights=[0.25, 0.5])
+    np.testing.assert_allclose(found, [1.0 + 0.25 * 2.0 - 0.5, -0.25 + 1.0])
+
+
+@pytest.mark.parametrize("num_classes", [1, 2, 254])
+@pytest.mark.parametrize("magnitude", [0.0, 1e-38, 1.0, 88.0, 104.0, 1e3, 1e10, 1e18])
+def test_log_odds_of_any_magnitude_stay_numbers(magnitude, num_classes):
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        own, log_q, other = (rng.choice([-1.0, 0.0, 0.5, 1.0], num_classes) * magnitude for _ in range(3))
+        for rule in RULES:
+            found = _step(own, log_q, rule, 0.5, [other], [0.5], num_classes)
+            assert np.isfinite(found).all()
+            mixed = np.append(0.0, 0.5 * own + 0.5 * other)[None].astype(np.float32).astype(np.float64)
+            if rule == "gradient":
+                expected = rules.gradient_step(mixed, np.append(0.0, log_q)[None], 0.5)[0, 1:]
+                np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * max(magnitude, 1e-3))
+
+
+def test_a_step_without_change_marks_nothing():
+    octree = octree_of(cube((0, 0, 0), 3, [1.0, 2.0]))
+    before = octree.revisions.copy()
+    same = octree.copy()
+    assert consensus_step(octree, [same], [0.5], same, rule="natural", gamma=0.5, revision=9) == 0.0
+    assert (octree.revisions == before).all()
+
+
+def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():
+    octree, other = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({(1, 1, 1): [0.0, 0.0], (40, 0, 0): [0.0, 0.0]})
+    assert consensus_step(octree, [other], [0.0], octree.copy(), rule="natural", gamma=0.5, revision=9) == 0.0
+    assert set(cells_of(octree)) == {(0, 0, 0), (1, 1, 1), (40, 0, 0)}
+    assert (octree.revisions == 9).all()
+
+
+def test_neighbours_and_evidence_are_not_changed():
+    own, other, log_q, last = (octree_of(cube((i, 0, 0), 9, [i - 1.0, -i])) for i in range(4))
+    before = [cells_of(octree) for octree in (other, log_q, last)]
+    for rule in RULES:
+        consensus_step(own, [other], [0.5], log_q, rule=rule, gamma=0.5, revision=1, last_log_likelihood=last)
+    assert [cells_of(octree) for octree in (other, log_q, last)] == before
+
+
+def test_uniform_free_space_stays_uniform():
+    own, other = (octree_of(cube((0, 0, 0), 16, [value, value])) for value in (-5.0, -3.0))
+    for rule in ("gradient", "natural", "bayes"):
+        consensus_step(own, [other], [0.5], own.copy(), rule=rule, gamma=0.5, revision=1)
+        assert (own.bricks.tiers[: own.num_bricks] == kernels.UNIFORM).all()
+        assert len(own.leaves()) == 1
+
+
+@pytest.mark.parametrize(
+    ("power", "decay", "expected"), [(0.0, 1.0, 0.8), (1.0, 1.0, 0.8 / 5), (0.5, 2.0, 0.8 / 3**0.5)]
+)
+def test_the_schedule_of_gamma(power, decay, expected):
+    consensus = team_config("a", gamma=0.8, gamma_power=power, gamma_decay=decay).consensus
+    assert gamma_at(consensus, 4) == pytest.approx(expected)
+    assert gamma_at(consensus, 0) == 0.8
+
+
+def test_the_sum_of_evidence():
+    a, b = cube((0, 0, 0), 2, [1.0, -2.0]), cube((1, 0, 0), 8, [4.0, 4.0])
+    counts = {key: [2.0] for key in b}
+    codes = np.unique(np.concatenate([octree_of(a).codes, octree_of(b).codes]))
+    target = octree_of({})
+    sum_of_evidence(target, [Evidence(octree_of(a), scale=0.5), Evidence(octree_of(b))], codes, 3)
+    found = {key: np.frombuffer(value, np.float32).tolist() for key, value in cells_of(target).items()}
+    assert found[0, 0, 0] == [0.5, -1.0]
+    assert found[1, 0, 0] == [4.5, 3.0]
+    assert found[8, 7, 7] == [4.0, 4.0]
+    assert found.keys() == a.keys() | b.keys()
+    assert (target.revisions == 3).all()
+    single = octree_of({})
+    sum_of_evidence(single, [Evidence(octree_of(b), scan_counts=octree_of(counts, num_classes=1))], codes, 3)
+    assert {np.frombuffer(value, np.float32)[0] for value in cells_of(single).values()} == {2.0}
+
+
+# --- whole runs ------------------------------------------------------------------------------------------------------
+
+SHAPE = TeamShape(num_robots=5, num_ticks=24, image=(16, 12), resolution=0.4, scan_period=0.5, sensors="mixed")
+
+
+@functools.lru_cache(maxsize=2)
+def _scenario(shape=SHAPE):
+    return make_scenario(2, shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameList:
+    content: tuple
+
+    def frames(self):
+        return iter(self.content)
+
+
+def _session(shape=SHAPE, **parameters):
+    scenario = _scenario(shape)
+    sources = [FrameList(tuple(f for f in scenario.frames if f.robot_id == robot)) for robot in scenario.robot_ids]
+    return Session(scenario.config(**parameters), sources, num_threads=1)
+
+
+@functools.lru_cache(maxsize=1)
+def _every_cell():
+    """Centres (M, 3) of all cells that the team sees."""
+    *_, tick = _session(rule="local", settle=0).ticks()
+    keys = np.array(sorted(set().union(*(cells_of(octree) for octree in tick.maps))))
+    return (keys + 0.5) * SHAPE.resolution
+
+
+def _values(octree):
+    """(M, C) float64 of a map at every cell."""
+    return octree.lookup(_every_cell())[0].astype(np.float64)
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.parametrize("mode", ["sync", "on-arrival"])
+def test_bayes_keeps_the_mean_and_ends_at_the_oracle(mode, topology):
+    session = _session(rule="bayes", mode=mode, topology=topology)
+    num_robots = len(_scenario().robot_ids)
+    for tick in session.ticks():
+        if tick.settling and tick.number % 10:
+            continue
+        mean = np.mean([_values(octree) for octree in tick.maps], axis=0)
+        evidence = np.mean([_values(robot.evidence.octree) for robot in session._robots], axis=0)
+        np.testing.assert_allclose(mean, evidence, atol=1e-5)
+    for octree in tick.maps:
+        np.testing.assert_allclose(num_robots * _values(octree), _values(tick.oracle), atol=1e-4)
+    assert min(robot.agreement for robot in tick.metrics.robots) > 0.999
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.parametrize("rule", ["gradient", "natural", "bayes"])
+def test_settling_ends_the_disagreement(rule, topology):
+    session = _session(rule=rule, topology=topology)
+    peak = 0.0
+    for tick in session.ticks():
+        peak = max(peak, tick.metrics.total_distance_all)
+    assert tick.metrics.total_distance_all < 1e-9 * peak
+    assert session.stop_reason == CONVERGED
+    assert tick.metrics.label_disagreement < 1e-3
+    assert min(robot.agreement_occupied for robot in tick.metrics.robots) >= 0.995
+
+
+def test_the_gradients_labels_are_the_oracles():
+    """Cells that the oracle calls free by little are slow: classes that were hit once fade at gamma's pace."""
+    session = _session(dataclasses.replace(SHAPE, num_ticks=120), rule="gradient", settle=100)
+    *_, tick = session.ticks()
+    assert min(robot.agreement for robot in tick.metrics.robots) >= 0.995
+    assert min(robot.agreement_occupied for robot in tick.metrics.robots) >= 0.995
+
+
+def test_without_exchange_the_maps_disagree():
+    *_, tick = _session(rule="local").ticks()
+    assert max(robot.agreement_occupied for robot in tick.metrics.robots) < 0.9
+    assert tick.metrics.total_distance_all > 1000.0

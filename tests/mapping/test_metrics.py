@@ -1,0 +1,159 @@
+"""The team's metrics on hand-made octrees, and brick by brick updates against a fresh comparison."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from octoreplay.mapping.metrics import MapComparer
+from octree_factory import cube, octree_of
+from reference.metrics import team_metrics
+
+EMPTY = {}
+
+
+def _compare(maps, oracle, links=((0, 1),), prior=0.0):
+    octrees = [octree_of(cells) for cells in maps]
+    return MapComparer(len(maps), prior).compare(octrees, octree_of(oracle), links, 0)
+
+
+def test_distances_by_hand():
+    a = {(0, 0, 0): [1.0, -2.0], (9, 0, 0): [3.0, 3.0]}
+    b = {(0, 0, 0): [0.0, 0.0], (0, 0, 1): [-1.0, -1.0]}
+    c = {(0, 0, 0): [1.0, -1.0]}
+    found = _compare([a, b, c], a, links=[(0, 1)])
+    # Cells known to one end count as the prior at the other: (1 + 4) + (9 + 9) + (1 + 1).
+    assert found.total_distance == pytest.approx(5 + 18 + 2)
+    # a - c: 1 + 18; b - c: 2 + 2.
+    assert found.total_distance_all == pytest.approx(25 + 19 + 4)
+    assert found.num_known_cells == 3
+    assert found.num_link_cells == 3
+    assert found.num_cells.tolist() == [2, 2, 1]
+
+
+def test_each_link_counts_the_cells_known_to_either_end():
+    a, b, c = cube((0, 0, 0), 2, [0.0, 0.0]), cube((0, 0, 0), 8, [-1.0, -1.0]), {(30, 0, 0): [1.0, 0.0]}
+    assert _compare([a, b, c], b, links=[(0, 1), (0, 2)]).num_link_cells == 512 + 9
+    found = _compare([a, b, c], b, links=[])
+    assert (found.num_link_cells, found.total_distance) == (0, 0.0)
+    assert found.total_distance_all == pytest.approx(512 * 2 + 1 + (512 * 2 + 1), rel=1e-5)
+
+
+def test_agreement_by_hand():
+    oracle = {(0, 0, 0): [2.0, 1.0], (1, 0, 0): [-1.0, -1.0], (2, 0, 0): [0.5, 3.0], (3, 0, 0): [-1.0, -2.0]}
+    a = {(0, 0, 0): [0.1, 0.0], (1, 0, 0): [-0.1, -9.0], (2, 0, 0): [1.0, 0.5]}  # right, right, wrong, unknown
+    b = dict(oracle)
+    found = _compare([a, b], oracle)
+    assert found.agreement.tolist() == [0.5, 1.0]
+    assert found.agreement_occupied.tolist() == [0.5, 1.0]
+    # Unknown cells are a label of their own.
+    assert found.label_disagreement == 0.5
+
+
+@pytest.mark.parametrize(("margin", "agrees"), [(0.0, True), (0.0009, True), (0.0011, False)])
+def test_a_tie_of_the_oracle_counts_as_agreement(margin, agrees):
+    found = _compare([{(0, 0, 0): [0.0, 1.0]}], {(0, 0, 0): [1.0 + margin, 1.0]}, links=[])
+    assert found.agreement.tolist() == found.agreement_occupied.tolist() == [float(agrees)]
+    found = _compare([{(0, 0, 0): [-1.0, -1.0]}], {(0, 0, 0): [margin, -1.0]}, links=[])
+    assert found.agreement.tolist() == [float(agrees)]
+
+
+def test_ties_of_a_map_go_to_free_and_then_to_the_lower_class():
+    oracle = {(0, 0, 0): [-1.0, -1.0], (1, 0, 0): [1.0, -1.0]}
+    found = _compare([{(0, 0, 0): [0.0, 0.0], (1, 0, 0): [2.0, 2.0]}], oracle, links=[])
+    assert found.agreement.tolist() == [1.0]
+
+
+def test_entropy_by_hand():
+    found = _compare([{(0, 0, 0): [0.0, 0.0], (50, 0, 0): [80.0, -80.0]}, EMPTY], EMPTY)
+    assert found.entropy_bits.tolist() == [pytest.approx(np.log2(3) / 2), 0.0]
+    # With a prior: p = (0.5, 0.25, 0.25) where the map says nothing new.
+    found = _compare([{(0, 0, 0): [0.0, 0.0]}], EMPTY, links=[], prior=float(np.log(0.5)))
+    assert found.entropy_bits.tolist() == [pytest.approx(1.5, rel=1e-6)]
+
+
+def test_nothing_is_known():
+    found = _compare([EMPTY, EMPTY], EMPTY)
+    assert (found.num_known_cells, found.total_distance, found.total_distance_all) == (0, 0.0, 0.0)
+    assert found.label_disagreement == 0.0
+    assert found.agreement.tolist() == found.agreement_occupied.tolist() == [1.0, 1.0]
+    assert found.entropy_bits.tolist() == [0.0, 0.0]
+
+
+def test_no_cell_is_occupied():
+    found = _compare([{(0, 0, 0): [1.0, 0.0]}, EMPTY], {(0, 0, 0): [-1.0, -1.0]})
+    assert found.agreement.tolist() == [0.0, 0.0]
+    assert found.agreement_occupied.tolist() == [1.0, 1.0]
+
+
+def test_close_maps_of_large_values_keep_their_distance():
+    a = cube((0, 0, 0), 8, [1e4, -1e4])
+    b = a | {(3, 3, 3): [1e4 + 0.0078125, -1e4]}
+    found = _compare([a, b, a], a)
+    assert found.total_distance == pytest.approx(0.0078125**2, rel=1e-6)
+    assert found.total_distance_all == pytest.approx(2 * 0.0078125**2, rel=1e-4)
+
+
+def _random_cells(rng):
+    cells = {}
+    for _ in range(rng.integers(0, 5)):
+        corner, edge = rng.integers(-10, 10, 3).tolist(), int(rng.choice([1, 2, 8]))
+        values = rng.choice([-5.0, -0.3, 0.7, 4.0], 2) + (rng.random(2) if rng.random() < 0.5 else 0.0)
+        cells.update(cube(corner, edge, values if rng.random() < 0.6 else [values[0]] * 2))
+    return cells
+
+
+def _dense(maps, oracle, prior):
+    """The same maps as (N, M, K), masks (N, M) and the oracle (M, K), for the reference."""
+    keys = sorted(set(itertools.chain(oracle, *maps)))
+    known = np.array([[key in cells for key in keys] for cells in maps], dtype=bool).reshape(len(maps), -1)
+    dense = np.zeros((len(maps) + 1, len(keys), 3))
+    for row, cells in enumerate([*maps, oracle]):
+        for column, key in enumerate(keys):
+            dense[row, column, 1:] = np.float32(cells.get(key, (0.0, 0.0)))
+    dense[..., 1:] += prior
+    return dense[:-1], known, dense[-1]
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), prior=st.sampled_from([0.0, -1.2]))
+def test_random_maps_against_the_reference(seed, prior):
+    rng = np.random.default_rng(seed)
+    maps = [_random_cells(rng) for _ in range(rng.integers(1, 5))]
+    oracle = {key: np.sum([cells.get(key, np.zeros(2)) for cells in maps], axis=0) for key in set().union(*maps)}
+    links = [pair for pair in itertools.combinations(range(len(maps)), 2) if rng.random() < 0.6]
+    found = _compare(maps, oracle, links, prior)
+    expected = team_metrics(*_dense(maps, oracle, prior), links, 0.0)
+    assert found.total_distance == pytest.approx(expected.total_distance, rel=1e-5)
+    assert found.total_distance_all == pytest.approx(expected.total_distance_all, rel=1e-5, abs=1e-9)
+    assert found.num_known_cells == expected.num_known_cells
+    assert found.num_cells.tolist() == list(expected.num_cells)
+    assert found.entropy_bits.tolist() == pytest.approx(expected.entropy_bits, rel=1e-5, abs=1e-6)
+    assert found.label_disagreement == pytest.approx(expected.label_disagreement)
+    assert found.agreement.tolist() == pytest.approx(expected.agreement)
+    assert found.agreement_occupied.tolist() == pytest.approx(expected.agreement_occupied)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_updating_changed_bricks_gives_what_a_fresh_comparison_gives(seed):
+    rng = np.random.default_rng(seed)
+    octrees = [octree_of(_random_cells(rng)) for _ in range(3)]
+    oracle = octree_of(_random_cells(rng))
+    comparer = MapComparer(3, -0.5)
+    links = [(0, 1), (1, 2)]
+    comparer.compare(octrees, oracle, links, 0)
+    for revision in range(2, 8):
+        target = octrees[rng.integers(3)] if rng.random() < 0.8 else oracle
+        source = octree_of(_random_cells(rng))
+        target.overwrite(source, np.arange(source.num_bricks), revision)
+        if rng.random() < 0.3:
+            links = links[:1] if len(links) == 2 else [(0, 1), (1, 2)]
+        updated = comparer.compare(octrees, oracle, links, revision)
+        fresh = MapComparer(3, -0.5).compare(octrees, oracle, links, 0)
+        for name in vars(fresh):
+            np.testing.assert_array_equal(getattr(updated, name), getattr(fresh, name), err_msg=name)

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from octoreplay.mapping import kernels
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
+from octoreplay.records import LeafTable
+from octree_factory import cells_of, cube, octree_of
+from reference.comparison import expand_leaves, num_lossless_leaves
+
+LIMIT = kernels.KEY_OFFSET
+RESOLUTION = 0.25
+
+
+@st.composite
+def cell_maps(draw, num_classes):
+    """{key: values}: cubes with few distinct values, many of them aligned, so that there is much to merge."""
+    values = st.sampled_from([-5.0, -0.25, 0.0, 1.0])
+    cells = {}
+    for _ in range(draw(st.integers(1, 4))):
+        edge = draw(st.sampled_from([1, 2, 4, 8, 16]))
+        corner = [edge * draw(st.integers(-3, 2)) + draw(st.sampled_from([0, 0, 0, 1])) for _ in range(3)]
+        equal = draw(st.booleans())
+        content = [draw(values)] * num_classes if equal else [draw(values) for _ in range(num_classes)]
+        cells.update(cube(corner, edge, content))
+    return cells
+
+
+@settings(max_examples=25, deadline=None)
+@given(cells=cell_maps(num_classes=2))
+def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
+    octree = octree_of(cells)
+    leaves = octree.leaves()
+    keys, values = expand_leaves(leaves, RESOLUTION)
+    content = dict(zip(map(tuple, keys.tolist()), values.tolist(), strict=True))
+    assert len(content) == len(keys) == octree.num_cells == len(cells)
+    assert content == {key: list(value) for key, value in cells.items()}
+    assert (leaves.sizes**3).sum() == pytest.approx(len(cells) * RESOLUTION**3)
+    # As few leaves as a lossless octree can have: no eight sibling leaves are equal.
+    assert len(leaves) == num_lossless_leaves(keys, values.astype(np.float32))
+    assert _in_morton_order(leaves)
+
+
+def _in_morton_order(leaves):
+    low = np.rint((leaves.centers - leaves.sizes[:, None] / 2) / RESOLUTION).astype(np.int64)
+    codes = np.array([kernels.key_to_code(*key) for key in low.tolist()])
+    return bool((np.diff(codes) > 0).all())
+
+
+@settings(max_examples=40, deadline=None)
+@given(cells=cell_maps(num_classes=3), seed=st.integers(0, 99))
+def test_lookup_gives_what_the_leaves_say(cells, seed):
+    octree = octree_of(cells, num_classes=3)
+    rng = np.random.default_rng(seed)
+    keys = np.concatenate([np.array(list(cells))[rng.integers(0, len(cells), 40)], rng.integers(-60, 60, (40, 3))])
+    coords = (keys + rng.uniform(0.0, 1.0, keys.shape)) * RESOLUTION
+    coords[::7] = keys[::7] * RESOLUTION  # exactly in the lowest corner, which belongs to the cell
+    log_odds, known, sizes = octree.lookup(coords)
+    leaves = octree.leaves()
+    for coord, key, found, is_known, size in zip(coords, keys.tolist(), log_odds, known, sizes, strict=True):
+        value = cells.get(tuple(key))
+        assert is_known == (value is not None)
+        assert found.tolist() == (list(value) if value is not None else [0.0, 0.0, 0.0])
+        low = leaves.centers - leaves.sizes[:, None] / 2
+        inside = np.flatnonzero(((low <= coord) & (coord < low + leaves.sizes[:, None])).all(axis=1))
+        assert len(inside) == is_known
+        assert size == (leaves.sizes[inside[0]] if is_known else 0.0)
+
+
+def test_lookup_outside_the_key_space_is_unknown():
+    octree = octree_of({(-LIMIT, 0, 0): [1.0, 2.0], (LIMIT - 1, 0, 0): [1.0, 2.0]})
+    reach = LIMIT * RESOLUTION
+    places = [[-reach, 0, 0], [np.nextafter(reach, 0), 0, 0], [reach, 0, 0], [-reach - 1, 0, 0], [1e300, 0, 0]]
+    places += [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, -np.inf]]
+    log_odds, known, sizes = octree.lookup(np.array(places))
+    assert known.tolist() == [True, True] + 6 * [False]
+    assert log_odds[:2].tolist() == [[1.0, 2.0]] * 2
+    assert not log_odds[2:].any()
+    assert (sizes > 0).tolist() == known.tolist()
+
+
+def test_lookup_of_nothing_and_in_nothing():
+    assert [len(part) for part in octree_of({(0, 0, 0): [1.0, 1.0]}).lookup(np.zeros((0, 3)))] == [0, 0, 0]
+    log_odds, known, _ = SemanticOctree(0.2, 2).lookup(np.zeros((4, 3)))
+    assert not known.any()
+    assert log_odds.shape == (4, 2)
+
+
+def test_the_prior_is_added_to_leaves():
+    octree = octree_of({(0, 0, 0): [1.0, -0.25]})
+    table = octree.leaves(prior=-1.5)
+    assert isinstance(table, LeafTable)
+    assert table.log_odds.tolist() == [[-0.5, -1.75]]
+    assert table.centers.tolist() == [[0.125, 0.125, 0.125]]
+    assert table.sizes.tolist() == [0.25]
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), tolerance=st.sampled_from([0.0, 0.05, 0.2, 1.0, 10.0]))
+def test_merging_stays_within_its_bound(seed, tolerance):
+    """Every cell of a merged leaf is within half the tolerance of the leaf, and nothing that could merge is left."""
+    rng = np.random.default_rng(seed)
+    corner = rng.integers(-9, 9, 3)
+    cells = {}
+    for key in cube(corner.tolist(), 8, None):
+        if rng.random() < 0.97:
+            cells[key] = (rng.integers(0, 3) + 0.1 * rng.random(2)).astype(np.float32)
+    octree = octree_of(cells)
+    merged = octree_from_streams(octree.streams(tolerance=tolerance), RESOLUTION)
+    after = cells_of(merged)
+    assert after.keys() == cells.keys()
+    for key, value in after.items():
+        assert np.abs(np.frombuffer(value, np.float32) - cells[key]).max() <= tolerance / 2 * (1 + 1e-6) + 1e-7
+    leaves = merged.leaves()
+    finest = np.rint((leaves.centers - leaves.sizes[:, None] / 2) / RESOLUTION).astype(np.int64)
+    groups = {}
+    for key, size in zip(finest.tolist(), leaves.sizes, strict=True):
+        if size == RESOLUTION:
+            groups.setdefault(tuple(k >> 1 for k in key), []).append(cells[tuple(key)])
+    for group in groups.values():
+        assert len(group) < 8 or np.ptp(np.array(group), axis=0).max() > tolerance
+
+
+def test_without_pruning_every_known_cell_is_a_leaf():
+    octree = octree_of(cube((0, 0, 0), 16, [-5.0, -5.0]) | {(40, 1, 1): [1.0, 0.0]})
+    streams = octree.streams(prune=False)
+    assert streams.num_leaves == octree.num_cells == 16**3 + 1
+    assert cells_of(octree_from_streams(streams, RESOLUTION)) == cells_of(octree)
+    assert octree.streams().num_leaves == 2
+
+
+def test_equal_siblings_that_are_not_all_known_stay_apart():
+    cells = cube((0, 0, 0), 8, [-5.0, -5.0])
+    del cells[7, 7, 7]
+    octree = octree_of(cells)
+    assert octree.bricks.tiers[0] == kernels.SCALAR
+    assert len(octree.leaves()) == 7 + 7 + 7
+    whole = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
+    assert whole.bricks.tiers[0] == kernels.UNIFORM
+
+
+@settings(max_examples=20, deadline=None)
+@given(first=cell_maps(num_classes=2), second=cell_maps(num_classes=2))
+def test_overwrite_replaces_whole_bricks(first, second):
+    target, source = octree_of(first), octree_of(second)
+    target.overwrite(source, np.arange(source.num_bricks), revision=5)
+    bricks = {tuple(k >> 3 for k in key) for key in second}
+    kept = {key: value for key, value in first.items() if tuple(k >> 3 for k in key) not in bricks}
+    assert cells_of(target) == cells_of(octree_of(kept | second))
+    assert np.count_nonzero(target.revisions == 5) == source.num_bricks
+
+
+def test_a_copy_is_independent():
+    octree = octree_of(cube((0, 0, 0), 3, [1.0, 2.0]))
+    before = cells_of(octree)
+    copy = octree.copy()
+    copy.overwrite(octree_of(cube((0, 0, 0), 5, [0.0, 0.0])), np.arange(1))
+    assert cells_of(octree) == before
+    assert cells_of(copy) != before
+
+
+def test_many_bricks_are_found_again():
+    """The hash table and the arrays grow many times."""
+    rng = np.random.default_rng(0)
+    octree = SemanticOctree(0.2, 1)
+    codes = np.unique(rng.integers(0, 1 << 48, 30_000))
+    rng.shuffle(codes)
+    for part in np.array_split(codes, 37):
+        indices = octree.find_or_add(part)
+        assert (octree.codes[indices] == part).all()
+    assert (octree.codes[octree.find(codes)] == codes).all()
+    assert octree.num_bricks == len(codes)
+    assert (octree.find(codes + (1 << 48)) == -1).all()
+    assert octree.find_or_add(np.array([codes[3], codes[3]])).tolist() == [3, 3]
+    assert octree.num_bricks == len(codes)
+
+
+def test_morton_codes():
+    keys = [(-LIMIT, -LIMIT, -LIMIT), (LIMIT - 1,) * 3, (0, 0, 0), (-1, 5, -77)]
+    codes = np.array([kernels.key_to_code(*key) for key in keys])
+    assert codes[:2].tolist() == [0, (1 << 57) - 1]
+    back = np.empty((4, 3), np.int64)
+    kernels.codes_to_keys(codes, back)
+    assert [tuple(key) for key in back.tolist()] == keys
+    for child in itertools.product((0, 1), repeat=3):
+        x, y, z = child
+        assert kernels.key_to_code(2 + x, 4 + y, -6 + z) - kernels.key_to_code(2, 4, -6) == x + 2 * y + 4 * z
+
+
+def test_memory_is_what_the_bricks_take():
+    octree = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
+    assert octree.memory_bytes < 2000
+    hit = octree_of({(0, 0, 0): [1.0, 0.0]})
+    assert 4096 < hit.memory_bytes < 4096 + 2000
