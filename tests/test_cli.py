@@ -156,6 +156,12 @@ def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pyt
         (["run", PAIR, "-o", "x.mcap", "--rule", "magic"], 2, "'magic' is not one of"),
         (["run", PAIR, "-o", "x.mcap", "--hit", "-1"], 2, "hit: -1.0 must be greater than 0"),
         (["run", PAIR, "-o", "x.mcap", "--bounds", "1"], 2, "bounds: expects 2 or 6 numbers, got 1"),
+        (["run", PAIR, "-o", "x.mcap", "--bounds", "nan,5"], 2, "bounds: expects finite numbers"),
+        (["run", PAIR, "-o", "x.mcap", "--publish-period", "1e-7"], 2, "more than 10,000,000; check clock_offset"),
+        (["run", PAIR, "-o", "x.yaml"], 2, r"x\.yaml: the output's name must end in \.mcap"),
+        (["run", PAIR, "--save-team", PAIR], 1, "is an input of this command"),
+        (["query", PAIR, "--box", "5", "5", "5", "0", "0", "0"], 2, "box: every minimum must be below its maximum"),
+        (["query", PAIR, "--at", "nan", "0", "0"], 2, "at: expects finite numbers"),
         (["run", PAIR, "-o", "x.mcap", "--resolution", "small"], 2, "'small' is not a valid float"),
         (["run", "--config-from", PAIR, "-o", "x.mcap"], 1, "not a finished MCAP file"),
         (["info"], 2, "Missing argument"),
@@ -255,6 +261,8 @@ def test_export_writes_what_it_says(result: Path, tmp_path: Path) -> None:
     assert "octoreplay map of husky_2" in data.comments[0]
     fails(1, "robot 'husky_9' not found; robots: husky_1, husky_2", "export", result, "-o", tmp_path / "x.ply",
           "--robot", "husky_9")  # fmt: skip
+    fails(2, r"out\.mcap: the output's name must end in \.ply", "export", result, "-o", tmp_path / "out.mcap")
+    fails(1, "is a folder or a device", "export", result, "-o", "/dev/full")
     fails(1, "no map of robot 'husky_1' is stored up to", "export", result, "-o", tmp_path / "x.ply", "--at", "-5")
     fails(1, r"none/x\.ply: cannot be written", "export", result, "-o", tmp_path / "none" / "x.ply")
     assert not (tmp_path / "x.ply").exists()
@@ -282,25 +290,28 @@ def test_info_describes_logs() -> None:
     assert max(len(line) for line in done.stdout.splitlines()) <= 100
 
 
-def interrupted(arguments: list[object], ready: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
-    """A command that gets SIGINT once it is ready."""
+def interrupted(
+    arguments: list[object], ready: Callable[[], bool], number: signal.Signals
+) -> subprocess.CompletedProcess[str]:
+    """A command that gets a signal once it is ready."""
     process = subprocess.Popen(
         [sys.executable, "-m", "octoreplay", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
     while process.poll() is None and not ready():
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=120)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
-def test_an_interrupted_run_leaves_a_partial_result_and_the_old_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_partial_result_and_the_old_one(tmp_path: Path, number: signal.Signals) -> None:
     out, partial = tmp_path / "out.mcap", tmp_path / "out.partial.mcap"
     out.write_text("the result of yesterday")
     # Very long settling, so that the run is still going when the signal comes.
     arguments = ["run", PAIR, "-o", out, "--settle", "100000", "--settle-max", "100000", "--state-every", "0.001"]
-    done = interrupted(arguments, lambda: partial.exists() and partial.stat().st_size > 20_000)
+    done = interrupted(arguments, lambda: partial.exists() and partial.stat().st_size > 20_000, number)
     assert done.returncode == 130, done.stderr
     assert f"interrupted; what was finished is in {partial}" in done.stderr
     assert out.read_text() == "the result of yesterday"

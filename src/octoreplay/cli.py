@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -119,6 +121,10 @@ def run(
 
     if output is None and save_team is None:
         raise click.UsageError("give the result's name: -o OUT.mcap (or --save-team TEAM.yaml to stop before the run)")
+    if output is not None:
+        _check_output(output, ".mcap")
+    if save_team is not None:
+        _check_output(save_team, ".yaml", inputs)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     base = _base_config(inputs, config_from, err)
     given = {name: value for name, value in parameters.items() if value is not None}
@@ -226,6 +232,7 @@ def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
     from octoreplay.report.export import export_ply
     from octoreplay.report.tables import size
 
+    _check_output(output, ".ply")
     count = export_ply(result, output, at=at, **options)
     click.echo(f"wrote {output} ({count:,} {'cubes' if options['what'] == 'voxels' else 'points'}, "
                f"{size(output.stat().st_size)})")  # fmt: skip
@@ -241,6 +248,8 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
     from octoreplay.report import plots, tables
     from octoreplay.result import open_result
 
+    if csv is not None:
+        _check_output(csv, ".csv")
     with open_result(result) as opened:
         tables.show(tables.terminal(), tables.results(opened.summary))
         written: list[Path] = []
@@ -288,6 +297,10 @@ def query(
 
     if not points and box is None:
         raise click.UsageError("ask for a point, --at X Y Z, or a box, --box XMIN YMIN ZMIN XMAX YMAX ZMAX")
+    if not all(math.isfinite(number) for point in points for number in point):
+        raise ConfigError("at: expects finite numbers")
+    if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise ConfigError("box: every minimum must be below its maximum")
     out = tables.terminal()
     with open_result(result) as opened:
         robot_id = opened.robots[0] if robot is None else robot
@@ -327,6 +340,7 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
     from octoreplay.config import load_team_file
     from octoreplay.io import rgbd_folder
 
+    _check_output(output, ".mcap")
     numbers = None if intrinsics is None else _numbers("intrinsics", intrinsics, 4)
     table = None if classes_from is None else load_team_file(classes_from).classes
     with _progress("import") as update:
@@ -345,7 +359,8 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit with its code."""
+    """Run the command line and exit with its code; SIGTERM ends a run as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_exit_code(arguments))
 
 
@@ -446,6 +461,18 @@ def _image_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise ConfigError(f"image: expects WIDTHxHEIGHT such as 160x120, got '{text}'")
     return int(width), int(height)
+
+
+def _check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
+    """Refuse an output before any work is done: another kind of file, no file at all, or an input of the command."""
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: is a folder or a device; give a file name such as out{suffix}")
+    if path.suffix.lower() != suffix and not (suffix == ".yaml" and path.suffix.lower() == ".yml"):
+        raise ConfigError(f"{path}: the output's name must end in {suffix}")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: cannot be written: the folder '{path.parent}' does not exist")
+    if any(path.resolve() == entry.resolve() for entry in inputs):
+        raise OutputError(f"{path}: is an input of this command; name another output")
 
 
 def _save_team(config: RunConfig, path: Path) -> None:

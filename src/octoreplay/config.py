@@ -108,6 +108,8 @@ class MapConfig:
 
     def __post_init__(self) -> None:
         _check_ranges(self)
+        if not all(math.isfinite(number) for number in self.bounds):
+            raise ConfigError("bounds: expects finite numbers")
         if len(self.bounds) not in (0, 2, 6):
             raise ConfigError(f"bounds: expects 2 or 6 numbers, got {len(self.bounds)}")
         half = len(self.bounds) // 2

@@ -55,7 +55,9 @@ class Recorder:
         if self._is_due(tick, self._config.output.view_every):
             self._write_views(tick)
 
-    def finish(self, stop_reason: str, counts: Mapping[str, FrameCounts], wall_seconds: float) -> RunSummary:
+    def finish(
+        self, stop_reason: str, counts: Mapping[str, FrameCounts], warnings: tuple[str, ...], wall_seconds: float
+    ) -> RunSummary:
         """Store the last maps and sum the run up; at least one tick was recorded."""
         tick = self.last
         assert tick is not None
@@ -80,7 +82,7 @@ class Recorder:
             mean_grid_bytes=float(means[2]),
             total_sent_bytes=self._sent_bytes,
             frame_counts=counts,
-            warnings=(),
+            warnings=warnings,
         )
 
     def _add_up(self, metrics: TickMetrics) -> None:

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from octoreplay.config import RunConfig
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.discover import resolve
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.io.robot_log import RobotLog
@@ -37,6 +37,7 @@ from octoreplay.replay.graph import (
     settle_ticks_max,
     step_size,
 )
+from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.robot import PublishedMap, Robot
 from octoreplay.replay.tick import Tick
@@ -45,6 +46,9 @@ from octoreplay.replay.timeline import FrameSource, Timeline
 CONVERGED = "converged"
 SETTLE_MAX = "settle_max reached"
 NO_SETTLING = "settling is off"
+
+MAX_TICKS = 10_000_000
+"""Most ticks of one run: a day at 100 Hz is 8.6 million."""
 
 _Result = TypeVar("_Result")
 
@@ -278,9 +282,11 @@ def replay_team(
         writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
         recorder = Recorder(config, writer)
         total_ns = _total_ns(logs)
+        _check_num_ticks(config, total_ns)
         try:
             for tick in session.ticks():
-                recorder.record(tick)
+                with deferred_interrupts():
+                    recorder.record(tick)
                 if progress is not None:
                     log_ns = tick.stamp_ns - recorder.start_ns
                     progress(Progress(log_ns, total_ns, tick.number, tick.metrics.total_distance, tick.settling))
@@ -289,9 +295,13 @@ def replay_team(
                 raise InputError(f"{error}: {_causes(logs)}") from error
             raise
         counts = {log.robot_id: log.counts for log in logs}
-        summary = recorder.finish(session.stop_reason, counts, time.monotonic() - started)
+        with deferred_interrupts():
+            summary = recorder.finish(
+                session.stop_reason, counts, _warnings(logs, recorder), time.monotonic() - started
+            )
         if writer is not None:
-            writer.complete(summary)
+            with deferred_interrupts():
+                writer.complete(summary)
         return summary
 
 
@@ -300,6 +310,29 @@ def _total_ns(logs: Sequence[RobotLog]) -> int | None:
     starts = [log.start_ns for log in logs if log.start_ns is not None]
     ends = [log.end_ns for log in logs if log.end_ns is not None]
     return max(ends) - min(starts) if starts and ends else None
+
+
+def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
+    """Raise ConfigError where a run would take more ticks than anybody waits for."""
+    num_ticks = (total_ns or 0) / 1e9 / config.network.publish_period
+    if num_ticks > MAX_TICKS:
+        raise ConfigError(
+            f"publish_period: the logs span {(total_ns or 0) / 1e9:.6g} s, which takes {num_ticks:.3g} ticks of "
+            f"{config.network.publish_period:g} s, more than {MAX_TICKS:,}; check clock_offset and publish_period"
+        )
+
+
+def _warnings(logs: Sequence[RobotLog], recorder: Recorder) -> tuple[str, ...]:
+    """What a user should know of a run that went well."""
+    sentences = []
+    if recorder.last is not None and recorder.last.metrics.num_known_cells == 0:
+        sentences.append("the maps are empty: no ray passes the mapped region; check bounds, max_range and the poses")
+    spans = [(log.start_ns, log.end_ns, log.robot_id) for log in logs]
+    for start, _, robot_id in spans:
+        others = [(a, b) for a, b, other in spans if other != robot_id]
+        if start is not None and others and all(b is not None and b < start for _, b in others):
+            sentences.append(f"{robot_id} starts when all other robots have ended; check the clock_offsets")
+    return tuple(sentences)
 
 
 def _causes(logs: Sequence[RobotLog]) -> str:
@@ -312,4 +345,5 @@ def _causes(logs: Sequence[RobotLog]) -> str:
         }  # fmt: skip
         return ", ".join(f"{number} {cause}" for cause, number in causes.items() if number) or "no frames"
 
-    return "; ".join(f"{log.robot_id}: {text(log.counts)}" for log in logs)
+    found = "; ".join(f"{log.robot_id}: {text(log.counts)}" for log in logs)
+    return f"{found}; compare sensor and poses in 'octoreplay info', or try clock 'log' or a larger pose_gap"

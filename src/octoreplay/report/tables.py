@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
@@ -160,9 +161,10 @@ def description(logs: LogDescription) -> RenderableType:
 
 
 def terminal(*, stderr: bool = False, file: IO[str] | None = None, width: int | None = None) -> Console:
-    """A console at most 100 columns wide, in which square brackets and colons are just text."""
+    """A console at most 100 columns wide (160 in a pipe), in which square brackets and colons are just text."""
     console = Console(stderr=stderr, file=file, width=width, markup=False, emoji=False, highlight=False)
-    console.width = min(console.width, 100)
+    # A pipe has no width of its own, and nothing that is read by a program should be cut.
+    console.width = min(console.width, 100) if console.is_terminal or width or "COLUMNS" in os.environ else 160
     return console
 
 
