@@ -295,12 +295,10 @@ def replay_team(
                 raise InputError(f"{error}: {_causes(logs)}") from error
             raise
         counts = {log.robot_id: log.counts for log in logs}
+        warnings = _warnings(logs, recorder)
         with deferred_interrupts():
-            summary = recorder.finish(
-                session.stop_reason, counts, _warnings(logs, recorder), time.monotonic() - started
-            )
-        if writer is not None:
-            with deferred_interrupts():
+            summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
+            if writer is not None:
                 writer.complete(summary)
         return summary
 
