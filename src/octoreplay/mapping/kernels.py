@@ -458,6 +458,15 @@ def points_to_ends(points, class_ids, pose, resolution, min_range, max_range, ke
 
 
 @kernel
+def widen_to_keys(keys, low, high):
+    """Widen the box from ``low`` (3,) to ``high`` (3,) so that it holds all keys (n, 3)."""
+    for i in range(keys.shape[0]):
+        for axis in range(3):
+            low[axis] = min(low[axis], keys[i, axis])
+            high[axis] = max(high[axis], keys[i, axis])
+
+
+@kernel
 def fill_axis_tables(num_bricks, offsets):
     """Offset of each local coordinate in the scratch grid, per axis (3, m): their sum over the axes is the cell.
 

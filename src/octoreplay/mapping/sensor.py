@@ -177,8 +177,9 @@ class ScanCaster:
     ) -> tuple[Int64Array, tuple[Int64Array, Int64Array], Int64Array]:
         """The scratch grid around a scan: its lowest cell, (axis offsets, edges), offsets of mapped cells only."""
         start = np.floor(origin / self._resolution).astype(np.int64)
-        low = np.minimum(start, keys.min(axis=0, initial=kernels.KEY_OFFSET)) >> kernels.BRICK_BITS
-        high = np.maximum(start, keys.max(axis=0, initial=-kernels.KEY_OFFSET)) >> kernels.BRICK_BITS
+        low, high = start.copy(), start.copy()
+        kernels.widen_to_keys(keys, low, high)
+        low, high = low >> kernels.BRICK_BITS, high >> kernels.BRICK_BITS
         corner = low << kernels.BRICK_BITS
         num_bricks = high - low + 1
         edges = num_bricks << kernels.BRICK_BITS
