@@ -101,12 +101,12 @@ def test_a_gap_is_bridged_up_to_its_limit(distance, is_bridged):
     assert track.at(distance) is not None
 
 
-def test_from_arrays_and_the_last_of_two_equal_stamps_holds():
-    track = PoseTrack.from_arrays(
-        np.array([0, 10, 10]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.tile(IDENTITY, (3, 1)), 100
-    )
+def test_the_last_of_two_equal_stamps_holds():
+    track = PoseTrack(100)
+    for stamp, x in ((0, 0.0), (10, 1.0), (10, 2.0)):
+        track.add(stamp, (x, 0, 0), IDENTITY)
     assert len(track) == 2
-    assert (track.first_ns, track.last_ns) == (0, 10)
+    assert track.last_ns == 10
     assert track.at(5)[0] == pytest.approx((1.0, 0.0, 0.0))
 
 

@@ -36,7 +36,6 @@ def test_frames_come_once_each_by_stamp_then_robot(stamps_of_robots, ticks):
         assert given_so_far == [entry for entry in expected if entry[0] < tick]
         rest = expected[len(given_so_far) :]
         assert timeline.exhausted == (not rest)
-        assert timeline.next_stamp_ns == (rest[0][0] if rest else None)
         for index, stamps in enumerate(stamps_of_robots):
             seen = [stamp for stamp in stamps if stamp < tick]
             assert timeline.has_ended(index) == (len(seen) == len(stamps))

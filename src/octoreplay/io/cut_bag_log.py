@@ -10,7 +10,7 @@ import io
 import struct
 from collections.abc import Collection, Iterator, Mapping
 
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 
 from octoreplay.io.block_log import Block, BlockLog, Entry, Index
 from octoreplay.io.log_reader import Bytes, Channel, normalise_type_name

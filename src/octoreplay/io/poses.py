@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from octoreplay.errors import InputError
-from octoreplay.records import Float64Array, Int64Array
+from octoreplay.io.messages import stamp_to_ns
+from octoreplay.records import Float64Array
 
 Position: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -96,23 +97,8 @@ class PoseTrack:
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
 
-    @classmethod
-    def from_arrays(
-        cls, stamps_ns: Int64Array, positions: Float64Array, quaternions: Float64Array, pose_gap_ns: int
-    ) -> Self:
-        """A track from stamps (M,) int64, positions (M, 3) and quaternions (M, 4)."""
-        track = cls(pose_gap_ns)
-        for stamp, position, quaternion in zip(stamps_ns.tolist(), positions, quaternions, strict=True):
-            track.add(stamp, position, quaternion)
-        return track
-
     def __len__(self) -> int:
         return len(self._stamps)
-
-    @property
-    def first_ns(self) -> int | None:
-        """Stamp of the first pose; None in an empty track."""
-        return self._stamps[0] if self._stamps else None
 
     @property
     def last_ns(self) -> int | None:
@@ -202,12 +188,11 @@ class FrameTree:
             self._moving[child] = PoseTrack(self._pose_gap_ns)
         self._moving[child].add(stamp_ns, translation, quaternion)
 
-    def add_message(self, message: object, *, is_static: bool, stamp_ns: int | None = None) -> int | None:
+    def add_message(self, message: Any, *, is_static: bool, stamp_ns: int | None = None) -> int | None:
         """Add all transforms of a TFMessage at their own stamps, or all at ``stamp_ns``; the newest stamp added."""
         newest: int | None = None
-        for entry in message.transforms:  # type: ignore[attr-defined]
-            own = int(entry.header.stamp.sec) * 1_000_000_000 + int(entry.header.stamp.nanosec)
-            stamp = own if stamp_ns is None else stamp_ns
+        for entry in message.transforms:
+            stamp = stamp_to_ns(entry.header.stamp) if stamp_ns is None else stamp_ns
             t, q = entry.transform.translation, entry.transform.rotation
             self.add(
                 entry.header.frame_id, entry.child_frame_id, None if is_static else stamp, (t.x, t.y, t.z),
@@ -244,9 +229,7 @@ class FrameTree:
         moving = [self._moving[child] for child in (*up, *down) if child in self._moving and child not in self._fixed]
         return min((track.last_ns for track in moving if track.last_ns is not None), default=None)
 
-    def T_a_b(  # noqa: N802
-        self, a: str, b: str, stamp_ns: int
-    ) -> Float64Array | None:
+    def T_a_b(self, a: str, b: str, stamp_ns: int) -> Float64Array | None:
         """The transform from frame b to frame a at a stamp; None where a moving transform has no value there.
 
         Raises InputError with both names where nothing joins the frames, or a frame between has two parents.

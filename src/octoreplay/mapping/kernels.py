@@ -83,6 +83,7 @@ def inline_kernel(function: Callable[..., Any]) -> Any:
 
 
 @intrinsic
+# The parameters' names and number are numba's.
 def _float_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ARG001
     """The float32 pointer of an integer address."""
     pointer = types.CPointer(types.float32)

@@ -93,12 +93,11 @@ class ScanCaster:
         """
         keys, kinds, ends = self._ends(frame)
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
-        corner, offsets, mapped = self._grid(keys, origin)
+        corner, edges, offsets, mapped = self._grid(keys, origin)
         kernels.clear_marks(self._marks, self._flags, self._touched[: self._num_touched])
-        num_cells = int(np.prod(np.array(offsets[1])))
-        self._make_room(num_cells)
+        self._make_room(int(np.prod(edges)))
         num_rays, num_touched = kernels.mark_ends(
-            keys, kinds, self._num_classes, corner, offsets[0], mapped, self._slots, self._votes, self._rays,
+            keys, kinds, self._num_classes, corner, offsets, mapped, self._slots, self._votes, self._rays,
             self._marks, self._flags, self._touched,
         )  # fmt: skip
         if self._sensor.rays == "cells":
@@ -110,7 +109,7 @@ class ScanCaster:
         self._num_touched = num_touched
         touched = self._touched[:num_touched]
         codes = np.empty(num_touched, np.int64)
-        kernels.touched_codes(touched, corner >> kernels.BRICK_BITS, offsets[1] >> kernels.BRICK_BITS, codes)
+        kernels.touched_codes(touched, corner >> kernels.BRICK_BITS, edges >> kernels.BRICK_BITS, codes)
         hit_bricks = int(kernels.count_hit_bricks(self._marks, touched, num_touched))
         return TouchedCells(codes, self._marks, touched, hit_bricks)
 
@@ -172,10 +171,8 @@ class ScanCaster:
             )
         )  # fmt: skip
 
-    def _grid(
-        self, keys: Int32Array, origin: Float64Array
-    ) -> tuple[Int64Array, tuple[Int64Array, Int64Array], Int64Array]:
-        """The scratch grid around a scan: its lowest cell, (axis offsets, edges), offsets of mapped cells only."""
+    def _grid(self, keys: Int32Array, origin: Float64Array) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
+        """The scratch grid around a scan: lowest cell, edges in cells, axis offsets, those of mapped cells only."""
         start = np.floor(origin / self._resolution).astype(np.int64)
         low, high = start.copy(), start.copy()
         kernels.widen_to_keys(keys, low, high)
@@ -192,7 +189,7 @@ class ScanCaster:
         kernels.fill_axis_tables(num_bricks, offsets)
         centers = (np.arange(offsets.shape[1])[None, :] + corner[:, None] + 0.5) * self._resolution
         outside = (centers < self._low) | (centers >= self._high)
-        return corner, (offsets, edges), np.where(outside, np.int64(-(1 << 50)), offsets)
+        return corner, edges, offsets, np.where(outside, np.int64(-(1 << 50)), offsets)
 
     def _make_room(self, num_cells: int) -> None:
         """Scratch grids for so many cells; fresh ones are zero and take no memory until they are touched."""

@@ -31,11 +31,6 @@ class Timeline:
         """True when every frame of every robot has been given."""
         return all(frame is None for frame in self._next)
 
-    @property
-    def next_stamp_ns(self) -> int | None:
-        """Stamp of the frame that comes next; None when exhausted."""
-        return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
-
     def has_ended(self, robot_index: int) -> bool:
         """True when a robot's last frame has been given (at once for a robot without any)."""
         return self._next[robot_index] is None
