@@ -6,10 +6,11 @@ import itertools
 
 import numpy as np
 
-from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import consensus as consensus_kernels
+from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 
-BRICK_EDGE = kernels.BRICK_EDGE
+BRICK_EDGE = storage.BRICK_EDGE
 
 
 def octree_of(cells, *, num_classes=2, resolution=0.25):
@@ -23,23 +24,25 @@ def octree_of(cells, *, num_classes=2, resolution=0.25):
     codes = np.array([brick_code(brick) for brick in by_brick], np.int64)
     indices = octree.find_or_add(codes)
     is_vector = [any((v != v[0]).any() for v in content.values()) for content in by_brick.values()]
-    octree.raise_tiers(np.where(is_vector, kernels.VECTOR, kernels.SCALAR).astype(np.uint8))
+    octree.raise_tiers(np.where(is_vector, storage.VECTOR, storage.SCALAR).astype(np.uint8))
     for index, content, vector in zip(indices, by_brick.values(), is_vector, strict=True):
         row = octree.bricks.rows[index]
         for key, values in content.items():
-            cell = kernels.key_to_code(*key) & 511
+            cell = storage.key_to_code(*key) & 511
             octree.bricks.known[index, cell >> 3] |= np.uint8(1 << (cell & 7))
             if vector:
                 octree.bricks.vector[row, :, cell] = values
             else:
                 octree.bricks.scalar[row, cell] = values[0]
-    kernels.finish_step(octree.bricks, np.ones(octree.num_bricks, np.float32), np.ones(octree.num_bricks, np.uint8), 1)
+    consensus_kernels.finish_step(
+        octree.bricks, np.ones(octree.num_bricks, np.float32), np.ones(octree.num_bricks, np.uint8), 1
+    )
     return octree
 
 
 def brick_code(brick):
     """Code of the brick whose lowest cell has 8 times this key."""
-    return int(kernels.key_to_code(*(8 * k for k in brick))) >> 9
+    return int(storage.key_to_code(*(8 * k for k in brick))) >> 9
 
 
 def cube(corner, edge, values):
@@ -54,16 +57,16 @@ def cells_of(octree):
     for index in range(octree.num_bricks):
         known = np.unpackbits(octree.known[index], bitorder="little").astype(bool)
         tier, row = octree.bricks.tiers[index], octree.bricks.rows[index]
-        values = np.empty((octree.num_classes, kernels.BRICK_CELLS), np.float32)
-        if tier == kernels.UNIFORM:
+        values = np.empty((octree.num_classes, storage.BRICK_CELLS), np.float32)
+        if tier == storage.UNIFORM:
             values[:] = octree.bricks.values[index]
-        elif tier == kernels.SCALAR:
+        elif tier == storage.SCALAR:
             values[:] = octree.bricks.scalar[row]
         else:
             values[:] = octree.bricks.vector[row]
         cells = np.flatnonzero(known)
         keys = np.empty((len(cells), 3), np.int64)
-        kernels.codes_to_keys((octree.codes[index] << 9) + cells, keys)
+        storage.codes_to_keys((octree.codes[index] << 9) + cells, keys)
         for key, cell in zip(keys.tolist(), cells, strict=True):
             content[tuple(key)] = values[:, cell].tobytes()
     return content

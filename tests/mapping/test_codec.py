@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.errors import PacketError
-from octoreplay.mapping import codec, kernels
+from octoreplay.mapping import codec
+from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octree_factory import brick_code, cells_of, cube, octree_of
 
-LIMIT = kernels.KEY_OFFSET
+LIMIT = storage.KEY_OFFSET
 
 VALUES = st.sampled_from([0.0, -5.0, 5.0, -0.3, 1.0, 1e-30, -3e38, float(np.float32(0.1))])
 

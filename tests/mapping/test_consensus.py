@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.mapping import kernels
 from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
+from octoreplay.mapping.kernels import storage
 from octoreplay.replay.session import CONVERGED, Session
 from octree_factory import cells_of, cube, octree_of
 from reference import rules
@@ -92,7 +92,7 @@ def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, rule, gamma, with_base
     assert change == pytest.approx(most, rel=1e-4, abs=3e-5) or change > most
     changed = {key for key in known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
     revised = set(octree.codes[octree.revisions == 4].tolist())
-    assert {int(kernels.key_to_code(*key)) >> 9 for key in changed} <= revised
+    assert {int(storage.key_to_code(*key)) >> 9 for key in changed} <= revised
 
 
 def _octree(cells):
@@ -159,7 +159,7 @@ def test_uniform_free_space_stays_uniform():
     own, other = (octree_of(cube((0, 0, 0), 16, [value, value])) for value in (-5.0, -3.0))
     for rule in ("gradient", "natural", "bayes"):
         consensus_step(own, [other], [0.5], own.copy(), rule=rule, gamma=0.5, revision=1)
-        assert (own.bricks.tiers[: own.num_bricks] == kernels.UNIFORM).all()
+        assert (own.bricks.tiers[: own.num_bricks] == storage.UNIFORM).all()
         assert len(own.leaves()) == 1
 
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.records import LeafTable
 from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
 
-LIMIT = kernels.KEY_OFFSET
+LIMIT = storage.KEY_OFFSET
 RESOLUTION = 0.25
 
 
@@ -48,7 +48,7 @@ def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
 
 def _in_morton_order(leaves):
     low = np.rint((leaves.centers - leaves.sizes[:, None] / 2) / RESOLUTION).astype(np.int64)
-    codes = np.array([kernels.key_to_code(*key) for key in low.tolist()])
+    codes = np.array([storage.key_to_code(*key) for key in low.tolist()])
     return bool((np.diff(codes) > 0).all())
 
 
@@ -138,10 +138,10 @@ def test_equal_siblings_that_are_not_all_known_stay_apart():
     cells = cube((0, 0, 0), 8, [-5.0, -5.0])
     del cells[7, 7, 7]
     octree = octree_of(cells)
-    assert octree.bricks.tiers[0] == kernels.SCALAR
+    assert octree.bricks.tiers[0] == storage.SCALAR
     assert len(octree.leaves()) == 7 + 7 + 7
     whole = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
-    assert whole.bricks.tiers[0] == kernels.UNIFORM
+    assert whole.bricks.tiers[0] == storage.UNIFORM
 
 
 @settings(max_examples=20, deadline=None)
@@ -182,14 +182,14 @@ def test_many_bricks_are_found_again():
 
 def test_morton_codes():
     keys = [(-LIMIT, -LIMIT, -LIMIT), (LIMIT - 1,) * 3, (0, 0, 0), (-1, 5, -77)]
-    codes = np.array([kernels.key_to_code(*key) for key in keys])
+    codes = np.array([storage.key_to_code(*key) for key in keys])
     assert codes[:2].tolist() == [0, (1 << 57) - 1]
     back = np.empty((4, 3), np.int64)
-    kernels.codes_to_keys(codes, back)
+    storage.codes_to_keys(codes, back)
     assert [tuple(key) for key in back.tolist()] == keys
     for child in itertools.product((0, 1), repeat=3):
         x, y, z = child
-        assert kernels.key_to_code(2 + x, 4 + y, -6 + z) - kernels.key_to_code(2, 4, -6) == x + 2 * y + 4 * z
+        assert storage.key_to_code(2 + x, 4 + y, -6 + z) - storage.key_to_code(2, 4, -6) == x + 2 * y + 4 * z
 
 
 def test_memory_is_what_the_bricks_take():

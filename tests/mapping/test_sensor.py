@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from octoreplay.config import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
@@ -34,10 +34,10 @@ def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=Non
     """(freed keys, {hit key: class_id}) of a scan as the caster finds them."""
     touched = (caster or ScanCaster(sensor, region, num_classes)).cast(frame)
     assert len(set(touched.codes.tolist())) == len(touched.codes)
-    marks = touched.marks.reshape(-1, kernels.BRICK_CELLS)[touched.touched]
+    marks = touched.marks.reshape(-1, storage.BRICK_CELLS)[touched.touched]
     rows, cells = np.nonzero(marks)
     keys = np.empty((len(rows), 3), np.int64)
-    kernels.codes_to_keys((touched.codes[rows] << 9) + cells, keys)
+    storage.codes_to_keys((touched.codes[rows] << 9) + cells, keys)
     kinds = marks[rows, cells].tolist()
     content = dict(zip(map(tuple, keys.tolist()), kinds, strict=True))
     freed = {key for key, kind in content.items() if kind == 1}
@@ -287,7 +287,7 @@ def test_one_caster_gives_the_same_for_every_scan_as_a_new_one():
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_scans_that_leave_the_key_space_are_refused(axis, sign):
     region = MapConfig(resolution=0.25)
-    reach = kernels.KEY_OFFSET * 0.25
+    reach = storage.KEY_OFFSET * 0.25
     pose = np.eye(4)
     pose[axis, 3] = sign * (reach - 3.1)
     point = np.zeros(3)
@@ -376,7 +376,7 @@ def test_saturated_free_space_becomes_uniform_and_stays_unchanged():
     pose[:3, 3] = 0.8
     frame = CloudFrame("r", 0, points, np.zeros(len(points), np.uint8), pose)
     octree = _sums([frame] * 20, clamped_increments(SENSOR))
-    centre = octree.find(np.array([kernels.key_to_code(0, 0, 0) >> 9]))[0]
-    assert octree.bricks.tiers[centre] == kernels.UNIFORM
+    centre = octree.find(np.array([storage.key_to_code(0, 0, 0) >> 9]))[0]
+    assert octree.bricks.tiers[centre] == storage.UNIFORM
     assert octree.bricks.values[centre] == -5.0
     assert octree.revisions[centre] < 19

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from octoreplay.config import PRESETS
-from octoreplay.mapping import consensus, kernels, sensor
+from octoreplay.mapping import consensus, sensor
+from octoreplay.mapping.kernels import storage
 from octoreplay.replay import robot as robot_module
 from octoreplay.replay import session as session_module
 from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
@@ -441,7 +442,7 @@ def _free_is_not_reset(monkeypatch):
         mixed = own.copy()
         right(mixed, neighbours, step_weights, log_likelihood, gamma=0.0, **kwargs)
         change = right(own, neighbours, step_weights, log_likelihood, gamma=gamma, **kwargs)
-        codes = own.codes[own.bricks.tiers[: own.num_bricks] == kernels.VECTOR]
+        codes = own.codes[own.bricks.tiers[: own.num_bricks] == storage.VECTOR]
         after = own.bricks.vector[own.bricks.rows[own.find(codes)]]
         before = mixed.bricks.vector[mixed.bricks.rows[mixed.find(codes)]]
         own.bricks.vector[own.bricks.rows[own.find(codes)]] = after + (after - before).sum(axis=1, keepdims=True)

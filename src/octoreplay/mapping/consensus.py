@@ -8,11 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoreplay.config import ConsensusConfig
-from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import consensus as consensus_kernels
+from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float32Array, Int64Array, UInt8Array
 
-_RULES = {"gradient": kernels.GRADIENT, "natural": kernels.NATURAL, "bayes": kernels.BAYES, "local": kernels.LOCAL}
+_RULES = {
+    "gradient": consensus_kernels.GRADIENT,
+    "natural": consensus_kernels.NATURAL,
+    "bayes": consensus_kernels.BAYES,
+    "local": consensus_kernels.LOCAL,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +68,11 @@ def consensus_step(
     columns += [log_likelihood if last_log_likelihood is None else last_log_likelihood, *neighbours]
     _, tiers = address_table(columns, codes)
     needed = np.empty(codes.size, np.uint8)
-    kernels.needed_tiers(tiers, needed)
+    consensus_kernels.needed_tiers(tiers, needed)
     own.raise_tiers(needed)
     addresses, tiers = address_table(columns, codes)
     changes = np.empty(codes.size, np.float32)
-    kernels.consensus_step(
+    consensus_kernels.consensus_step(
         addresses,
         tiers,
         np.asarray(step_weights, np.float32),
@@ -75,7 +81,7 @@ def consensus_step(
         own.num_classes,
         changes,
     )
-    kernels.finish_step(own.bricks, changes, known_changed, revision)
+    consensus_kernels.finish_step(own.bricks, changes, known_changed, revision)
     return float(changes.max(initial=0.0))
 
 
@@ -84,7 +90,7 @@ def _take_known(own: SemanticOctree, sources: Sequence[SemanticOctree]) -> UInt8
     indices = [own.find_or_add(source.codes) for source in sources]
     changed = np.zeros(own.num_bricks, np.uint8)
     for source, places in zip(sources, indices, strict=True):
-        changed[places] |= kernels.merge_known(own.bricks.known, places, source.known)
+        changed[places] |= storage.merge_known(own.bricks.known, places, source.known)
     return changed
 
 
@@ -107,17 +113,17 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     addresses, tiers = address_table([*octrees, *counts], codes)
     needed = np.empty(codes.size, np.uint8)
-    kernels.needed_tiers(tiers, needed)
+    consensus_kernels.needed_tiers(tiers, needed)
     all_needed = target.bricks.tiers[: target.num_bricks].copy()
     all_needed[indices] = np.maximum(all_needed[indices], needed)
     target.raise_tiers(all_needed)
     for octree in octrees:
         found = octree.find(codes)
         present = found >= 0
-        kernels.merge_known(target.bricks.known, indices[present], octree.known[found[present]])
+        storage.merge_known(target.bricks.known, indices[present], octree.known[found[present]])
     target_addresses, target_tiers = target.addresses(indices)
     scales: Float32Array = np.array([entry.scale for entry in evidence], np.float32)
-    kernels.sum_evidence(
+    consensus_kernels.sum_evidence(
         addresses, tiers, len(octrees) if counts else -1, scales, target.num_classes, target_addresses, target_tiers
     )
     target.bricks.revisions[indices] = revision

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.mapping import kernels
 from octoreplay.mapping.consensus import address_table
+from octoreplay.mapping.kernels import metrics as metrics_kernels
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import BoolArray, Float64Array, Int64Array
 
@@ -93,7 +93,7 @@ class MapComparer:
         distances = np.empty((rows.size, 2))
         counts = np.empty((rows.size, self._counts.shape[1]), np.int64)
         entropies = np.empty((rows.size, len(maps)))
-        kernels.compare_maps(
+        metrics_kernels.compare_maps(
             addresses,
             tiers,
             known,

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.mapping import kernels
-from octoreplay.mapping.kernels import Bricks
+from octoreplay.mapping.kernels import packets, storage
+from octoreplay.mapping.kernels.storage import Bricks
 from octoreplay.records import (
     BoolArray,
     Float32Array,
@@ -54,14 +54,14 @@ class SemanticOctree:
             codes=np.empty(0, np.int64), tiers=np.empty(0, np.uint8), rows=np.empty(0, np.int32),
             values=np.empty(0, np.float32), known=np.empty((0, 64), np.uint8), revisions=np.empty(0, np.int64),
             table=np.full(64, -1, np.int32), counters=np.zeros(4, np.int64), free_scalar=np.empty(0, np.int32),
-            scalar=np.empty((0, kernels.BRICK_CELLS), np.float32),
-            vector=np.empty((0, num_classes, kernels.BRICK_CELLS), np.float32),
+            scalar=np.empty((0, storage.BRICK_CELLS), np.float32),
+            vector=np.empty((0, num_classes, storage.BRICK_CELLS), np.float32),
         )  # fmt: skip
 
     @property
     def num_bricks(self) -> int:
         """Number of bricks, the partly known ones included."""
-        return int(self.bricks.counters[kernels.NUM_BRICKS])
+        return int(self.bricks.counters[storage.NUM_BRICKS])
 
     @property
     def codes(self) -> Int64Array:
@@ -81,19 +81,19 @@ class SemanticOctree:
     @property
     def num_cells(self) -> int:
         """Number of known finest cells."""
-        return int(kernels.count_known(self.known))
+        return int(storage.count_known(self.known))
 
     @property
     def memory_bytes(self) -> int:
         """Bytes allocated for the bricks in use: their values, masks and bookkeeping."""
         counters = self.bricks.counters
-        rows = counters[kernels.NUM_SCALAR] - counters[kernels.NUM_FREE_SCALAR]
+        rows = counters[storage.NUM_SCALAR] - counters[storage.NUM_FREE_SCALAR]
         per_brick = sum(array.itemsize for array in self.bricks[:6]) + 64
         return int(
             self.num_bricks * per_brick
             + self.bricks.table.nbytes
-            + rows * kernels.BRICK_CELLS * 4
-            + counters[kernels.NUM_VECTOR] * kernels.BRICK_CELLS * 4 * self.num_classes
+            + rows * storage.BRICK_CELLS * 4
+            + counters[storage.NUM_VECTOR] * storage.BRICK_CELLS * 4 * self.num_classes
         )
 
     def reserve(self, bricks: int = 0, scalar: int = 0, vector: int = 0) -> None:
@@ -105,12 +105,12 @@ class SemanticOctree:
         if num + bricks > old.codes.size:
             for name in ("codes", "tiers", "rows", "values", "known", "revisions"):
                 changes[name] = _grown(getattr(old, name), num, num + bricks)
-        free = int(counters[kernels.NUM_FREE_SCALAR])
-        used = int(counters[kernels.NUM_SCALAR])
+        free = int(counters[storage.NUM_FREE_SCALAR])
+        used = int(counters[storage.NUM_SCALAR])
         if used + scalar - free > old.scalar.shape[0]:
             changes["scalar"] = _grown(old.scalar, used, used + scalar - free)
             changes["free_scalar"] = _grown(old.free_scalar, free, changes["scalar"].shape[0])
-        used = int(counters[kernels.NUM_VECTOR])
+        used = int(counters[storage.NUM_VECTOR])
         if used + vector > old.vector.shape[0]:
             changes["vector"] = _grown(old.vector, used, used + vector)
         size = old.table.size
@@ -121,35 +121,35 @@ class SemanticOctree:
         if changes:
             self.bricks = old._replace(**changes)
         if "table" in changes:
-            kernels.rebuild_table(self.bricks)
+            storage.rebuild_table(self.bricks)
 
     def find(self, codes: Int64Array) -> Int64Array:
         """Index of each brick code (n,) int64, -1 where there is no such brick."""
         indices = np.empty(codes.size, np.int64)
-        kernels.find_all(self.bricks, codes, indices)
+        storage.find_all(self.bricks, codes, indices)
         return indices
 
     def find_or_add(self, codes: Int64Array) -> Int64Array:
         """Index of each brick code (n,) int64; missing bricks are added, all unknown."""
         self.reserve(bricks=codes.size)
         indices = np.empty(codes.size, np.int64)
-        kernels.find_or_add(self.bricks, codes, indices)
+        storage.find_or_add(self.bricks, codes, indices)
         return indices
 
     def raise_tiers(self, tiers: UInt8Array) -> None:
         """Raise brick i to at least tier ``tiers[i]``, for all bricks (n,)."""
         present = self.bricks.tiers[: self.num_bricks]
         self.reserve(
-            scalar=int(np.count_nonzero((tiers == kernels.SCALAR) & (present == kernels.UNIFORM))),
-            vector=int(np.count_nonzero((tiers == kernels.VECTOR) & (present != kernels.VECTOR))),
+            scalar=int(np.count_nonzero((tiers == storage.SCALAR) & (present == storage.UNIFORM))),
+            vector=int(np.count_nonzero((tiers == storage.VECTOR) & (present != storage.VECTOR))),
         )
-        kernels.make_tiers(self.bricks, tiers)
+        storage.make_tiers(self.bricks, tiers)
 
     def addresses(self, indices: Int64Array) -> tuple[Int64Array, UInt8Array]:
         """Memory addresses and tiers (n,) of the bricks ``indices`` (n,); valid until this octree grows."""
         addresses = np.empty(indices.size, np.int64)
         tiers = np.empty(indices.size, np.uint8)
-        kernels.brick_addresses(
+        storage.brick_addresses(
             self.bricks, indices, self.bricks.scalar.ctypes.data, self.bricks.vector.ctypes.data,
             self.bricks.values.ctypes.data, addresses, tiers,
         )  # fmt: skip
@@ -161,7 +161,7 @@ class SemanticOctree:
         tiers = self.bricks.tiers[: self.num_bricks].copy()
         tiers[own] = np.maximum(tiers[own], source.bricks.tiers[indices])
         self.raise_tiers(tiers)
-        kernels.copy_bricks(source.bricks, indices, self.bricks, own)
+        storage.copy_bricks(source.bricks, indices, self.bricks, own)
         self.bricks.revisions[own] = revision
 
     def copy(self) -> Self:
@@ -179,22 +179,22 @@ class SemanticOctree:
         chosen = np.arange(self.num_bricks) if indices is None else indices
         order = chosen[np.argsort(self.bricks.codes[chosen], kind="stable")]
         tiers = self.bricks.tiers[order]
-        num_vector = int(np.count_nonzero(tiers == kernels.VECTOR))
-        num_uniform = int(np.count_nonzero(tiers == kernels.UNIFORM)) if prune else 0
-        cells = (order.size - num_uniform) * kernels.BRICK_CELLS + num_uniform
-        words = np.empty(order.size * (kernels.BRICK_DEPTH + 73), np.uint16)
+        num_vector = int(np.count_nonzero(tiers == storage.VECTOR))
+        num_uniform = int(np.count_nonzero(tiers == storage.UNIFORM)) if prune else 0
+        cells = (order.size - num_uniform) * storage.BRICK_CELLS + num_uniform
+        words = np.empty(order.size * (storage.BRICK_DEPTH + 73), np.uint16)
         scalars = np.empty(cells, np.float32)
-        vectors = np.empty((num_vector * kernels.BRICK_CELLS, self.num_classes), np.float32)
-        totals = kernels.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors)
+        vectors = np.empty((num_vector * storage.BRICK_CELLS, self.num_classes), np.float32)
+        totals = packets.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors)
         return TreeStreams(words[: totals[0]], scalars[: totals[1]], vectors[: totals[2]])
 
     def leaves(self, prior: float = 0.0) -> LeafTable:
         """All leaves in Morton order; ``prior`` h_0 is added to the deviations."""
         streams = self.streams()
         codes, depths, is_vector = leaf_list(streams)
-        sizes = np.exp2(kernels.KEY_BITS - depths.astype(np.float64)) * self.resolution
+        sizes = np.exp2(storage.KEY_BITS - depths.astype(np.float64)) * self.resolution
         keys = np.empty((codes.size, 3), np.int64)
-        kernels.codes_to_keys(codes, keys)
+        storage.codes_to_keys(codes, keys)
         centers = keys * self.resolution + sizes[:, None] / 2
         return LeafTable(centers, sizes, leaf_values(streams, is_vector) + np.float32(prior))
 
@@ -207,18 +207,18 @@ class SemanticOctree:
         codes, depths, is_vector = leaf_list(streams)
         with np.errstate(invalid="ignore"):
             keys = np.floor(np.asarray(coords, np.float64) / self.resolution)
-            inside = np.all((keys >= -kernels.KEY_OFFSET) & (keys < kernels.KEY_OFFSET), axis=1)
+            inside = np.all((keys >= -storage.KEY_OFFSET) & (keys < storage.KEY_OFFSET), axis=1)
             keys = np.where(inside[:, None], keys, 0).astype(np.int64)
         cell_codes = np.empty(len(keys), np.int64)
-        kernels.keys_to_codes(keys, cell_codes)
+        storage.keys_to_codes(keys, cell_codes)
         leaf = np.searchsorted(codes, cell_codes, side="right") - 1
-        spans = np.int64(1) << (3 * (kernels.KEY_BITS - depths.astype(np.int64)))
+        spans = np.int64(1) << (3 * (storage.KEY_BITS - depths.astype(np.int64)))
         known = inside & (leaf >= 0)
         known[known] = cell_codes[known] < (codes + spans)[leaf[known]]
         log_odds = np.zeros((len(keys), self.num_classes), np.float32)
         log_odds[known] = leaf_values(streams, is_vector)[leaf[known]]
         sizes = np.zeros(len(keys))
-        sizes[known] = np.exp2(kernels.KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
+        sizes[known] = np.exp2(storage.KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
         return log_odds, known, sizes
 
 
@@ -238,7 +238,7 @@ def leaf_list(streams: TreeStreams) -> tuple[Int64Array, Int32Array, BoolArray]:
     codes = np.empty(count, np.int64)
     depths = np.empty(count, np.int32)
     is_vector = np.empty(count, np.bool_)
-    found = kernels.walk_leaves(streams.words, codes, depths, is_vector)
+    found = packets.walk_leaves(streams.words, codes, depths, is_vector)
     if found != count or np.count_nonzero(is_vector) != streams.vectors.shape[0]:
         raise ValueError("the words are no octree with that many leaves")
     return codes, depths, is_vector
@@ -267,16 +267,16 @@ def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctr
     """The octree of a depth-first stream. Raises ValueError when the stream is no octree."""
     codes, depths, is_vector = leaf_list(streams)
     octree = SemanticOctree(resolution, streams.vectors.shape[1])
-    large = depths <= kernels.BRICK_DEPTH
-    spans = np.int64(1) << (3 * np.maximum(kernels.BRICK_DEPTH - depths[large].astype(np.int64), 0))
+    large = depths <= storage.BRICK_DEPTH
+    spans = np.int64(1) << (3 * np.maximum(storage.BRICK_DEPTH - depths[large].astype(np.int64), 0))
     small_codes = codes[~large] >> 9
     num_small = _num_distinct(small_codes)
     num_bricks = int(spans.sum(dtype=np.float64)) + num_small
     if num_bricks > MAX_BRICKS:
         raise ValueError("the stream holds more space than an octree may")
     num_vector = int(spans[is_vector[large]].sum()) + _num_distinct(small_codes[is_vector[~large]])
-    if (num_small + num_vector * octree.num_classes) * kernels.BRICK_CELLS * 4 > MAX_BYTES:
+    if (num_small + num_vector * octree.num_classes) * storage.BRICK_CELLS * 4 > MAX_BYTES:
         raise ValueError("the stream holds more values than an octree may")
     octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
-    kernels.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
+    packets.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
     return octree

@@ -8,7 +8,7 @@ import numpy as np
 
 from octoreplay.config import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.mapping import kernels
+from octoreplay.mapping.kernels import casting, storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CloudFrame,
@@ -94,23 +94,23 @@ class ScanCaster:
         keys, kinds, ends = self._ends(frame)
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
         corner, edges, offsets, mapped = self._grid(keys, origin)
-        kernels.clear_marks(self._marks, self._flags, self._touched[: self._num_touched])
+        casting.clear_marks(self._marks, self._flags, self._touched[: self._num_touched])
         self._make_room(int(np.prod(edges)))
-        num_rays, num_touched = kernels.mark_ends(
+        num_rays, num_touched = casting.mark_ends(
             keys, kinds, self._num_classes, corner, offsets, mapped, self._slots, self._votes, self._rays,
             self._marks, self._flags, self._touched,
         )  # fmt: skip
         if self._sensor.rays == "cells":
             keys = keys[self._rays[:num_rays]]
             ends = (keys.astype(np.float64) + 0.5) * self._resolution
-        num_touched = kernels.mark_free(
+        num_touched = casting.mark_free(
             origin, ends, keys, self._resolution, corner, mapped, self._marks, self._flags, self._touched, num_touched
         )
         self._num_touched = num_touched
         touched = self._touched[:num_touched]
         codes = np.empty(num_touched, np.int64)
-        kernels.touched_codes(touched, corner >> kernels.BRICK_BITS, edges >> kernels.BRICK_BITS, codes)
-        hit_bricks = int(kernels.count_hit_bricks(self._marks, touched, num_touched))
+        casting.touched_codes(touched, corner >> storage.BRICK_BITS, edges >> storage.BRICK_BITS, codes)
+        hit_bricks = int(casting.count_hit_bricks(self._marks, touched, num_touched))
         return TouchedCells(codes, self._marks, touched, hit_bricks)
 
     def _ends(self, frame: Frame) -> tuple[Int32Array, UInt8Array, Float64Array]:
@@ -129,7 +129,7 @@ class ScanCaster:
             count = self._depth_ends(frame, pose, keys, kinds, ends)
         else:
             count = self._cloud_ends(frame, pose, keys, kinds, ends)
-        reach = kernels.KEY_OFFSET * self._resolution
+        reach = storage.KEY_OFFSET * self._resolution
         if count < 0 or not np.all(np.abs(pose[:3, 3]) < reach):
             raise InputError(
                 f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches "
@@ -151,7 +151,7 @@ class ScanCaster:
         stored = np.float32 if kind is np.float32 else np.float64
         invalid, no_return = (a.astype(stored).astype(np.float64) for a in (self._invalid, self._no_return))
         return int(
-            kernels.depth_to_ends(
+            casting.depth_to_ends(
                 np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
                 np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
                 self._sensor.max_range, largest, invalid, no_return, keys, kinds, ends,
@@ -165,7 +165,7 @@ class ScanCaster:
         kind = np.float32 if frame.points.dtype == np.float32 else np.float64
         classes = np.empty(0, np.uint8) if frame.class_ids is None else frame.class_ids
         return int(
-            kernels.points_to_ends(
+            casting.points_to_ends(
                 np.ascontiguousarray(frame.points, kind), np.ascontiguousarray(classes), pose, self._resolution,
                 self._sensor.min_range, self._sensor.max_range, keys, kinds, ends,
             )
@@ -175,18 +175,18 @@ class ScanCaster:
         """The scratch grid around a scan: lowest cell, edges in cells, axis offsets, those of mapped cells only."""
         start = np.floor(origin / self._resolution).astype(np.int64)
         low, high = start.copy(), start.copy()
-        kernels.widen_to_keys(keys, low, high)
-        low, high = low >> kernels.BRICK_BITS, high >> kernels.BRICK_BITS
-        corner = low << kernels.BRICK_BITS
+        casting.widen_to_keys(keys, low, high)
+        low, high = low >> storage.BRICK_BITS, high >> storage.BRICK_BITS
+        corner = low << storage.BRICK_BITS
         num_bricks = high - low + 1
-        edges = num_bricks << kernels.BRICK_BITS
+        edges = num_bricks << storage.BRICK_BITS
         if float(np.prod(edges.astype(np.float64))) > MAX_GRID_CELLS:
             raise ConfigError(
                 f"resolution: {self._resolution:g} m is too fine for max_range {self._sensor.max_range:g} m: one scan "
                 f"would span more than {MAX_GRID_CELLS:.1e} cells"
             )
         offsets = np.zeros((3, int(edges.max())), np.int64)
-        kernels.fill_axis_tables(num_bricks, offsets)
+        casting.fill_axis_tables(num_bricks, offsets)
         centers = (np.arange(offsets.shape[1])[None, :] + corner[:, None] + 0.5) * self._resolution
         outside = (centers < self._low) | (centers >= self._high)
         return corner, edges, offsets, np.where(outside, np.int64(-(1 << 50)), offsets)
@@ -196,15 +196,15 @@ class ScanCaster:
         if num_cells > self._marks.size:
             self._marks = np.zeros(num_cells, np.uint8)
             self._slots = np.zeros(num_cells, np.int32)
-            self._flags = np.zeros(num_cells // kernels.BRICK_CELLS, np.uint8)
-            self._touched = np.zeros(num_cells // kernels.BRICK_CELLS, np.int64)
+            self._flags = np.zeros(num_cells // storage.BRICK_CELLS, np.uint8)
+            self._touched = np.zeros(num_cells // storage.BRICK_CELLS, np.int64)
 
 
 def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
     """Add one scan's increments to an octree; changed bricks get ``revision``."""
     indices = octree.find_or_add(cells.codes)
     octree.reserve(scalar=cells.codes.size, vector=cells.num_hit_bricks if octree.num_classes > 1 else 0)
-    kernels.apply_marks(
+    casting.apply_marks(
         octree.bricks, indices, cells.touched, cells.marks, np.float32(increments.hit), np.float32(increments.miss),
         np.float32(increments.hit_other), np.float32(increments.least), np.float32(increments.most), revision,
     )  # fmt: skip

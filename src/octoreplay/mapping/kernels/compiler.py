@@ -1,0 +1,69 @@
+"""How kernels are compiled and kept: they take plain arrays and trust them; the wrappers check and coerce."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba import njit
+
+logger = logging.getLogger(__name__)
+
+
+def _cache_folder() -> str | None:
+    """Where compiled kernels are kept: a folder named after the content of all kernel files; None where none can be.
+
+    numba's own rule looks at one file at a time, and would keep a kernel whose callee in another file has changed.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    places = [Path(__file__).parent / "__pycache__"]
+    if os.environ.get("HOME"):
+        places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "octoreplay")
+    if numba.config.CACHE_DIR:
+        places = [Path(numba.config.CACHE_DIR)]
+    for place in places:
+        folder = place / f"kernels-{digest.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return str(folder)
+    return None
+
+
+_CACHE_FOLDER = _cache_folder()
+
+
+def _compile(function: Callable[..., Any], **options: Any) -> Any:
+    """numba.njit with the on-disk cache where a cache folder can be written, without it elsewhere.
+
+    No fast-math: reordered sums come out differently when callees are linked from the cache instead of inlined, and
+    the same input must give the same bytes. Loops over a brick run as vectors when they sum element by element.
+    """
+    settings = {"nogil": True, "error_model": "numpy", **options}
+    if _CACHE_FOLDER is None:
+        return njit(**settings)(function)
+    users_folder = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _CACHE_FOLDER
+    try:
+        return njit(cache=True, **settings)(function)
+    finally:
+        numba.config.CACHE_DIR = users_folder
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile for plain arrays."""
+    return _compile(function)
+
+
+def inline_kernel(function: Callable[..., Any]) -> Any:
+    """Compile for use inside other kernels."""
+    return _compile(function, inline="always")
