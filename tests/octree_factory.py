@@ -18,7 +18,7 @@ def octree_of(cells, *, num_classes=2, resolution=0.25):
     octree = SemanticOctree(resolution, num_classes)
     by_brick = {}
     for key, values in cells.items():
-        by_brick.setdefault(tuple(k >> 3 for k in key), {})[key] = np.broadcast_to(
+        by_brick.setdefault(tuple(k >> storage.BRICK_BITS for k in key), {})[key] = np.broadcast_to(
             np.asarray(values, np.float32), num_classes
         )
     codes = np.array([brick_code(brick) for brick in by_brick], np.int64)
@@ -28,8 +28,8 @@ def octree_of(cells, *, num_classes=2, resolution=0.25):
     for index, content, vector in zip(indices, by_brick.values(), is_vector, strict=True):
         row = octree.bricks.rows[index]
         for key, values in content.items():
-            cell = storage.key_to_code(*key) & 511
-            octree.bricks.known[index, cell >> 3] |= np.uint8(1 << (cell & 7))
+            cell = storage.key_to_code(*key) & (storage.BRICK_CELLS - 1)
+            octree.bricks.known[index] |= np.uint64(1 << cell)
             if vector:
                 octree.bricks.vector[row, :, cell] = values
             else:
@@ -41,8 +41,8 @@ def octree_of(cells, *, num_classes=2, resolution=0.25):
 
 
 def brick_code(brick):
-    """Code of the brick whose lowest cell has 8 times this key."""
-    return int(storage.key_to_code(*(8 * k for k in brick))) >> 9
+    """Code of the brick whose lowest cell has BRICK_EDGE times this key."""
+    return int(storage.key_to_code(*(storage.BRICK_EDGE * k for k in brick))) >> storage.CELL_BITS
 
 
 def cube(corner, edge, values):
@@ -55,7 +55,7 @@ def cells_of(octree):
     """{key: bytes of its values (C,) float32} of every known finest cell, read from the bricks' arrays."""
     content = {}
     for index in range(octree.num_bricks):
-        known = np.unpackbits(octree.known[index], bitorder="little").astype(bool)
+        known = (octree.known[index] >> np.arange(storage.BRICK_CELLS, dtype=np.uint64)) & np.uint64(1) == 1
         tier, row = octree.bricks.tiers[index], octree.bricks.rows[index]
         values = np.empty((octree.num_classes, storage.BRICK_CELLS), np.float32)
         if tier == storage.UNIFORM:
@@ -66,7 +66,7 @@ def cells_of(octree):
             values[:] = octree.bricks.vector[row]
         cells = np.flatnonzero(known)
         keys = np.empty((len(cells), 3), np.int64)
-        storage.codes_to_keys((octree.codes[index] << 9) + cells, keys)
+        storage.codes_to_keys((octree.codes[index] << storage.CELL_BITS) + cells, keys)
         for key, cell in zip(keys.tolist(), cells, strict=True):
             content[tuple(key)] = values[:, cell].tobytes()
     return content

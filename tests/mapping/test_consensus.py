@@ -92,7 +92,7 @@ def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, rule, gamma, with_base
     assert change == pytest.approx(most, rel=1e-4, abs=3e-5) or change > most
     changed = {key for key in known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
     revised = set(octree.codes[octree.revisions == 4].tolist())
-    assert {int(storage.key_to_code(*key)) >> 9 for key in changed} <= revised
+    assert {int(storage.key_to_code(*key)) >> storage.CELL_BITS for key in changed} <= revised
 
 
 def _octree(cells):

@@ -37,7 +37,7 @@ def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=Non
     marks = touched.marks.reshape(-1, storage.BRICK_CELLS)[touched.touched]
     rows, cells = np.nonzero(marks)
     keys = np.empty((len(rows), 3), np.int64)
-    storage.codes_to_keys((touched.codes[rows] << 9) + cells, keys)
+    storage.codes_to_keys((touched.codes[rows] << storage.CELL_BITS) + cells, keys)
     kinds = marks[rows, cells].tolist()
     content = dict(zip(map(tuple, keys.tolist()), kinds, strict=True))
     freed = {key for key, kind in content.items() if kind == 1}
@@ -376,7 +376,7 @@ def test_saturated_free_space_becomes_uniform_and_stays_unchanged():
     pose[:3, 3] = 0.8
     frame = CloudFrame("r", 0, points, np.zeros(len(points), np.uint8), pose)
     octree = _sums([frame] * 20, clamped_increments(SENSOR))
-    centre = octree.find(np.array([storage.key_to_code(0, 0, 0) >> 9]))[0]
+    centre = octree.find(np.array([storage.key_to_code(0, 0, 0) >> storage.CELL_BITS]))[0]
     assert octree.bricks.tiers[centre] == storage.UNIFORM
     assert octree.bricks.values[centre] == -5.0
     assert octree.revisions[centre] < 19

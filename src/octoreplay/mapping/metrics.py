@@ -86,7 +86,7 @@ class MapComparer:
         """Compare the bricks ``rows`` anew."""
         codes = self._codes[rows]
         addresses, tiers = address_table([*maps, oracle], codes)
-        known = np.zeros((rows.size, len(maps), 64), np.uint8)
+        known = np.zeros((rows.size, len(maps)), np.uint64)
         for robot, octree in enumerate(maps):
             found = octree.find(codes)
             known[found >= 0, robot] = octree.known[found[found >= 0]]
@@ -109,7 +109,7 @@ class MapComparer:
         self._entropies[rows] = entropies
         for column, (a, b) in enumerate(link_ends):
             either = known[:, a] | known[:, b]
-            self._link_cells[rows, column] = np.bitwise_count(either).sum(axis=1)
+            self._link_cells[rows, column] = np.bitwise_count(either)
 
     def _result(self) -> MapComparison:
         """The sums over all bricks."""

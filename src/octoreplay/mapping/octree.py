@@ -1,6 +1,6 @@
-"""The semantic octree: one log-odds per occupied class in every known cell, stored in bricks of 8 x 8 x 8 cells.
+"""The semantic octree: one log-odds per occupied class in every known cell, stored in bricks of 4 x 4 x 4 cells.
 
-Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. See kernels.py for the layout.
+Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. See kernels/storage.py for the layout.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from octoreplay.records import (
     Int64Array,
     LeafTable,
     UInt8Array,
+    UInt64Array,
 )
 
 
@@ -52,7 +53,7 @@ class SemanticOctree:
         self.num_classes = num_classes
         self.bricks = Bricks(
             codes=np.empty(0, np.int64), tiers=np.empty(0, np.uint8), rows=np.empty(0, np.int32),
-            values=np.empty(0, np.float32), known=np.empty((0, 64), np.uint8), revisions=np.empty(0, np.int64),
+            values=np.empty(0, np.float32), known=np.empty(0, np.uint64), revisions=np.empty(0, np.int64),
             table=np.full(64, -1, np.int32), counters=np.zeros(4, np.int64), free_scalar=np.empty(0, np.int32),
             scalar=np.empty((0, storage.BRICK_CELLS), np.float32),
             vector=np.empty((0, num_classes, storage.BRICK_CELLS), np.float32),
@@ -69,8 +70,8 @@ class SemanticOctree:
         return self.bricks.codes[: self.num_bricks]
 
     @property
-    def known(self) -> UInt8Array:
-        """Masks of the known cells (n, 64): bit j of byte b is cell 8 b + j."""
+    def known(self) -> UInt64Array:
+        """Masks of the known cells (n,): bit i stands for cell i."""
         return self.bricks.known[: self.num_bricks]
 
     @property
@@ -81,14 +82,14 @@ class SemanticOctree:
     @property
     def num_cells(self) -> int:
         """Number of known finest cells."""
-        return int(storage.count_known(self.known))
+        return int(np.bitwise_count(self.known).sum())
 
     @property
     def memory_bytes(self) -> int:
         """Bytes allocated for the bricks in use: their values, masks and bookkeeping."""
         counters = self.bricks.counters
         rows = counters[storage.NUM_SCALAR] - counters[storage.NUM_FREE_SCALAR]
-        per_brick = sum(array.itemsize for array in self.bricks[:6]) + 64
+        per_brick = sum(array.itemsize for array in self.bricks[:6])
         return int(
             self.num_bricks * per_brick
             + self.bricks.table.nbytes
@@ -182,7 +183,7 @@ class SemanticOctree:
         num_vector = int(np.count_nonzero(tiers == storage.VECTOR))
         num_uniform = int(np.count_nonzero(tiers == storage.UNIFORM)) if prune else 0
         cells = (order.size - num_uniform) * storage.BRICK_CELLS + num_uniform
-        words = np.empty(order.size * (storage.BRICK_DEPTH + 73), np.uint16)
+        words = np.empty(order.size * (storage.BRICK_DEPTH + 9), np.uint16)
         scalars = np.empty(cells, np.float32)
         vectors = np.empty((num_vector * storage.BRICK_CELLS, self.num_classes), np.float32)
         totals = packets.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors)
@@ -253,7 +254,7 @@ def leaf_values(streams: TreeStreams, is_vector: BoolArray) -> Float32Array:
 
 
 MAX_BRICKS = 1 << 24
-"""Most bricks of one octree that is built from leaves: 8.6e9 cells."""
+"""Most bricks of one octree that is built from leaves: 1.1e9 cells."""
 MAX_BYTES = 1 << 32
 """Most memory for the values of one octree that is built from leaves."""
 
@@ -269,7 +270,7 @@ def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctr
     octree = SemanticOctree(resolution, streams.vectors.shape[1])
     large = depths <= storage.BRICK_DEPTH
     spans = np.int64(1) << (3 * np.maximum(storage.BRICK_DEPTH - depths[large].astype(np.int64), 0))
-    small_codes = codes[~large] >> 9
+    small_codes = codes[~large] >> storage.CELL_BITS
     num_small = _num_distinct(small_codes)
     num_bricks = int(spans.sum(dtype=np.float64)) + num_small
     if num_bricks > MAX_BRICKS:

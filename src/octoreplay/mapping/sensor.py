@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay.config import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.mapping.kernels import casting, storage
+from octoreplay.mapping.kernels import casting, ends, evidence, storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CloudFrame,
@@ -53,7 +55,7 @@ COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf)
 
 @dataclass(frozen=True, eq=False)
 class TouchedCells:
-    """The cells that one scan touches: brick codes (n,), and the marks (512 each, Morton order) of those bricks.
+    """The cells that one scan touches: brick codes (n,), and the marks (64 each, Morton order) of those bricks.
 
     A mark is 0 untouched, 1 passed, 1 + class_id hit. The marks are the caster's scratch memory, and are valid until it
     casts again.
@@ -72,18 +74,13 @@ class ScanCaster:
         self._sensor = sensor
         self._resolution = map_config.resolution
         self._num_classes = num_classes
-        self._low, self._high = np.array(map_config.box).reshape(2, 3, 1)
+        self._low, self._high = np.array(map_config.box).reshape(2, 3)
+        self._is_bounded = bool(np.isfinite(map_config.box).any())
         self._invalid = np.array(sensor.invalid_depth, np.float64)
         self._no_return = np.array(sensor.no_return_depth, np.float64)
         self._marks = np.zeros(0, np.uint8)
-        self._slots = np.zeros(0, np.int32)
         self._flags = np.zeros(0, np.uint8)
-        self._touched = np.zeros(0, np.int64)
-        self._num_touched = 0
-        self._keys = np.empty((0, 3), np.int32)
-        self._kinds = np.empty(0, np.uint8)
-        self._votes = np.zeros((0, num_classes), np.int32)
-        self._rays = np.empty(0, np.int64)
+        self._runs = _Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
         """The cells that a scan touches: each once, hit before passed.
@@ -91,57 +88,38 @@ class ScanCaster:
         Rays follow ``sensor.rays``: one per distinct end cell to its centre, or one per point. Raises InputError where
         the scan leaves the key space, and ConfigError where max_range is too long for the resolution.
         """
-        keys, kinds, ends = self._ends(frame)
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
-        corner, edges, offsets, mapped = self._grid(keys, origin)
-        casting.clear_marks(self._marks, self._flags, self._touched[: self._num_touched])
-        self._make_room(int(np.prod(edges)))
-        num_rays, num_touched = casting.mark_ends(
-            keys, kinds, self._num_classes, corner, offsets, mapped, self._slots, self._votes, self._rays,
-            self._marks, self._flags, self._touched,
-        )  # fmt: skip
-        if self._sensor.rays == "cells":
-            keys = keys[self._rays[:num_rays]]
-            ends = (keys.astype(np.float64) + 0.5) * self._resolution
-        num_touched = casting.mark_free(
-            origin, ends, keys, self._resolution, corner, mapped, self._marks, self._flags, self._touched, num_touched
-        )
-        self._num_touched = num_touched
-        touched = self._touched[:num_touched]
-        codes = np.empty(num_touched, np.int64)
-        casting.touched_codes(touched, corner >> storage.BRICK_BITS, edges >> storage.BRICK_BITS, codes)
-        hit_bricks = int(casting.count_hit_bricks(self._marks, touched, num_touched))
-        return TouchedCells(codes, self._marks, touched, hit_bricks)
+        self._find_runs(frame)
+        runs = self._runs
+        low, high = self._box(frame, origin)
+        num_ends = runs.reduce(low, high, self._num_classes)
+        end_keys = runs.end_keys[:num_ends]
+        corner, num_blocks, marks, flags = self._grid(low, high)
+        casting.mark_free(origin, *runs.rays(num_ends), self._resolution, corner, num_blocks, marks, flags)
+        casting.mark_hits(end_keys, runs.end_marks[:num_ends], corner, num_blocks, marks, flags)
+        if self._is_bounded:
+            casting.clear_outside(*self._mapped(corner, num_blocks), num_blocks, marks, flags)
+        most = np.count_nonzero(flags) * casting.BRICKS_PER_BLOCK
+        touched, codes = np.empty(most, np.int64), np.empty(most, np.int64)
+        count, num_hit = casting.touched_bricks(marks.view(np.uint64), flags, corner, num_blocks, touched, codes)
+        return TouchedCells(codes[:count], marks, touched[:count], num_hit)
 
-    def _ends(self, frame: Frame) -> tuple[Int32Array, UInt8Array, Float64Array]:
-        """End cells' keys (n, 3), kinds (n,) and, for one ray per point, end points (n, 3)."""
-        sensor = self._sensor
+    def _find_runs(self, frame: Frame) -> None:
+        """Put the ends of the scan's rays into the runs."""
         size = frame.depth_image.size if isinstance(frame, DepthFrame) else len(frame.points)
-        if size > self._kinds.size:
-            self._keys = np.empty((size, 3), np.int32)
-            self._kinds = np.empty(size, np.uint8)
-            self._votes = np.zeros((size, self._num_classes), np.int32)
-            self._rays = np.empty(size, np.int64)
-        keys, kinds = self._keys, self._kinds
-        ends = np.empty((size if sensor.rays == "all" else 0, 3))
+        if size > self._runs.capacity:
+            self._runs = _Runs(size, self._num_classes, self._sensor.rays)
+        self._runs.counters[:] = 0
         pose = np.ascontiguousarray(frame.T_team_sensor, np.float64)
+        if not np.isfinite(pose).all():
+            raise self._outside(frame)
         if isinstance(frame, DepthFrame):
-            count = self._depth_ends(frame, pose, keys, kinds, ends)
+            self._find_depth_runs(frame, pose)
         else:
-            count = self._cloud_ends(frame, pose, keys, kinds, ends)
-        reach = storage.KEY_OFFSET * self._resolution
-        if count < 0 or not np.all(np.abs(pose[:3, 3]) < reach):
-            raise InputError(
-                f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches "
-                f"{reach:g} m from its origin at a resolution of {self._resolution:g} m; check the poses, or give "
-                "T_team_map or a coarser resolution"
-            )
-        return keys[:count], kinds[:count], ends[:count]
+            self._find_cloud_runs(frame, pose)
 
-    def _depth_ends(
-        self, frame: DepthFrame, pose: Float64Array, keys: Int32Array, kinds: UInt8Array, ends: Float64Array
-    ) -> int:
-        """Ends of a depth image's rays."""
+    def _find_depth_runs(self, frame: DepthFrame, pose: Float64Array) -> None:
+        """Runs of a depth image's rays."""
         depth = frame.depth_image
         kind = np.uint16 if depth.dtype.kind in "ui" and depth.dtype.itemsize <= 2 else np.float32
         largest = float(np.iinfo(depth.dtype).max) if depth.dtype.kind in "ui" else np.inf
@@ -150,61 +128,123 @@ class ScanCaster:
         # A float image stores a value such as 2.1 as its nearest float32, and that is what it is to be compared with.
         stored = np.float32 if kind is np.float32 else np.float64
         invalid, no_return = (a.astype(stored).astype(np.float64) for a in (self._invalid, self._no_return))
-        return int(
-            casting.depth_to_ends(
-                np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
-                np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-                self._sensor.max_range, largest, invalid, no_return, keys, kinds, ends,
-            )
+        ends.depth_to_runs(
+            np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
+            self._sensor.max_range, largest, invalid, no_return, *self._runs.outputs,
         )  # fmt: skip
 
-    def _cloud_ends(
-        self, frame: CloudFrame, pose: Float64Array, keys: Int32Array, kinds: UInt8Array, ends: Float64Array
-    ) -> int:
-        """Ends of a point cloud's rays."""
+    def _find_cloud_runs(self, frame: CloudFrame, pose: Float64Array) -> None:
+        """Runs of a point cloud's rays."""
         kind = np.float32 if frame.points.dtype == np.float32 else np.float64
         classes = np.empty(0, np.uint8) if frame.class_ids is None else frame.class_ids
-        return int(
-            casting.points_to_ends(
-                np.ascontiguousarray(frame.points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-                self._sensor.min_range, self._sensor.max_range, keys, kinds, ends,
-            )
+        ends.points_to_runs(
+            np.ascontiguousarray(frame.points, kind), np.ascontiguousarray(classes), pose, self._resolution,
+            self._sensor.min_range, self._sensor.max_range, *self._runs.outputs,
         )  # fmt: skip
 
-    def _grid(self, keys: Int32Array, origin: Float64Array) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
-        """The scratch grid around a scan: lowest cell, edges in cells, axis offsets, those of mapped cells only."""
-        start = np.floor(origin / self._resolution).astype(np.int64)
-        low, high = start.copy(), start.copy()
-        casting.widen_to_keys(keys, low, high)
-        low, high = low >> storage.BRICK_BITS, high >> storage.BRICK_BITS
-        corner = low << storage.BRICK_BITS
-        num_bricks = high - low + 1
-        edges = num_bricks << storage.BRICK_BITS
-        if float(np.prod(edges.astype(np.float64))) > MAX_GRID_CELLS:
+    def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
+        """Least and greatest key (3,) of the origin and all ends."""
+        start = np.floor(origin / self._resolution)
+        if np.any(np.abs(start) >= storage.KEY_OFFSET):
+            raise self._outside(frame)
+        low, high = start.astype(np.int64), start.astype(np.int64)
+        ends.widen_to_keys(self._runs.keys[: self._runs.num_runs], low, high)
+        if np.any(low <= -storage.KEY_OFFSET) or np.any(high >= storage.KEY_OFFSET):
+            raise self._outside(frame)
+        if float(np.prod(high - low + 2.0 * casting.BLOCK_EDGE)) > MAX_GRID_CELLS:
             raise ConfigError(
                 f"resolution: {self._resolution:g} m is too fine for max_range {self._sensor.max_range:g} m: one scan "
                 f"would span more than {MAX_GRID_CELLS:.1e} cells"
             )
-        offsets = np.zeros((3, int(edges.max())), np.int64)
-        casting.fill_axis_tables(num_bricks, offsets)
-        centers = (np.arange(offsets.shape[1])[None, :] + corner[:, None] + 0.5) * self._resolution
-        outside = (centers < self._low) | (centers >= self._high)
-        return corner, edges, offsets, np.where(outside, np.int64(-(1 << 50)), offsets)
+        return low, high
 
-    def _make_room(self, num_cells: int) -> None:
-        """Scratch grids for so many cells; fresh ones are zero and take no memory until they are touched."""
-        if num_cells > self._marks.size:
-            self._marks = np.zeros(num_cells, np.uint8)
-            self._slots = np.zeros(num_cells, np.int32)
-            self._flags = np.zeros(num_cells // storage.BRICK_CELLS, np.uint8)
-            self._touched = np.zeros(num_cells // storage.BRICK_CELLS, np.int64)
+    def _outside(self, frame: Frame) -> InputError:
+        """The error of a scan that leaves the key space."""
+        reach = storage.KEY_OFFSET * self._resolution
+        return InputError(
+            f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches "
+            f"{reach:g} m from its origin at a resolution of {self._resolution:g} m; check the poses, or give "
+            "T_team_map or a coarser resolution"
+        )
+
+    def _grid(self, low: Int64Array, high: Int64Array) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
+        """An empty scratch grid around the cells low..high: lowest cell, size in blocks, marks, flags of blocks."""
+        casting.clear_marks(self._marks, self._flags)
+        first = low >> casting.BLOCK_BITS
+        num_blocks = (high >> casting.BLOCK_BITS) - first + 1
+        size = int(np.prod(num_blocks))
+        if size > self._flags.size:
+            # Fresh memory is zero and takes no room until it is touched.
+            self._marks = np.zeros(size * casting.BLOCK_CELLS, np.uint8)
+            self._flags = np.zeros(size, np.uint8)
+        marks = self._marks[: size * casting.BLOCK_CELLS]
+        return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
+
+    def _mapped(self, corner: Int64Array, num_blocks: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """The cells [low, high) (3,) of a scratch grid whose centres lie within the bounds."""
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for axis in range(3):
+            local = np.arange(num_blocks[axis] * casting.BLOCK_EDGE)
+            centers = (local + corner[axis] + 0.5) * self._resolution
+            low[axis] = np.count_nonzero(centers < self._low[axis])
+            high[axis] = np.count_nonzero(centers < self._high[axis])
+        return low, high
+
+
+class _Runs:
+    """Memory for the ends of a scan's rays: of neighbouring points with one end cell, then of distinct cells."""
+
+    def __init__(self, capacity: int, num_classes: int, rays: str) -> None:
+        self.capacity = capacity
+        self.counters = np.zeros(2, np.int64)
+        # One place more than there are points: what carries no information is written and then written over.
+        places = capacity + 1
+        self.keys = np.empty((places, 3), np.int32)
+        self.kinds = np.empty(places, np.uint8)
+        self.lengths = np.empty(places, np.int32)
+        self.end_keys = np.empty((capacity, 3), np.int32)
+        self.end_marks = np.empty(capacity, np.uint8)
+        self._end_cells = np.empty(capacity, np.int64)
+        self._votes = np.empty((capacity, num_classes), np.int32)
+        self._every = rays == "all"
+        self._points = np.empty((places if self._every else 0, 3))
+        self._point_keys = np.empty((places if self._every else 0, 3), np.int32)
+
+    @property
+    def num_runs(self) -> int:
+        """Number of runs."""
+        return int(self.counters[ends.NUM_RUNS])
+
+    @property
+    def outputs(self) -> tuple[npt.NDArray[Any], ...]:
+        """What the kernels that find runs write to."""
+        return self.keys, self.kinds, self.lengths, self._points, self._point_keys, self.counters
+
+    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int) -> int:
+        """Reduce the runs, all within low..high, to distinct end cells; returns their number."""
+        num_runs = self.num_runs
+        table = np.full(1 << max(2 * num_runs, 2).bit_length(), -1, np.int32)
+        return int(
+            ends.distinct_ends(
+                self.keys[:num_runs], self.kinds, self.lengths, low, high - low + 1, num_classes, table, self._votes,
+                self._end_cells, self.end_keys, self.end_marks,
+            )
+        )  # fmt: skip
+
+    def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
+        """End points [m] (n, 3) and end cells (n, 3) of the rays; no end points where rays go to cells' centres."""
+        if not self._every:
+            return self._points, self.end_keys[:num_ends]
+        num_points = int(self.counters[ends.NUM_POINTS])
+        return self._points[:num_points], self._point_keys[:num_points]
 
 
 def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
     """Add one scan's increments to an octree; changed bricks get ``revision``."""
     indices = octree.find_or_add(cells.codes)
     octree.reserve(scalar=cells.codes.size, vector=cells.num_hit_bricks if octree.num_classes > 1 else 0)
-    casting.apply_marks(
-        octree.bricks, indices, cells.touched, cells.marks, np.float32(increments.hit), np.float32(increments.miss),
+    evidence.apply_marks(
+        octree.bricks, indices, cells.touched, cells.marks, cells.marks.view(np.uint64), np.float32(increments.hit), np.float32(increments.miss),
         np.float32(increments.hit_other), np.float32(increments.least), np.float32(increments.most), revision,
     )  # fmt: skip

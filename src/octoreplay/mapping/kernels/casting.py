@@ -1,330 +1,269 @@
-"""Which cells a scan touches, and what it adds to them."""
+"""Which cells the rays of a scan pass.
+
+The scratch grid of a scan is made of blocks of 8 x 8 x 8 cells, x fastest; a block holds eight bricks, and all its cells
+in Morton order. A *mark* says what the scan did to a cell: 0 nothing, 1 passed, 1 + class_id hit.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.storage import (
-    BRICK_BITS,
-    BRICK_CELLS,
-    BRICK_EDGE,
-    KEY_OFFSET,
-    SCALAR,
-    UNIFORM,
-    all_known,
-    collapse,
-    make_scalar,
-    make_vector,
-    spread_bits,
-)
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, KEY_OFFSET, spread_bits
 
-CUT = 255
-"""Kind of a ray that was cut at max_range, above every class_id; other kinds are class ids, 0 for an ignored label."""
+BLOCK_BITS = 3
+BLOCK_EDGE = 1 << BLOCK_BITS
+BLOCK_CELLS = 1 << (3 * BLOCK_BITS)
+BRICKS_PER_BLOCK = BLOCK_CELLS // BRICK_CELLS
+
+FRACTION_BITS = 40
+"""Rays are walked in whole numbers: positions and slopes are multiples of 2^-40 of a cell."""
+_ONE = 1 << FRACTION_BITS
+
+_PIECE = 64
+"""Planes of the main axis that are worked on at once."""
 
 
 @inline_kernel
-def _in_list(value, numbers):
-    """True when ``value`` is one of ``numbers``; NaN equals NaN."""
-    found = False
-    for i in range(numbers.size):
-        if value == numbers[i] or (value != value and numbers[i] != numbers[i]):
-            found = True
-    return found
+def _offset(coordinate, axis, stride):
+    """What one coordinate adds to a cell's place in the scratch grid; ``stride`` is that of the axis' blocks."""
+    return (coordinate >> 3) * stride + (((coordinate & 1) | (coordinate & 2) << 2 | (coordinate & 4) << 4) << axis)
 
 
 @kernel
-def depth_to_ends(
-    depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, invalid, no_return,
-    keys, kinds, ends,
-):  # fmt: skip
-    """End cells of a depth image's rays: keys (n, 3) and kinds (n,) for the n rays that carry information.
+def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, flags):
+    """Mark with 1 every cell that a ray passes before its end cell, and flag the blocks that rays pass.
 
-    ``camera`` is (fx, fy, cx, cy), ``pose`` (4, 4); a class_image of size 0 means that every point is class 1;
-    ``ends`` (n, 3), where it is not empty, gets the rays' end points [m]. Returns n, or -1 when a key is out of range.
+    All rays start at ``origin`` (3,) and go to ``ends`` (n, 3), or to the centres of the cells ``end_keys`` (n, 3) where
+    ``ends`` is empty. ``corner`` (3,) is the lowest cell of the scratch grid of ``num_blocks`` (3,).
+
+    A ray is cut by the walls of its main axis, along which it is longest, into slabs of at most three cells each.
+    Positions at the walls follow from whole numbers without a sum along the way, so all slabs are worked out at once
+    and nothing drifts. Where two walls are met at once, z goes before y and y before x, as in OctoMap; walls closer
+    than about n x 2^-40 cells count as met at once in the n-th slab.
     """
-    height, width = depth_image.shape
-    labelled = class_image.size > 0
-    count = 0
-    ratios = np.empty(width)
-    for u in range(width):
-        ratios[u] = (u - camera[2]) / camera[0]
-    for v in range(height):
-        y_ratio = (v - camera[3]) / camera[1]
-        for u in range(width):
-            raw = depth_image[v, u]
-            kind = np.uint8(1)
-            if no_return.size > 0 and _in_list(raw, no_return):
-                z = 1.0
-                distance = np.inf
-            else:
-                z = raw * depth_unit
-                if not (z > 0.0 and z < np.inf) or raw == largest or (invalid.size > 0 and _in_list(raw, invalid)):
-                    continue
-                distance = z * np.sqrt(ratios[u] * ratios[u] + y_ratio * y_ratio + 1.0)
-                if distance < min_range:
-                    continue
-                if labelled:
-                    kind = class_image[v, u]
-            if distance > max_range:
-                z = max_range / np.sqrt(ratios[u] * ratios[u] + y_ratio * y_ratio + 1.0)
-                kind = np.uint8(CUT)
-            x = ratios[u] * z
-            y = y_ratio * z
-            if not _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, count):
-                return -1
-            count += 1
-    return count
-
-
-@kernel
-def _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, place):
-    """Write one ray's end, given in the sensor's frame; False when its key is outside the key space."""
-    wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-    wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-    wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-    kx, ky, kz = np.floor(wx / resolution), np.floor(wy / resolution), np.floor(wz / resolution)
-    if not (abs(kx) < KEY_OFFSET and abs(ky) < KEY_OFFSET and abs(kz) < KEY_OFFSET):
-        return False
-    keys[place, 0] = np.int32(kx)
-    keys[place, 1] = np.int32(ky)
-    keys[place, 2] = np.int32(kz)
-    kinds[place] = kind
-    if ends.size > 0:
-        ends[place, 0] = wx
-        ends[place, 1] = wy
-        ends[place, 2] = wz
-    return True
-
-
-@kernel
-def points_to_ends(points, class_ids, pose, resolution, min_range, max_range, keys, kinds, ends):
-    """End cells of a point cloud's rays; as depth_to_ends, for points (p, 3) in the sensor's frame."""
-    labelled = class_ids.size > 0
-    count = 0
-    for i in range(points.shape[0]):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        distance = np.sqrt(x * x + y * y + z * z)
-        if not (distance > 0.0 and distance < np.inf) or distance < min_range:
-            continue
-        kind = class_ids[i] if labelled else np.uint8(1)
-        if distance > max_range:
-            scale = max_range / distance
-            x, y, z = x * scale, y * scale, z * scale
-            kind = np.uint8(CUT)
-        if not _store_end(x, y, z, kind, pose, resolution, keys, kinds, ends, count):
-            return -1
-        count += 1
-    return count
-
-
-@kernel
-def widen_to_keys(keys, low, high):
-    """Widen the box from ``low`` (3,) to ``high`` (3,) so that it holds all keys (n, 3)."""
-    for i in range(keys.shape[0]):
-        for axis in range(3):
-            low[axis] = min(low[axis], keys[i, axis])
-            high[axis] = max(high[axis], keys[i, axis])
-
-
-@kernel
-def fill_axis_tables(num_bricks, offsets):
-    """Offset of each local coordinate in the scratch grid, per axis (3, m): their sum over the axes is the cell.
-
-    The grid holds ``num_bricks`` (3,) whole bricks, x fastest, each in Morton order.
-    """
-    stride = BRICK_CELLS
+    strides = np.empty(3, np.int64)
+    strides[0] = BLOCK_CELLS
+    strides[1] = BLOCK_CELLS * num_blocks[0]
+    strides[2] = BLOCK_CELLS * num_blocks[0] * num_blocks[1]
+    start, first = np.empty(3, np.int64), np.empty(3, np.int64)
     for axis in range(3):
-        for i in range(num_bricks[axis] * BRICK_EDGE):
-            offsets[axis, i] = (i >> BRICK_BITS) * stride + (spread_bits(i & 7) << axis)
-        stride *= num_bricks[axis]
-
-
-@kernel
-def _mark(marks, cell, value, touched_flags, touched, count):
-    """Write a mark and list its brick; returns the number of listed bricks."""
-    marks[cell] = value
-    brick = cell >> 9
-    if touched_flags[brick] == 0:
-        touched_flags[brick] = 1
-        touched[count] = brick
-        return count + 1
-    return count
-
-
-@kernel
-def mark_ends(keys, kinds, num_classes, corner, offsets, mapped, slots, votes, rays, marks, touched_flags, touched):
-    """Find the distinct end cells and mark the hit ones with 1 + the class that most points in them have.
-
-    ``offsets`` (3, m) are the axis tables of the scratch grid with lowest cell ``corner`` (3,); in ``mapped``,
-    coordinates outside the mapped region make every sum negative. ``slots`` (a grid) and ``votes`` (n, C) are zeroed
-    and left so; ``rays`` (n,) gets one input index for each distinct end cell. Returns the number of distinct end
-    cells and of touched bricks.
-    """
-    num_rays = 0
-    num_touched = 0
-    last_cell = np.int64(-1)
-    slot = np.int64(0)
-    for i in range(keys.shape[0]):
-        cell = (
-            offsets[0, keys[i, 0] - corner[0]] + offsets[1, keys[i, 1] - corner[1]] + offsets[2, keys[i, 2] - corner[2]]
-        )
-        if cell != last_cell:
-            last_cell = cell
-            slot = np.int64(slots[cell]) - 1
-            if slot < 0:
-                slot = num_rays
-                slots[cell] = slot + 1
-                rays[slot] = i
-                num_rays += 1
-        if 0 < kinds[i] <= num_classes:
-            votes[slot, kinds[i] - 1] += 1
-    for slot in range(num_rays):
-        x, y, z = keys[rays[slot], 0] - corner[0], keys[rays[slot], 1] - corner[1], keys[rays[slot], 2] - corner[2]
-        slots[offsets[0, x] + offsets[1, y] + offsets[2, z]] = 0
-        best, most = -1, 0
-        for c in range(num_classes):
-            if votes[slot, c] > most:
-                best, most = c, votes[slot, c]
-            votes[slot, c] = 0
-        cell = mapped[0, x] + mapped[1, y] + mapped[2, z]
-        if best >= 0 and cell >= 0:
-            num_touched = _mark(marks, cell, np.uint8(best + 2), touched_flags, touched, num_touched)
-    return num_rays, num_touched
-
-
-@kernel
-def mark_free(origin, ends, end_keys, resolution, corner, mapped, marks, touched_flags, touched, num_touched):
-    """Mark with 1 every unmarked cell that a ray passes before its end cell (Amanatides and Woo 1987).
-
-    All rays start at ``origin`` (3,) and go to ``ends`` (n, 3) in the cells ``end_keys`` (n, 3). The walk takes exactly
-    as many steps along each axis as the keys differ, so that it always arrives; where two borders are met at once, z
-    goes before y and y before x, as in OctoMap. Returns the number of touched bricks.
-    """
-    start_x = np.int64(np.floor(origin[0] / resolution)) - corner[0]
-    start_y = np.int64(np.floor(origin[1] / resolution)) - corner[1]
-    start_z = np.int64(np.floor(origin[2] / resolution)) - corner[2]
-    origin_cell = mapped[0, start_x] + mapped[1, start_y] + mapped[2, start_z]
-    for i in range(ends.shape[0]):
-        x, y, z = start_x, start_y, start_z
-        left_x = end_keys[i, 0] - corner[0] - x
-        left_y = end_keys[i, 1] - corner[1] - y
-        left_z = end_keys[i, 2] - corner[2] - z
-        dx, dy, dz = ends[i, 0] - origin[0], ends[i, 1] - origin[1], ends[i, 2] - origin[2]
-        step_x = 1 if left_x > 0 else -1
-        step_y = 1 if left_y > 0 else -1
-        step_z = 1 if left_z > 0 else -1
-        left_x, left_y, left_z = abs(left_x), abs(left_y), abs(left_z)
-        next_x = next_y = next_z = np.inf
-        # The wall ahead of local cell k is at (k + ahead) x resolution; crossings are not summed up, so nothing drifts.
-        ahead_x, ahead_y, ahead_z = corner[0] + (step_x > 0), corner[1] + (step_y > 0), corner[2] + (step_z > 0)
-        if left_x > 0:
-            next_x = ((x + ahead_x) * resolution - origin[0]) / dx
-        if left_y > 0:
-            next_y = ((y + ahead_y) * resolution - origin[1]) / dy
-        if left_z > 0:
-            next_z = ((z + ahead_z) * resolution - origin[2]) / dz
-        part_x, part_y, part_z = mapped[0, x], mapped[1, y], mapped[2, z]
-        if left_x + left_y + left_z > 0 and origin_cell >= 0 and marks[origin_cell] == 0:
-            num_touched = _mark(marks, origin_cell, np.uint8(1), touched_flags, touched, num_touched)
-        for _ in range(left_x + left_y + left_z - 1):
-            if next_x < next_y and next_x < next_z:
-                x += step_x
-                left_x -= 1
-                next_x = ((x + ahead_x) * resolution - origin[0]) / dx if left_x > 0 else np.inf
-                part_x = mapped[0, x]
-            elif next_y < next_z and not next_x < next_y:
-                y += step_y
-                left_y -= 1
-                next_y = ((y + ahead_y) * resolution - origin[1]) / dy if left_y > 0 else np.inf
-                part_y = mapped[1, y]
+        quotient = origin[axis] / resolution
+        cell = np.int64(np.floor(quotient))
+        first[axis] = cell - corner[axis]
+        inside = min(np.int64(np.rint((quotient - cell) * _ONE)), _ONE - 1)
+        start[axis] = (first[axis] << FRACTION_BITS) + inside
+    counts, steps, fractions = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    lengths = np.empty(3)
+    crossed = np.empty((2, _PIECE + 1), np.int64)
+    places = np.empty((2, _PIECE + 1), np.int64)
+    cells = np.empty((3, _PIECE), np.int64)
+    for i in range(end_keys.shape[0]):
+        for axis in range(3):
+            cell = end_keys[i, axis] - corner[axis]
+            if ends.size > 0:
+                inside = np.int64(np.rint((ends[i, axis] / resolution - end_keys[i, axis]) * _ONE))
+                target = (cell << FRACTION_BITS) + min(max(inside, 0), _ONE - 1)
             else:
-                z += step_z
-                left_z -= 1
-                next_z = ((z + ahead_z) * resolution - origin[2]) / dz if left_z > 0 else np.inf
-                part_z = mapped[2, z]
-            cell = part_x + part_y + part_z
-            if cell >= 0 and marks[cell] == 0:
-                num_touched = _mark(marks, cell, np.uint8(1), touched_flags, touched, num_touched)
-    return num_touched
-
-
-@kernel
-def count_hit_bricks(marks, touched, num_touched):
-    """Number of touched bricks with at least one hit cell."""
-    total = 0
-    for t in range(num_touched):
-        for i in range(BRICK_CELLS):
-            if marks[touched[t] * BRICK_CELLS + i] > 1:
-                total += 1
-                break
-    return total
-
-
-@kernel
-def touched_codes(touched, low_brick, num_bricks, codes):
-    """Brick codes (n,) of the touched bricks (n,) of the scratch grid."""
-    offset = KEY_OFFSET >> BRICK_BITS
-    for t in range(touched.size):
-        x = touched[t] % num_bricks[0]
-        y = (touched[t] // num_bricks[0]) % num_bricks[1]
-        z = touched[t] // (num_bricks[0] * num_bricks[1])
-        codes[t] = (
-            spread_bits(x + low_brick[0] + offset)
-            | spread_bits(y + low_brick[1] + offset) << 1
-            | spread_bits(z + low_brick[2] + offset) << 2
+                target = (cell << FRACTION_BITS) + (_ONE >> 1)
+            upwards = target >= start[axis]
+            steps[axis] = 1 if upwards else -1
+            counts[axis] = abs(cell - first[axis])
+            lengths[axis] = np.float64(abs(target - start[axis]))
+            inside = start[axis] - (first[axis] << FRACTION_BITS)
+            fractions[axis] = inside if upwards else _ONE - inside
+        if counts[0] + counts[1] + counts[2] == 0:
+            continue
+        a = 0
+        if lengths[1] > lengths[0]:
+            a = 1
+        if lengths[2] > lengths[a]:
+            a = 2
+        # Of the other two axes, c is the one whose walls come first where both are met at once.
+        b = 1 if a == 0 else 0
+        c = 1 if a == 2 else 2
+        n, n_b, n_c = counts[a], counts[b], counts[c]
+        step_a, step_b, step_c = steps[a], steps[b], steps[c]
+        # Rounding must not change the order of walls that are met at once: axes above the main one are put ahead.
+        slope_b, slope_c = lengths[b] / lengths[a], lengths[c] / lengths[a]
+        rise_b, rise_c = min(np.int64(slope_b * _ONE), _ONE), min(np.int64(slope_c * _ONE), _ONE)
+        from_b = fractions[b] - np.int64(slope_b * fractions[a]) + (n + 4 if b > a else -n - 4)
+        from_c = fractions[c] - np.int64(slope_c * fractions[a]) + (n + 4 if c > a else -n - 4)
+        next_b, next_c = np.float64(_ONE - fractions[b]), np.float64(_ONE - fractions[c])
+        last_b = min(max((from_b + rise_b) >> FRACTION_BITS, 0), n_b) if n > 0 else n_b
+        last_c = min(max((from_c + rise_c) >> FRACTION_BITS, 0), n_c) if n > 0 else n_c
+        _mark_slab(
+            marks,
+            flags,
+            _offset(first[a], a, strides[a]),
+            0,
+            0,
+            last_b,
+            last_c,
+            n > 0,
+            next_b,
+            next_c,
+            lengths[b],
+            lengths[c],
+            first[b],
+            first[c],
+            step_b,
+            step_c,
+            b,
+            c,
+            strides[b],
+            strides[c],
+        )
+        if n == 0:
+            continue
+        for piece in range(1, n, _PIECE):
+            size = min(_PIECE, n - piece)
+            crossed_b, crossed_c, places_b, places_c = crossed[0], crossed[1], places[0], places[1]
+            for k in range(size + 1):
+                count_b = min(max((from_b + rise_b * (piece + k)) >> FRACTION_BITS, 0), n_b)
+                count_c = min(max((from_c + rise_c * (piece + k)) >> FRACTION_BITS, 0), n_c)
+                crossed_b[k], crossed_c[k] = count_b, count_c
+                places_b[k] = _offset(first[b] + step_b * count_b, b, strides[b])
+                places_c[k] = _offset(first[c] + step_c * count_c, c, strides[c])
+            after_b, after_c, there_b, there_c = crossed_b[1:], crossed_c[1:], places_b[1:], places_c[1:]
+            entered, left, between = cells[0], cells[1], cells[2]
+            for k in range(size):
+                place = _offset(first[a] + step_a * (piece + k), a, strides[a])
+                wall_b = (crossed_b[k] * _ONE + next_b) * lengths[c]
+                wall_c = (crossed_c[k] * _ONE + next_c) * lengths[b]
+                both = (crossed_b[k] != after_b[k]) & (crossed_c[k] != after_c[k])
+                c_first = wall_c <= wall_b
+                entered[k] = place + places_b[k] + places_c[k]
+                left[k] = place + there_b[k] + there_c[k]
+                between[k] = (
+                    place
+                    + (places_b[k] if c_first | (not both) else there_b[k])
+                    + (there_c[k] if c_first & both else places_c[k])
+                )
+            for k in range(size):
+                marks[entered[k]] = 1
+                marks[left[k]] = 1
+                marks[between[k]] = 1
+                flags[entered[k] >> 9] = 1
+                flags[left[k] >> 9] = 1
+                flags[between[k] >> 9] = 1
+        last_b = min(max((from_b + rise_b * n) >> FRACTION_BITS, 0), n_b)
+        last_c = min(max((from_c + rise_c * n) >> FRACTION_BITS, 0), n_c)
+        _mark_slab(
+            marks,
+            flags,
+            _offset(first[a] + step_a * n, a, strides[a]),
+            last_b,
+            last_c,
+            n_b,
+            n_c,
+            False,
+            next_b,
+            next_c,
+            lengths[b],
+            lengths[c],
+            first[b],
+            first[c],
+            step_b,
+            step_c,
+            b,
+            c,
+            strides[b],
+            strides[c],
         )
 
 
 @kernel
-def apply_marks(bricks, indices, touched, marks, hit, miss, hit_other, clamp_min, clamp_max, revision):
-    """Add one scan's log-odds to the bricks ``indices`` (n,) whose marks are the scratch bricks ``touched`` (n,).
-
-    A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped. Room for the rows that may be needed must be there.
-    """
-    num_classes = bricks.vector.shape[1]
-    for t in range(indices.size):
-        index = indices[t]
-        cells = marks[touched[t] * BRICK_CELLS : (touched[t] + 1) * BRICK_CELLS]
-        hits = 0
-        for i in range(BRICK_CELLS):
-            hits += cells[i] > 1
-        if bricks.tiers[index] == UNIFORM and hits == 0:
-            value = bricks.values[index]
-            if min(max(value + miss, clamp_min), clamp_max) == value and all_known(bricks.known[index]):
-                continue
-        bricks.revisions[index] = revision
-        for byte in range(64):
-            bits = np.uint8(0)
-            for j in range(8):
-                if cells[byte * 8 + j] > 0:
-                    bits |= np.uint8(1 << j)
-            bricks.known[index, byte] |= bits
-        if hits > 0 and num_classes > 1:
-            make_vector(bricks, index)
+def _mark_slab(
+    marks, flags, place, at_b, at_c, to_b, to_c, mark_last, next_b, next_c, length_b, length_c, first_b, first_c,
+    step_b, step_c, b, c, stride_b, stride_c,
+):  # fmt: skip
+    """Mark the cells of one slab, cell by cell, from crossing counts (at_b, at_c) to (to_b, to_c)."""
+    while True:
+        done = at_b >= to_b and at_c >= to_c
+        if done and not mark_last:
+            return
+        cell = place + _offset(first_b + step_b * at_b, b, stride_b) + _offset(first_c + step_c * at_c, c, stride_c)
+        marks[cell] = 1
+        flags[cell >> (3 * BLOCK_BITS)] = 1
+        if done:
+            return
+        c_first = (at_c * _ONE + next_c) * length_b <= (at_b * _ONE + next_b) * length_c
+        if at_c < to_c and (c_first or at_b >= to_b):
+            at_c += 1
         else:
-            make_scalar(bricks, index)
-        if bricks.tiers[index] == SCALAR:
-            data = bricks.scalar[bricks.rows[index]]
-            for i in range(BRICK_CELLS):
-                step = hit if cells[i] > 1 else miss
-                changed = min(max(data[i] + step, clamp_min), clamp_max)
-                data[i] = changed if cells[i] > 0 else data[i]
-            collapse(bricks, index)
-            continue
-        for c in range(num_classes):
-            row = bricks.vector[bricks.rows[index], c]
-            for i in range(BRICK_CELLS):
-                mark = cells[i]
-                step = miss if mark == 1 else (hit if mark == c + 2 else hit_other)
-                changed = min(max(row[i] + step, clamp_min), clamp_max)
-                row[i] = changed if mark > 0 else row[i]
+            at_b += 1
 
 
 @kernel
-def clear_marks(marks, touched_flags, touched):
-    """Zero the scratch grid again, touched bricks only."""
-    for t in range(touched.size):
-        marks[touched[t] * BRICK_CELLS : (touched[t] + 1) * BRICK_CELLS] = 0
-        touched_flags[touched[t]] = 0
+def mark_hits(end_keys, end_marks, corner, num_blocks, marks, flags):
+    """Write the marks (n,) of hit end cells (n, 3) over those of passed cells; ends with mark 0 are left out."""
+    for i in range(end_marks.size):
+        if end_marks[i] > 0:
+            x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
+            cell = (
+                _offset(x, 0, BLOCK_CELLS)
+                + _offset(y, 1, BLOCK_CELLS * num_blocks[0])
+                + _offset(z, 2, BLOCK_CELLS * num_blocks[0] * num_blocks[1])
+            )
+            marks[cell] = end_marks[i]
+            flags[cell >> (3 * BLOCK_BITS)] = 1
+
+
+@kernel
+def clear_outside(low, high, num_blocks, marks, flags):
+    """Take back the marks of cells outside [low, high) (3,), in cells of the scratch grid."""
+    for block in range(flags.size):
+        if flags[block] == 0:
+            continue
+        x, y = block % num_blocks[0], (block // num_blocks[0]) % num_blocks[1]
+        z = block // (num_blocks[0] * num_blocks[1])
+        for k in range(BLOCK_CELLS):
+            dx = (k & 1) | (k >> 2) & 2 | (k >> 4) & 4
+            dy = (k >> 1) & 1 | (k >> 3) & 2 | (k >> 5) & 4
+            dz = (k >> 2) & 1 | (k >> 4) & 2 | (k >> 6) & 4
+            inside = (low[0] <= 8 * x + dx < high[0]) and (low[1] <= 8 * y + dy < high[1])
+            if not (inside and low[2] <= 8 * z + dz < high[2]):
+                marks[block * BLOCK_CELLS + k] = 0
+
+
+@kernel
+def touched_bricks(words, flags, corner, num_blocks, touched, codes):
+    """The bricks of flagged blocks that hold a mark: their places in the grid and their codes.
+
+    ``words`` are the marks, eight to a word. Returns their number, and the number of those with a hit cell.
+    """
+    offset = KEY_OFFSET >> BLOCK_BITS
+    low_x, low_y, low_z = corner[0] >> BLOCK_BITS, corner[1] >> BLOCK_BITS, corner[2] >> BLOCK_BITS
+    words_per_brick = BRICK_CELLS // 8
+    num_touched, num_hit = 0, 0
+    hits = np.uint64(0xFEFEFEFEFEFEFEFE)
+    for block in range(flags.size):
+        if flags[block] == 0:
+            continue
+        code = np.int64(-1)
+        for brick in range(block * BRICKS_PER_BLOCK, (block + 1) * BRICKS_PER_BLOCK):
+            found = np.uint64(0)
+            for word in range(brick * words_per_brick, (brick + 1) * words_per_brick):
+                found |= words[word]
+            if found == 0:
+                continue
+            if code < 0:
+                x = block % num_blocks[0] + low_x + offset
+                y = (block // num_blocks[0]) % num_blocks[1] + low_y + offset
+                z = block // (num_blocks[0] * num_blocks[1]) + low_z + offset
+                code = (spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2) * BRICKS_PER_BLOCK
+            touched[num_touched] = brick
+            codes[num_touched] = code + brick - block * BRICKS_PER_BLOCK
+            num_touched += 1
+            num_hit += (found & hits) != 0
+    return num_touched, num_hit
+
+
+@kernel
+def clear_marks(marks, flags):
+    """Zero the flagged blocks of the scratch grid, and the flags."""
+    for block in range(flags.size):
+        if flags[block] != 0:
+            flags[block] = 0
+            marks[block * BLOCK_CELLS : (block + 1) * BLOCK_CELLS] = 0

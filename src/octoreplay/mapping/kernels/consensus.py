@@ -13,9 +13,9 @@ GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
 @kernel
 def exp_negative(x, out, powers, scales):
-    """Exp of ``x`` (512,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
+    """Exp of ``x`` (64,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
 
-    ``powers`` (512,) int32 and ``scales``, the same memory seen as float32, are scratch.
+    ``powers`` (64,) int32 and ``scales``, the same memory seen as float32, are scratch.
     """
     for i in range(x.size):
         value = max(x[i], np.float32(-87.0))
@@ -35,7 +35,7 @@ def exp_negative(x, out, powers, scales):
 
 @inline_kernel
 def _add_scaled(target, address, tier, c, factor, num_classes):
-    """Target (512,) += factor x class c of the brick at ``address``."""
+    """Target (64,) += factor x class c of the brick at ``address``."""
     if tier == UNIFORM:
         value = carray(float_pointer(address), (1,))[0] * factor
         for i in range(target.size):
@@ -52,14 +52,14 @@ def _add_scaled(target, address, tier, c, factor, num_classes):
 
 @inline_kernel
 def load(target, address, tier, c, num_classes):
-    """Target (512,) = class c of the brick at ``address``, 0 where there is none."""
+    """Target (64,) = class c of the brick at ``address``, 0 where there is none."""
     target[:] = np.float32(0.0)
     _add_scaled(target, address, tier, c, np.float32(1.0), num_classes)
 
 
 @inline_kernel
 def _load_evidence(target, addresses, tiers, column, count_column, scale, c, counts, num_classes):
-    """Target (512,) = class c of log q: the evidence times ``scale``, or divided by the cells' scan counts."""
+    """Target (64,) = class c of log q: the evidence times ``scale``, or divided by the cells' scan counts."""
     load(target, addresses[column], tiers[column], c, num_classes)
     if count_column >= 0:
         load(counts, addresses[count_column], tiers[count_column], 0, 1)

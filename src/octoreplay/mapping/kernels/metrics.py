@@ -11,7 +11,7 @@ from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR
 
 @kernel
 def _brick_labels(address, tier, prior, num_classes, labels, best, row):
-    """Argmax class (512,) of a brick and its log-odds; free is 0, ties go to the lower id."""
+    """Argmax class (64,) of a brick and its log-odds; free is 0, ties go to the lower id."""
     labels[:] = 0
     best[:] = np.float32(0.0)
     width = num_classes if tier == VECTOR else 1
@@ -28,7 +28,7 @@ def _brick_labels(address, tier, prior, num_classes, labels, best, row):
 def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distances, counts, entropies):
     """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``addresses``) and the oracle (column N).
 
-    ``known`` (n, N, 64) are the robots' masks and ``link_ends`` (L, 2) the links' robots. Outputs per brick:
+    ``known`` (n, N) are the robots' masks and ``link_ends`` (L, 2) the links' robots. Outputs per brick:
     ``distances`` (n, 2): sum of squared differences over the links, and over all pairs of robots;
     ``counts`` (n, 3 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
     labels; then per robot known cells, agreeing cells, agreeing cells that the oracle calls occupied;
@@ -50,10 +50,8 @@ def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distanc
     for b in range(addresses.shape[0]):
         for r in range(robots):
             _brick_labels(addresses[b, r], tiers[b, r], prior, num_classes, labels[r], best, row)
-            for byte in range(64):
-                bits = known[b, r, byte]
-                for j in range(8):
-                    seen[r, byte * 8 + j] = (bits >> j) & 1
+            for i in range(BRICK_CELLS):
+                seen[r, i] = (known[b, r] >> np.uint64(i)) & np.uint64(1)
             width = num_classes if tiers[b, r] == VECTOR else 1
             terms = np.float32(1.0) if tiers[b, r] == VECTOR else np.float32(num_classes)
             for i in range(BRICK_CELLS):

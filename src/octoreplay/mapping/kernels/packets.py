@@ -6,14 +6,15 @@ import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
 from octoreplay.mapping.kernels.storage import (
+    ALL_CELLS,
     BRICK_CELLS,
     BRICK_DEPTH,
+    CELL_BITS,
     KEY_BITS,
     SCALAR,
     UNIFORM,
     VECTOR,
     add_brick,
-    all_known,
     make_scalar,
     make_vector,
 )
@@ -76,7 +77,7 @@ def _word(states, start):
 
 @kernel
 def _load_cells(bricks, index, low, cells):
-    """Values of a brick's cells (C, 512) and the state of each cell; returns how many classes have their own values."""
+    """Values of a brick's cells (C, 64) and the state of each cell; returns how many classes have their own values."""
     tier = bricks.tiers[index]
     cells[:] = CHILD_SCALAR
     if tier == UNIFORM:
@@ -90,11 +91,11 @@ def _load_cells(bricks, index, low, cells):
             for i in range(BRICK_CELLS):
                 low[c, i] = row[i]
                 cells[i] |= np.uint8(row[i] != low[0, i])
-    if not all_known(bricks.known[index]):
-        for byte in range(64):
-            for j in range(8):
-                if (bricks.known[index, byte] >> j) & 1 == 0:
-                    cells[8 * byte + j] = CHILD_UNKNOWN
+    known = bricks.known[index]
+    if known != ALL_CELLS:
+        for i in range(BRICK_CELLS):
+            if (known >> np.uint64(i)) & np.uint64(1) == 0:
+                cells[i] = CHILD_UNKNOWN
     return low.shape[0] if tier == VECTOR else 1
 
 
@@ -119,16 +120,13 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
     num_classes = bricks.vector.shape[1]
     limit = tolerance if prune else np.float32(-1.0)
     low = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    low8 = np.empty((num_classes, 64), dtype=np.float32)
-    low64 = np.empty((num_classes, 8), dtype=np.float32)
+    low8 = np.empty((num_classes, 8), dtype=np.float32)
     # The bounds of a node's values; without a tolerance they are equal, and one array serves as both.
     lossy = limit > np.float32(0.0)
     high = np.empty_like(low) if lossy else low
     high8 = np.empty_like(low8) if lossy else low8
-    high64 = np.empty_like(low64) if lossy else low64
     cells = np.empty(BRICK_CELLS, dtype=np.uint8)
-    eights = np.empty(64, dtype=np.uint8)
-    groups = np.empty(8, dtype=np.uint8)
+    eights = np.empty(8, dtype=np.uint8)
     totals = np.zeros(3, dtype=np.int64)
     # The open nodes from the root down: where each one's word stands, what was written before it, its children.
     starts = np.zeros((BRICK_DEPTH + 1, 3), dtype=np.int64)
@@ -154,7 +152,7 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
         parent = BRICK_DEPTH - 1
         place = code & 7
         if bricks.tiers[index] == UNIFORM and prune:
-            state = CHILD_SCALAR if bricks.known[index, 0] else CHILD_UNKNOWN
+            state = CHILD_SCALAR if bricks.known[index] else CHILD_UNKNOWN
             node_low[parent, :, place] = bricks.values[index]
             node_high[parent, :, place] = bricks.values[index]
         else:
@@ -162,32 +160,25 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors):
             if lossy:
                 high[:width, :] = low[:width, :]
             _reduce(low, high, cells, limit, width, low8, high8, eights)
-            _reduce(low8, high8, eights, limit, width, low64, high64, groups)
-            state = _group_state(low64, high64, groups, 0, limit, width)
+            state = _group_state(low8, high8, eights, 0, limit, width)
             for c in range(num_classes):
-                node_low[parent, c, place] = low64[c if width > 1 else 0, 0]
-                node_high[parent, c, place] = high64[c if width > 1 else 0, 0]
+                node_low[parent, c, place] = low8[c if width > 1 else 0, 0]
+                node_high[parent, c, place] = high8[c if width > 1 else 0, 0]
         states[parent, place] = state
         if state >= CHILD_SCALAR:
             _write_leaf(state, node_low[parent], node_high[parent], place, scalars, vectors, totals)
         elif state == CHILD_INNER:
-            words[totals[0]] = _word(groups, 0)
+            words[totals[0]] = _word(eights, 0)
             totals[0] += 1
-            for g in range(8):
-                if groups[g] >= CHILD_SCALAR:
-                    _write_leaf(groups[g], low64, high64, g, scalars, vectors, totals)
-                elif groups[g] == CHILD_INNER:
-                    words[totals[0]] = _word(eights, 8 * g)
+            for e in range(8):
+                if eights[e] >= CHILD_SCALAR:
+                    _write_leaf(eights[e], low8, high8, e, scalars, vectors, totals)
+                elif eights[e] == CHILD_INNER:
+                    words[totals[0]] = _word(cells, 8 * e)
                     totals[0] += 1
-                    for e in range(8 * g, 8 * g + 8):
-                        if eights[e] >= CHILD_SCALAR:
-                            _write_leaf(eights[e], low8, high8, e, scalars, vectors, totals)
-                        elif eights[e] == CHILD_INNER:
-                            words[totals[0]] = _word(cells, 8 * e)
-                            totals[0] += 1
-                            for i in range(8 * e, 8 * e + 8):
-                                if cells[i] != CHILD_UNKNOWN:
-                                    _write_leaf(cells[i], low, high, i, scalars, vectors, totals)
+                    for i in range(8 * e, 8 * e + 8):
+                        if cells[i] != CHILD_UNKNOWN:
+                            _write_leaf(cells[i], low, high, i, scalars, vectors, totals)
     if order.size > 0:
         for depth in range(BRICK_DEPTH - 1, -1, -1):
             _close(depth, bricks.codes[order[order.size - 1]], limit, starts, states, node_low, node_high,
@@ -262,11 +253,11 @@ def fill_from_leaves(bricks, codes, depths, is_vector, scalars, vectors):
     last_code, index = np.int64(-1), np.int64(-1)
     for n in range(codes.size):
         span = np.int64(1) << (3 * (KEY_BITS - depths[n]))
-        brick_code = codes[n] >> 9
+        brick_code = codes[n] >> CELL_BITS
         if depths[n] <= BRICK_DEPTH:
-            for k in range(span >> 9):
+            for k in range(span >> CELL_BITS):
                 index = add_brick(bricks, brick_code + k)
-                bricks.known[index, :] = 255
+                bricks.known[index] = ALL_CELLS
                 if is_vector[n]:
                     make_vector(bricks, index)
                     for c in range(vectors.shape[1]):
@@ -278,11 +269,11 @@ def fill_from_leaves(bricks, codes, depths, is_vector, scalars, vectors):
                 index = add_brick(bricks, brick_code)
                 last_code = brick_code
                 make_scalar(bricks, index)
-            start = codes[n] & 511
+            start = codes[n] & (BRICK_CELLS - 1)
             if is_vector[n]:
                 make_vector(bricks, index)
             for i in range(start, start + span):
-                bricks.known[index, i >> 3] |= np.uint8(1 << (i & 7))
+                bricks.known[index] |= np.uint64(1) << np.uint64(i)
             row = bricks.rows[index]
             if is_vector[n]:
                 for c in range(vectors.shape[1]):

@@ -1,6 +1,6 @@
 """Where the cells of an octree are stored: bricks, their hash table, Morton codes.
 
-A *brick* is a cube of 8 x 8 x 8 finest cells, stored in Morton order (bit 0 of the index is x, bit 1 y, bit 2 z).
+A *brick* is a cube of 4 x 4 x 4 finest cells, stored in Morton order (bit 0 of the index is x, bit 1 y, bit 2 z).
 Its tier says how much is stored: UNIFORM one value for all its cells and classes, SCALAR one value per cell (equal over
 the classes: no cell was ever hit), VECTOR one value per class and cell.
 """
@@ -14,14 +14,18 @@ from numba import types
 from numba.extending import intrinsic
 
 from octoreplay.mapping.kernels.compiler import kernel
-from octoreplay.records import Float32Array, Int32Array, Int64Array, UInt8Array
+from octoreplay.records import Float32Array, Int32Array, Int64Array, UInt8Array, UInt64Array
 
 UNIFORM, SCALAR, VECTOR = 0, 1, 2
 ABSENT = 255
 
-BRICK_BITS = 3
-BRICK_EDGE = 8
-BRICK_CELLS = 512
+BRICK_BITS = 2
+BRICK_EDGE = 1 << BRICK_BITS
+CELL_BITS = 3 * BRICK_BITS
+"""A cell's Morton code without its last CELL_BITS bits is its brick's code."""
+BRICK_CELLS = 1 << CELL_BITS
+ALL_CELLS = np.uint64(0xFFFFFFFFFFFFFFFF)
+"""The mask of a brick with all its cells known: bit i stands for cell i."""
 KEY_BITS = 19
 """A key's three coordinates lie in [-2^18, 2^18)."""
 KEY_OFFSET = 1 << (KEY_BITS - 1)
@@ -38,7 +42,7 @@ class Bricks(NamedTuple):
     tiers: UInt8Array
     rows: Int32Array
     values: Float32Array
-    known: UInt8Array
+    known: UInt64Array
     revisions: Int64Array
     table: Int32Array
     counters: Int64Array
@@ -146,7 +150,7 @@ def add_brick(bricks, code):
     bricks.rows[index] = -1
     bricks.values[index] = 0.0
     bricks.revisions[index] = 0
-    bricks.known[index, :] = 0
+    bricks.known[index] = 0
     _enter(bricks, index)
     return index
 
@@ -222,18 +226,9 @@ def make_tiers(bricks, tiers):
 
 
 @kernel
-def all_known(known):
-    """True when all 512 cells of a brick are known."""
-    missing = 0
-    for byte in range(64):
-        missing += known[byte] != 255
-    return missing == 0
-
-
-@kernel
 def collapse(bricks, index):
     """Make a SCALAR brick UNIFORM when all its cells are known and equal: the in-memory prune."""
-    if bricks.tiers[index] != SCALAR or not all_known(bricks.known[index]):
+    if bricks.tiers[index] != SCALAR or bricks.known[index] != ALL_CELLS:
         return
     data = bricks.scalar[bricks.rows[index]]
     first = data[0]
@@ -253,7 +248,7 @@ def copy_bricks(source, indices, target, target_indices):
     for i in range(indices.size):
         a, b = indices[i], target_indices[i]
         tier = source.tiers[a]
-        target.known[b, :] = source.known[a]
+        target.known[b] = source.known[a]
         if target.tiers[b] == UNIFORM:
             target.values[b] = source.values[a]
         elif target.tiers[b] == SCALAR:
@@ -293,27 +288,12 @@ def brick_addresses(bricks, indices, scalar_base, vector_base, values_base, addr
 
 
 @kernel
-def count_known(known):
-    """Number of known cells in bricks with these masks (n, 64)."""
-    total = 0
-    for i in range(known.shape[0]):
-        for byte in range(64):
-            bits = np.int64(known[i, byte])
-            bits = bits - ((bits >> 1) & 0x55)
-            bits = (bits & 0x33) + ((bits >> 2) & 0x33)
-            total += (bits + (bits >> 4)) & 0x0F
-    return total
-
-
-@kernel
 def merge_known(known, indices, other_known):
     """known[indices] |= other_known; returns a flag (n,) where that changed anything."""
     changed = np.zeros(indices.size, dtype=np.bool_)
     for i in range(indices.size):
-        for byte in range(64):
-            old = known[indices[i], byte]
-            new = old | other_known[i, byte]
-            if new != old:
-                known[indices[i], byte] = new
-                changed[i] = True
+        old = known[indices[i]]
+        new = old | other_known[i]
+        known[indices[i]] = new
+        changed[i] = new != old
     return changed

@@ -1,0 +1,128 @@
+// Times native OctoMap, shows which cells it touches, and what its colour tree allocates.
+//
+//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   nanoseconds of each insertPointCloud call, a line each
+//   octomap_driver keys CLOUDS RESOLUTION DISCRETIZE MAX_RANGE     cells of each cloud, to standard output as int32:
+//                                                                  free count, keys, occupied count, keys
+//   octomap_driver memory CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   of one ColorOcTree with all clouds: allocated bytes,
+//                                                                  memoryUsage(), nodes, finest cells
+//
+// CLOUDS is little-endian: int64 clouds; for each int64 points, 3 float32 origin, 3 float32 per point, uint8 class per
+// point; all coordinates in the world's frame. The caller pins the process to a core.
+
+#include <malloc.h>
+
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <octomap/ColorOcTree.h>
+#include <octomap/OcTree.h>
+
+struct Cloud {
+  octomap::point3d origin;
+  octomap::Pointcloud points;
+  std::vector<uint8_t> classes;
+};
+
+template <class T>
+std::vector<T> read(std::ifstream& file, std::size_t count) {
+  std::vector<T> values(count);
+  file.read(reinterpret_cast<char*>(values.data()), static_cast<std::streamsize>(count * sizeof(T)));
+  if (!file) throw std::runtime_error("the file of clouds is cut");
+  return values;
+}
+
+std::vector<Cloud> readClouds(const char* path) {
+  std::ifstream file(path, std::ios::binary);
+  std::vector<Cloud> clouds(read<int64_t>(file, 1)[0]);
+  for (Cloud& cloud : clouds) {
+    const std::size_t count = read<int64_t>(file, 1)[0];
+    const auto origin = read<float>(file, 3);
+    const auto points = read<float>(file, 3 * count);
+    cloud.origin = octomap::point3d(origin[0], origin[1], origin[2]);
+    cloud.points.reserve(count);
+    for (std::size_t i = 0; i < count; ++i) {
+      cloud.points.push_back(points[3 * i], points[3 * i + 1], points[3 * i + 2]);
+    }
+    cloud.classes = read<uint8_t>(file, count);
+  }
+  return clouds;
+}
+
+void writeKeys(const octomap::KeySet& keys) {
+  std::vector<int32_t> values{static_cast<int32_t>(keys.size())};
+  for (const octomap::OcTreeKey& key : keys) {
+    for (int axis = 0; axis < 3; ++axis) values.push_back(static_cast<int32_t>(key[axis]) - 32768);
+  }
+  std::fwrite(values.data(), sizeof(int32_t), values.size(), stdout);
+}
+
+std::size_t allocatedBytes() {
+  const struct mallinfo2 info = mallinfo2();
+  return info.uordblks + info.hblkhd;
+}
+
+// Finest cells that the leaves stand for.
+std::size_t countCells(const octomap::ColorOcTree& tree) {
+  std::size_t cells = 0;
+  for (auto leaf = tree.begin_leafs(), end = tree.end_leafs(); leaf != end; ++leaf) {
+    cells += std::size_t{1} << (3 * (tree.getTreeDepth() - leaf.getDepth()));
+  }
+  return cells;
+}
+
+int main(int argc, char** argv) {
+  if (argc != 6) {
+    std::fprintf(stderr, "usage: octomap_driver insert|keys|memory CLOUDS RESOLUTION DISCRETIZE MAX_RANGE\n");
+    return 2;
+  }
+  const std::string mode = argv[1];
+  const std::vector<Cloud> clouds = readClouds(argv[2]);
+  const double resolution = std::atof(argv[3]);
+  const bool discretize = std::atoi(argv[4]) != 0;
+  const double maxRange = std::atof(argv[5]);
+  if (mode == "insert") {
+    octomap::OcTree tree(resolution);
+    for (const Cloud& cloud : clouds) {
+      const auto start = std::chrono::steady_clock::now();
+      tree.insertPointCloud(cloud.points, cloud.origin, maxRange, false, discretize);
+      const auto end = std::chrono::steady_clock::now();
+      std::printf("%lld\n",
+                  static_cast<long long>(std::chrono::duration_cast<std::chrono::nanoseconds>(end - start).count()));
+    }
+  } else if (mode == "keys") {
+    octomap::OcTree tree(resolution);
+    for (const Cloud& cloud : clouds) {
+      octomap::KeySet free, occupied;
+      if (discretize) {
+        tree.computeDiscreteUpdate(cloud.points, cloud.origin, free, occupied, maxRange);
+      } else {
+        tree.computeUpdate(cloud.points, cloud.origin, free, occupied, maxRange);
+      }
+      writeKeys(free);
+      writeKeys(occupied);
+    }
+  } else if (mode == "memory") {
+    const std::size_t before = allocatedBytes();
+    octomap::ColorOcTree tree(resolution);
+    for (const Cloud& cloud : clouds) {
+      tree.insertPointCloud(cloud.points, cloud.origin, maxRange, false, discretize);
+      for (std::size_t i = 0; i < cloud.points.size(); ++i) {
+        const uint8_t shade = static_cast<uint8_t>(30 * cloud.classes[i]);
+        tree.setNodeColor(cloud.points[i].x(), cloud.points[i].y(), cloud.points[i].z(), shade, shade, shade);
+      }
+    }
+    tree.prune();
+    const std::size_t after = allocatedBytes();
+    std::printf("%zu %zu %zu %zu\n", after - before, tree.memoryUsage(), tree.size(), countCells(tree));
+  } else {
+    std::fprintf(stderr, "unknown mode %s\n", mode.c_str());
+    return 2;
+  }
+  return 0;
+}
