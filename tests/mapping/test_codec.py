@@ -63,7 +63,7 @@ def test_a_delta_replaces_the_bricks_that_it_holds(before, after, data):
 
 
 def _code(key):
-    return brick_code(tuple(k >> 3 for k in key))
+    return brick_code(tuple(k >> storage.BRICK_BITS for k in key))
 
 
 def test_large_uniform_cubes_are_one_leaf():

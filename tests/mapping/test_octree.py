@@ -149,8 +149,8 @@ def test_equal_siblings_that_are_not_all_known_stay_apart():
 def test_overwrite_replaces_whole_bricks(first, second):
     target, source = octree_of(first), octree_of(second)
     target.overwrite(source, np.arange(source.num_bricks), revision=5)
-    bricks = {tuple(k >> 3 for k in key) for key in second}
-    kept = {key: value for key, value in first.items() if tuple(k >> 3 for k in key) not in bricks}
+    bricks = {tuple(k >> storage.BRICK_BITS for k in key) for key in second}
+    kept = {key: value for key, value in first.items() if tuple(k >> storage.BRICK_BITS for k in key) not in bricks}
     assert cells_of(target) == cells_of(octree_of(kept | second))
     assert np.count_nonzero(target.revisions == 5) == source.num_bricks
 

@@ -31,7 +31,7 @@ def cells_before_end(
 ) -> list[tuple[int, int, int]]:
     """The cells that the ray from ``origin`` to ``target`` [m] passes, in order, its start included, its end cell not.
 
-    ``end_key`` holds ``target``. Both points are rounded to 2^-40 of a cell, and all else is exact: the next wall to
+    ``end_key`` holds ``target``. Both points are rounded to 2^-32 of a cell, and all else is exact: the next wall to
     cross is the one with the least ray parameter t; walls at the same t are crossed z before y before x (OctoMap's
     order). An axis that has reached the end cell's index has no more walls.
     """
@@ -47,16 +47,16 @@ def cells_before_end(
         passed.append((key[0], key[1], key[2]))
         moving = [axis for axis in (2, 1, 0) if key[axis] != end_key[axis]]
         # The wall ahead of cell k is at k going down and at k + 1 going up.
-        ahead = {axis: abs(((key[axis] + (steps[axis] > 0)) << 40) - starts[axis]) * scales[axis] for axis in moving}
+        ahead = {axis: abs(((key[axis] + (steps[axis] > 0)) << 32) - starts[axis]) * scales[axis] for axis in moving}
         axis = min(moving, key=ahead.__getitem__)
         key[axis] += steps[axis]
     return passed
 
 
 def _fixed(coord: float, key: int, resolution: float) -> int:
-    """A coordinate [m] in the cell ``key``, in whole 2^-40 of a cell; it stays in its cell."""
-    inside = round((float(coord) / resolution - key) * 2.0**40)
-    return (key << 40) + min(max(inside, 0), (1 << 40) - 1)
+    """A coordinate [m] in the cell ``key``, in whole 2^-32 of a cell; it stays in its cell."""
+    inside = round((float(coord) / resolution - key) * 2.0**32)
+    return (key << 32) + min(max(inside, 0), (1 << 32) - 1)
 
 
 def _sign(number: int) -> int:

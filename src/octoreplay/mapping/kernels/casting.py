@@ -16,18 +16,23 @@ BLOCK_EDGE = 1 << BLOCK_BITS
 BLOCK_CELLS = 1 << (3 * BLOCK_BITS)
 BRICKS_PER_BLOCK = BLOCK_CELLS // BRICK_CELLS
 
-FRACTION_BITS = 40
-"""Rays are walked in whole numbers: positions and slopes are multiples of 2^-40 of a cell."""
-_ONE = 1 << FRACTION_BITS
+FRACTION = 2.0**-32
+"""Rays are walked without rounding: positions and slopes are multiples of this part of a cell, and a coordinate of the
+scratch grid with such a fraction fits a float64."""
 
 _PIECE = 64
 """Planes of the main axis that are worked on at once."""
 
 
 @inline_kernel
-def _offset(coordinate, axis, stride):
-    """What one coordinate adds to a cell's place in the scratch grid; ``stride`` is that of the axis' blocks."""
-    return (coordinate >> 3) * stride + (((coordinate & 1) | (coordinate & 2) << 2 | (coordinate & 4) << 4) << axis)
+def _offset(coordinate, unit, stride):
+    """What one coordinate adds to a cell's place in the scratch grid, in 32 bits.
+
+    ``unit`` is 1, 2 and 4 for x, y and z, ``stride`` that of the axis' blocks.
+    """
+    within = np.uint32(np.uint32(coordinate & 1) | np.uint32(np.uint32(coordinate & 2) << 2))
+    within = np.uint32(within | np.uint32(np.uint32(coordinate & 4) << 4))
+    return np.uint32(np.uint32(np.uint32(coordinate >> 3) * stride) + np.uint32(within * unit))
 
 
 @kernel
@@ -40,40 +45,37 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
     A ray is cut by the walls of its main axis, along which it is longest, into slabs of at most three cells each.
     Positions at the walls follow from whole numbers without a sum along the way, so all slabs are worked out at once
     and nothing drifts. Where two walls are met at once, z goes before y and y before x, as in OctoMap; walls closer
-    than about n x 2^-40 cells count as met at once in the n-th slab.
+    than about n x 2^-32 cells count as met at once in the n-th slab.
     """
-    strides = np.empty(3, np.int64)
+    strides, units = np.empty(3, np.uint32), np.empty(3, np.uint32)
     strides[0] = BLOCK_CELLS
     strides[1] = BLOCK_CELLS * num_blocks[0]
     strides[2] = BLOCK_CELLS * num_blocks[0] * num_blocks[1]
-    start, first = np.empty(3, np.int64), np.empty(3, np.int64)
+    first, last, steps = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    start, lengths = np.empty(3), np.empty(3)
     for axis in range(3):
-        quotient = origin[axis] / resolution
-        cell = np.int64(np.floor(quotient))
+        units[axis] = 1 << axis
+        cell = np.int64(np.floor(origin[axis] / resolution))
         first[axis] = cell - corner[axis]
-        inside = min(np.int64(np.rint((quotient - cell) * _ONE)), _ONE - 1)
-        start[axis] = (first[axis] << FRACTION_BITS) + inside
-    counts, steps, fractions = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
-    lengths = np.empty(3)
-    crossed = np.empty((2, _PIECE + 1), np.int64)
-    places = np.empty((2, _PIECE + 1), np.int64)
-    cells = np.empty((3, _PIECE), np.int64)
+        start[axis] = first[axis] + _fraction(origin[axis], cell, resolution)
+    coords_b, coords_c = np.empty(_PIECE + 16, np.int32), np.empty(_PIECE + 16, np.int32)
+    places_b, places_c = np.empty(_PIECE + 16, np.uint32), np.empty(_PIECE + 16, np.uint32)
+    # Places along each axis, upwards and downwards, with room for whole vectors.
+    longest = BLOCK_EDGE * max(num_blocks[0], num_blocks[1], num_blocks[2])
+    tables = np.zeros((2, 3, longest + 16), np.uint32)
+    for axis in range(3):
+        for k in range(longest):
+            tables[0, axis, k] = _offset(np.uint32(k), units[axis], strides[axis])
+            tables[1, axis, longest - 1 - k] = tables[0, axis, k]
+    entered, left, between = np.empty(_PIECE, np.uint32), np.empty(_PIECE, np.uint32), np.empty(_PIECE, np.uint32)
+    after_b, after_c, there_b, there_c = coords_b[1:], coords_c[1:], places_b[1:], places_c[1:]
     for i in range(end_keys.shape[0]):
         for axis in range(3):
-            cell = end_keys[i, axis] - corner[axis]
-            if ends.size > 0:
-                inside = np.int64(np.rint((ends[i, axis] / resolution - end_keys[i, axis]) * _ONE))
-                target = (cell << FRACTION_BITS) + min(max(inside, 0), _ONE - 1)
-            else:
-                target = (cell << FRACTION_BITS) + (_ONE >> 1)
-            upwards = target >= start[axis]
-            steps[axis] = 1 if upwards else -1
-            counts[axis] = abs(cell - first[axis])
-            lengths[axis] = np.float64(abs(target - start[axis]))
-            inside = start[axis] - (first[axis] << FRACTION_BITS)
-            fractions[axis] = inside if upwards else _ONE - inside
-        if counts[0] + counts[1] + counts[2] == 0:
-            continue
+            last[axis] = end_keys[i, axis] - corner[axis]
+            inside = _fraction(ends[i, axis], end_keys[i, axis], resolution) if ends.size > 0 else 0.5
+            length = last[axis] + inside - start[axis]
+            steps[axis] = 1 if length >= 0.0 else -1
+            lengths[axis] = abs(length)
         a = 0
         if lengths[1] > lengths[0]:
             a = 1
@@ -82,130 +84,169 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
         # Of the other two axes, c is the one whose walls come first where both are met at once.
         b = 1 if a == 0 else 0
         c = 1 if a == 2 else 2
-        n, n_b, n_c = counts[a], counts[b], counts[c]
-        step_a, step_b, step_c = steps[a], steps[b], steps[c]
-        # Rounding must not change the order of walls that are met at once: axes above the main one are put ahead.
-        slope_b, slope_c = lengths[b] / lengths[a], lengths[c] / lengths[a]
-        rise_b, rise_c = min(np.int64(slope_b * _ONE), _ONE), min(np.int64(slope_c * _ONE), _ONE)
-        from_b = fractions[b] - np.int64(slope_b * fractions[a]) + (n + 4 if b > a else -n - 4)
-        from_c = fractions[c] - np.int64(slope_c * fractions[a]) + (n + 4 if c > a else -n - 4)
-        next_b, next_c = np.float64(_ONE - fractions[b]), np.float64(_ONE - fractions[c])
-        last_b = min(max((from_b + rise_b) >> FRACTION_BITS, 0), n_b) if n > 0 else n_b
-        last_c = min(max((from_c + rise_c) >> FRACTION_BITS, 0), n_c) if n > 0 else n_c
+        n = abs(last[a] - first[a])
+        first_a, step_a, stride_a = first[a], steps[a], strides[a]
+        unit_a, unit_b, unit_c = units[a], units[b], units[c]
+        first_b, last_b, step_b, stride_b = first[b], last[b], steps[b], strides[b]
+        first_c, last_c, step_c, stride_c = first[c], last[c], steps[c], strides[c]
+        # Which of the walls ahead of cells k_b and k_c comes first: they are k x scale + shift away.
+        scale_b, shift_b = step_b * lengths[c], ((step_b > 0) - start[b]) * step_b * lengths[c]
+        scale_c, shift_c = step_c * lengths[b], ((step_c > 0) - start[c]) * step_c * lengths[b]
+        at_b, at_c = first_b, first_c
+        if n > 0:
+            distance = start[a] - first_a if step_a > 0 else first_a + 1 - start[a]
+            from_b, rise_b = _line(start[b], step_b, lengths[b] / lengths[a], distance, n, b > a)
+            from_c, rise_c = _line(start[c], step_c, lengths[c] / lengths[a], distance, n, c > a)
+            low_b, high_b = np.int32(min(first_b, last_b)), np.int32(max(first_b, last_b))
+            low_c, high_c = np.int32(min(first_c, last_c)), np.int32(max(first_c, last_c))
+            at_b = np.int64(min(max(np.int32(from_b + rise_b), low_b), high_b))
+            at_c = np.int64(min(max(np.int32(from_c + rise_c), low_c), high_c))
+            _mark_slab(
+                marks,
+                flags,
+                _offset(first_a, unit_a, stride_a),
+                first_b,
+                first_c,
+                at_b,
+                at_c,
+                True,
+                scale_b,
+                shift_b,
+                scale_c,
+                shift_c,
+                step_b,
+                step_c,
+                unit_b,
+                unit_c,
+                stride_b,
+                stride_c,
+            )
+            for piece in range(1, n, _PIECE):
+                size = min(_PIECE, n - piece)
+                begin = first_a + piece if step_a > 0 else longest - 1 - first_a + piece
+                places_a = tables[0 if step_a > 0 else 1, a, begin:]
+                # Whole vectors: what lies behind the piece is worked out and not used.
+                whole = (size + 16) // 16 * 16
+                for k in range(whole):
+                    coord_b = min(max(np.int32(from_b + rise_b * np.float64(piece + k)), low_b), high_b)
+                    coord_c = min(max(np.int32(from_c + rise_c * np.float64(piece + k)), low_c), high_c)
+                    coords_b[k], coords_c[k] = coord_b, coord_c
+                    places_b[k] = _offset(np.uint32(coord_b), unit_b, stride_b)
+                    places_c[k] = _offset(np.uint32(coord_c), unit_c, stride_c)
+                whole = (size + 15) // 16 * 16
+                for k in range(whole):
+                    both = (coords_b[k] != after_b[k]) & (coords_c[k] != after_c[k])
+                    c_first = coords_c[k] * scale_c + shift_c <= coords_b[k] * scale_b + shift_b
+                    place_a, place_b, place_c, next_b, next_c = (
+                        places_a[k],
+                        places_b[k],
+                        places_c[k],
+                        there_b[k],
+                        there_c[k],
+                    )
+                    b_between = next_b if both & (not c_first) else place_b
+                    c_between = next_c if both & c_first else place_c
+                    entered[k] = np.uint32(np.uint32(place_a + place_b) + place_c)
+                    left[k] = np.uint32(np.uint32(place_a + next_b) + next_c)
+                    between[k] = np.uint32(np.uint32(place_a + b_between) + c_between)
+                _flag_blocks(flags, places_a, places_b, places_c, begin & (BLOCK_EDGE - 1), size)
+                for k in range(size):
+                    marks[entered[k]] = 1
+                    marks[left[k]] = 1
+                    marks[between[k]] = 1
+            at_b = np.int64(min(max(np.int32(from_b + rise_b * n), low_b), high_b))
+            at_c = np.int64(min(max(np.int32(from_c + rise_c * n), low_c), high_c))
         _mark_slab(
             marks,
             flags,
-            _offset(first[a], a, strides[a]),
-            0,
-            0,
+            _offset(last[a], unit_a, stride_a),
+            at_b,
+            at_c,
             last_b,
             last_c,
-            n > 0,
-            next_b,
-            next_c,
-            lengths[b],
-            lengths[c],
-            first[b],
-            first[c],
-            step_b,
-            step_c,
-            b,
-            c,
-            strides[b],
-            strides[c],
-        )
-        if n == 0:
-            continue
-        for piece in range(1, n, _PIECE):
-            size = min(_PIECE, n - piece)
-            crossed_b, crossed_c, places_b, places_c = crossed[0], crossed[1], places[0], places[1]
-            for k in range(size + 1):
-                count_b = min(max((from_b + rise_b * (piece + k)) >> FRACTION_BITS, 0), n_b)
-                count_c = min(max((from_c + rise_c * (piece + k)) >> FRACTION_BITS, 0), n_c)
-                crossed_b[k], crossed_c[k] = count_b, count_c
-                places_b[k] = _offset(first[b] + step_b * count_b, b, strides[b])
-                places_c[k] = _offset(first[c] + step_c * count_c, c, strides[c])
-            after_b, after_c, there_b, there_c = crossed_b[1:], crossed_c[1:], places_b[1:], places_c[1:]
-            entered, left, between = cells[0], cells[1], cells[2]
-            for k in range(size):
-                place = _offset(first[a] + step_a * (piece + k), a, strides[a])
-                wall_b = (crossed_b[k] * _ONE + next_b) * lengths[c]
-                wall_c = (crossed_c[k] * _ONE + next_c) * lengths[b]
-                both = (crossed_b[k] != after_b[k]) & (crossed_c[k] != after_c[k])
-                c_first = wall_c <= wall_b
-                entered[k] = place + places_b[k] + places_c[k]
-                left[k] = place + there_b[k] + there_c[k]
-                between[k] = (
-                    place
-                    + (places_b[k] if c_first | (not both) else there_b[k])
-                    + (there_c[k] if c_first & both else places_c[k])
-                )
-            for k in range(size):
-                marks[entered[k]] = 1
-                marks[left[k]] = 1
-                marks[between[k]] = 1
-                flags[entered[k] >> 9] = 1
-                flags[left[k] >> 9] = 1
-                flags[between[k] >> 9] = 1
-        last_b = min(max((from_b + rise_b * n) >> FRACTION_BITS, 0), n_b)
-        last_c = min(max((from_c + rise_c * n) >> FRACTION_BITS, 0), n_c)
-        _mark_slab(
-            marks,
-            flags,
-            _offset(first[a] + step_a * n, a, strides[a]),
-            last_b,
-            last_c,
-            n_b,
-            n_c,
             False,
-            next_b,
-            next_c,
-            lengths[b],
-            lengths[c],
-            first[b],
-            first[c],
+            scale_b,
+            shift_b,
+            scale_c,
+            shift_c,
             step_b,
             step_c,
-            b,
-            c,
-            strides[b],
-            strides[c],
+            unit_b,
+            unit_c,
+            stride_b,
+            stride_c,
         )
+
+
+@inline_kernel
+def _fraction(coord, cell, resolution):
+    """Where in its cell a coordinate [m] lies, in [0, 1), rounded to a multiple of FRACTION."""
+    return min(max(np.rint((coord / resolution - cell) / FRACTION) * FRACTION, 0.0), 1.0 - FRACTION)
+
+
+@inline_kernel
+def _line(start, step, slope, distance, n, goes_first):
+    """Position along an axis at the k-th wall of the main one: first + k x second is in the cell behind the wall.
+
+    ``start`` is the origin's position, ``slope`` at most 1, ``distance`` one cell less that to the main axis' first wall.
+    Rounding must not decide the order of walls that are met at once: an axis that ``goes_first`` is put ahead by what
+    n roundings can amount to, the others behind.
+    """
+    rise = min(np.floor(slope / FRACTION) * FRACTION, 1.0)
+    ahead = (n + 4 if goes_first else -n - 4) * FRACTION - np.floor(slope * distance / FRACTION) * FRACTION
+    # Going down, a position on a wall is in the cell behind the wall.
+    return (start + ahead, rise) if step > 0 else (start - FRACTION - ahead, -rise)
+
+
+@inline_kernel
+def _flag_blocks(flags, places_a, places_b, places_c, skipped, size):
+    """Flag the blocks that ``size`` slabs pass, the first of them ``skipped`` cells from where its block begins."""
+    b, c = np.int64(places_b[0]) >> (3 * BLOCK_BITS), np.int64(places_c[0]) >> (3 * BLOCK_BITS)
+    for stretch in range((size + skipped + BLOCK_EDGE - 1) >> BLOCK_BITS):
+        # Within one block of the main axis a ray lies in at most two blocks along each of the others.
+        begin = max(stretch * BLOCK_EDGE - skipped, 0)
+        end = min(stretch * BLOCK_EDGE + BLOCK_EDGE - skipped, size)
+        a = np.int64(places_a[begin]) >> (3 * BLOCK_BITS)
+        other_b, other_c = np.int64(places_b[end]) >> (3 * BLOCK_BITS), np.int64(places_c[end]) >> (3 * BLOCK_BITS)
+        flags[a + b + c] = 1
+        flags[a + other_b + c] = 1
+        flags[a + b + other_c] = 1
+        flags[a + other_b + other_c] = 1
+        b, c = other_b, other_c
 
 
 @kernel
 def _mark_slab(
-    marks, flags, place, at_b, at_c, to_b, to_c, mark_last, next_b, next_c, length_b, length_c, first_b, first_c,
-    step_b, step_c, b, c, stride_b, stride_c,
+    marks, flags, place, at_b, at_c, to_b, to_c, mark_last, scale_b, shift_b, scale_c, shift_c, step_b, step_c, unit_b,
+    unit_c, stride_b, stride_c,
 ):  # fmt: skip
-    """Mark the cells of one slab, cell by cell, from crossing counts (at_b, at_c) to (to_b, to_c)."""
+    """Mark the cells of one slab, one by one, from (at_b, at_c) to (to_b, to_c)."""
     while True:
-        done = at_b >= to_b and at_c >= to_c
+        done = at_b == to_b and at_c == to_c
         if done and not mark_last:
             return
-        cell = place + _offset(first_b + step_b * at_b, b, stride_b) + _offset(first_c + step_c * at_c, c, stride_c)
+        cell = np.int64(place) + _offset(at_b, unit_b, stride_b) + _offset(at_c, unit_c, stride_c)
         marks[cell] = 1
         flags[cell >> (3 * BLOCK_BITS)] = 1
         if done:
             return
-        c_first = (at_c * _ONE + next_c) * length_b <= (at_b * _ONE + next_b) * length_c
-        if at_c < to_c and (c_first or at_b >= to_b):
-            at_c += 1
+        c_first = at_c * scale_c + shift_c <= at_b * scale_b + shift_b
+        if at_c != to_c and (c_first or at_b == to_b):
+            at_c += step_c
         else:
-            at_b += 1
+            at_b += step_b
 
 
 @kernel
 def mark_hits(end_keys, end_marks, corner, num_blocks, marks, flags):
     """Write the marks (n,) of hit end cells (n, 3) over those of passed cells; ends with mark 0 are left out."""
+    stride_x, stride_y = np.uint32(BLOCK_CELLS), np.uint32(BLOCK_CELLS * num_blocks[0])
+    stride_z = np.uint32(BLOCK_CELLS * num_blocks[0] * num_blocks[1])
     for i in range(end_marks.size):
         if end_marks[i] > 0:
             x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
-            cell = (
-                _offset(x, 0, BLOCK_CELLS)
-                + _offset(y, 1, BLOCK_CELLS * num_blocks[0])
-                + _offset(z, 2, BLOCK_CELLS * num_blocks[0] * num_blocks[1])
-            )
+            cell = np.int64(_offset(x, np.uint32(1), stride_x))
+            cell += np.int64(_offset(y, np.uint32(2), stride_y)) + np.int64(_offset(z, np.uint32(4), stride_z))
             marks[cell] = end_marks[i]
             flags[cell >> (3 * BLOCK_BITS)] = 1
 

@@ -21,6 +21,9 @@ _NONE = -1
 _FARTHEST_KEY = float(1 << 20)
 """Keys are limited to this, which is outside every key space and fits 32 bits."""
 
+_CLOSE = 1e-8
+"""Quotients farther from a whole number than this have the same floor with two roundings as with one."""
+
 _BLOCK = 1024
 
 
@@ -149,24 +152,20 @@ def points_to_runs(
 
 
 @kernel
-def _add_runs(
-    world, point_kinds, size, resolution, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters
-):  # fmt: skip
+def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
     """Append the runs of ``size`` points, given in the world."""
     for axis in range(3):
-        coords, out = world[axis], point_keys[axis]
-        for i in range(size):
-            out[i] = np.int32(min(max(np.floor(coords[i] / resolution), -_FARTHEST_KEY), _FARTHEST_KEY))
+        _coords_to_keys(world[axis], size, resolution, point_keys[axis])
     kx, ky, kz = point_keys[0], point_keys[1], point_keys[2]
-    num_starts = 0
-    if size > 0:
-        starts[0] = 0
-        num_starts = 1
+    is_start = np.ones(size + 1, np.uint8)
     for i in range(1, size):
-        starts[num_starts] = i
-        num_starts += (
+        is_start[i] = (
             (kx[i] != kx[i - 1]) | (ky[i] != ky[i - 1]) | (kz[i] != kz[i - 1]) | (point_kinds[i] != point_kinds[i - 1])
         )
+    num_starts = 0
+    for i in range(size):
+        starts[num_starts] = i
+        num_starts += is_start[i]
     starts[num_starts] = size
     place = counters[NUM_RUNS]
     for run in range(num_starts):
@@ -184,6 +183,20 @@ def _add_runs(
                 end_keys[place, axis] = point_keys[axis, i]
             place += point_kinds[i] != _NONE
         counters[NUM_POINTS] = place
+
+
+@kernel
+def _coords_to_keys(coords, size, resolution, keys):
+    """Keys = floor(coords / resolution), by multiplication where that cannot make a difference."""
+    inverse = 1.0 / resolution
+    num_close = 0
+    for i in range(size):
+        quotient = min(max(coords[i] * inverse, -_FARTHEST_KEY), _FARTHEST_KEY)
+        keys[i] = np.int32(np.floor(quotient))
+        num_close += abs(quotient - np.rint(quotient)) < _CLOSE
+    if num_close > 0:
+        for i in range(size):
+            keys[i] = np.int32(np.floor(min(max(coords[i] / resolution, -_FARTHEST_KEY), _FARTHEST_KEY)))
 
 
 @kernel
