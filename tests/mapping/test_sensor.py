@@ -149,6 +149,53 @@ def test_walls_at_decimal_places(resolution):
         _agree(CloudFrame("r", 0, ends, None, pose), SENSOR, MapConfig(resolution=resolution))
 
 
+@pytest.mark.parametrize("rays", ["cells", "all"])
+@pytest.mark.parametrize("seed", range(4))
+def test_long_rays(seed, rays):
+    """Hundreds of cells long, so that a ray is walked in several pieces, and some end next to a piece's end."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(60, 3))
+    directions[:6] = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 1, 0], [-1, 1, 1], [0.5, -1, 0.25]]
+    near_pieces = 64 * rng.integers(1, 6, 20) + rng.integers(-2, 3, 20)
+    lengths = np.concatenate([rng.uniform(1.0, 40.0, 40), near_pieces * 0.1])
+    points = directions / np.abs(directions).max(axis=1, keepdims=True) * lengths[:, None]
+    pose = np.eye(4)
+    pose[:3, 3] = rng.uniform(-20, 20, 3)
+    frame = CloudFrame("r", 0, points, rng.integers(0, 3, 60).astype(np.uint8), pose)
+    freed, _ = _agree(frame, dataclasses.replace(SENSOR, rays=rays, max_range=35.0), MapConfig(resolution=0.1))
+    assert len(freed) > 5000
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    origin=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+    point=st.tuples(*[st.floats(-30.0, 30.0).map(lambda value: round(value, 6))] * 3),
+    resolution=st.sampled_from([0.1, 0.25, 0.3]),
+    rays=st.sampled_from(["cells", "all"]),
+)
+def test_a_ray_is_a_chain_of_neighbours_from_its_origin_to_its_end(origin, point, resolution, rays):
+    """No cell is skipped, none is passed twice, and the end cell is not freed: as many cells as walls are crossed."""
+    pose = np.eye(4)
+    pose[:3, 3] = origin
+    frame = CloudFrame("r", 0, np.array([point]), None, pose)
+    sensor = dataclasses.replace(SENSOR, rays=rays, max_range=100.0)
+    freed, hit = _cells(frame, sensor, MapConfig(resolution=resolution))
+    if not np.any(point):
+        assert not freed
+        return
+    (end,) = hit
+    start = tuple(np.floor(np.array(origin) / resolution).astype(int).tolist())
+    assert len(freed) == sum(abs(e - s) for e, s in zip(end, start, strict=True))
+    at, rest = start, set(freed)
+    while rest:
+        rest.remove(at)
+        steps = [tuple(k + d * (axis == a) for a, k in enumerate(at)) for axis in range(3) for d in (-1, 1)]
+        following = [step for step in steps if step in rest or (step == end and not rest)]
+        assert len(following) == 1
+        (at,) = following
+    assert at == end
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("rays", ["cells", "all"])

@@ -245,6 +245,7 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
     indices = octree.find_or_add(cells.codes)
     octree.reserve(scalar=cells.codes.size, vector=cells.num_hit_bricks if octree.num_classes > 1 else 0)
     evidence.apply_marks(
-        octree.bricks, indices, cells.touched, cells.marks, cells.marks.view(np.uint64), np.float32(increments.hit), np.float32(increments.miss),
-        np.float32(increments.hit_other), np.float32(increments.least), np.float32(increments.most), revision,
+        octree.bricks, indices, cells.touched, cells.marks, cells.marks.view(np.uint64), np.float32(increments.hit),
+        np.float32(increments.miss), np.float32(increments.hit_other), np.float32(increments.least),
+        np.float32(increments.most), revision,
     )  # fmt: skip

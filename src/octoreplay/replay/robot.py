@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +78,7 @@ class Robot:
             octrees[id(self._scan_counts)] = self._scan_counts
         return sum(o.memory_bytes for o in octrees.values())
 
-    def integrate(self, frames: Sequence[Frame], tick: int) -> None:
+    def integrate(self, frames: Iterable[Frame], tick: int) -> None:
         """Add the robot's scans of one tick to its evidence."""
         for frame in frames:
             cells = self._caster.cast(frame)

@@ -22,7 +22,6 @@ from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
-    Frame,
     FrameCounts,
     LinkMetrics,
     RobotMetrics,
@@ -136,11 +135,12 @@ class Session:
         )  # fmt: skip
 
     def _integrate(self, number: int, stamp_ns: int) -> None:
-        """Every scan with a stamp before the tick goes into its robot's evidence."""
-        frames: dict[str, list[Frame]] = {robot_id: [] for robot_id in self._robot_ids}
-        for frame in self._timeline.frames_before(stamp_ns):
-            frames[frame.robot_id].append(frame)
-        self._each(lambda robot: robot.integrate(frames[robot.robot_id], number), self._robots)
+        """Every scan with a stamp before the tick goes into its robot's evidence, read in the robot's thread."""
+
+        def integrate(index: int) -> None:
+            self._robots[index].integrate(self._timeline.frames_before(index, stamp_ns), number)
+
+        self._each(integrate, range(len(self._robots)))
 
     def _active(self, stamp_ns: int) -> tuple[int, ...]:
         """Indices of the robots that take part in the tick."""

@@ -1,4 +1,4 @@
-"""The frames of a team on one clock: the robots' streams merged by stamp, read as they are asked for."""
+"""The frames of a team on one clock: every robot's stream, read as it is asked for."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ class FrameSource(Protocol):
 
 
 class Timeline:
-    """Merges robots' frames by (stamp, index of the robot); holds one frame of each robot ahead."""
+    """Gives robots' frames up to a common time; holds one frame of each robot ahead.
+
+    Different robots' frames may be taken in parallel threads.
+    """
 
     def __init__(self, logs: Sequence[FrameSource]) -> None:
         self._streams = [log.frames() for log in logs]
@@ -39,17 +42,9 @@ class Timeline:
         """Stamp of the latest frame that a robot has given; None before its first."""
         return self._last_ns[robot_index]
 
-    def frames_before(self, stamp_ns: int) -> Iterator[Frame]:
-        """The frames not given yet with stamps below ``stamp_ns``, by (stamp, robot index)."""
-        while (index := self._earliest()) is not None:
-            frame = self._next[index]
-            if frame is None or frame.stamp_ns >= stamp_ns:
-                return
-            self._last_ns[index] = frame.stamp_ns
-            self._next[index] = next(self._streams[index], None)
+    def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
+        """A robot's frames not given yet with stamps below ``stamp_ns``."""
+        while (frame := self._next[robot_index]) is not None and frame.stamp_ns < stamp_ns:
+            self._last_ns[robot_index] = frame.stamp_ns
+            self._next[robot_index] = next(self._streams[robot_index], None)
             yield frame
-
-    def _earliest(self) -> int | None:
-        """The index of the robot whose next frame is the earliest of all."""
-        waiting = [(frame.stamp_ns, index) for index, frame in enumerate(self._next) if frame is not None]
-        return min(waiting)[1] if waiting else None

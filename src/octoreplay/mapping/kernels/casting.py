@@ -1,7 +1,7 @@
 """Which cells the rays of a scan pass.
 
-The scratch grid of a scan is made of blocks of 8 x 8 x 8 cells, x fastest; a block holds eight bricks, and all its cells
-in Morton order. A *mark* says what the scan did to a cell: 0 nothing, 1 passed, 1 + class_id hit.
+The scratch grid of a scan is made of blocks of 8 x 8 x 8 cells, x fastest; a block holds eight bricks and its cells in
+Morton order. A *mark* says what the scan did to a cell: 0 nothing, 1 passed, 1 + class_id hit.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def _offset(coordinate, unit, stride):
 def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, flags):
     """Mark with 1 every cell that a ray passes before its end cell, and flag the blocks that rays pass.
 
-    All rays start at ``origin`` (3,) and go to ``ends`` (n, 3), or to the centres of the cells ``end_keys`` (n, 3) where
-    ``ends`` is empty. ``corner`` (3,) is the lowest cell of the scratch grid of ``num_blocks`` (3,).
+    All rays start at ``origin`` (3,) and go to ``ends`` (n, 3), or where that is empty to the centres of the cells
+    ``end_keys`` (n, 3). ``corner`` (3,) is the lowest cell of the scratch grid of ``num_blocks`` (3,).
 
     A ray is cut by the walls of its main axis, along which it is longest, into slabs of at most three cells each.
     Positions at the walls follow from whole numbers without a sum along the way, so all slabs are worked out at once
@@ -188,7 +188,7 @@ def _fraction(coord, cell, resolution):
 def _line(start, step, slope, distance, n, goes_first):
     """Position along an axis at the k-th wall of the main one: first + k x second is in the cell behind the wall.
 
-    ``start`` is the origin's position, ``slope`` at most 1, ``distance`` one cell less that to the main axis' first wall.
+    ``start`` is the origin's position, ``slope`` at most 1, and ``distance`` the origin's from the wall k = 0 behind it.
     Rounding must not decide the order of walls that are met at once: an axis that ``goes_first`` is put ahead by what
     n roundings can amount to, the others behind.
     """
@@ -307,4 +307,5 @@ def clear_marks(marks, flags):
     for block in range(flags.size):
         if flags[block] != 0:
             flags[block] = 0
-            marks[block * BLOCK_CELLS : (block + 1) * BLOCK_CELLS] = 0
+            for cell in range(block * BLOCK_CELLS, (block + 1) * BLOCK_CELLS):
+                marks[cell] = 0

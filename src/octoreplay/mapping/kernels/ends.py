@@ -1,4 +1,4 @@
-"""Where the rays of a scan end: measured points to keys, and keys to distinct end cells with the class most points have.
+"""Where the rays of a scan end: measured points to keys, keys to distinct end cells with their classes.
 
 Neighbouring points mostly share a cell, so they are kept as *runs*: key, kind and number of points in a row. The loops
 over points have no branches, so that they run as vectors.
@@ -235,7 +235,8 @@ def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, e
                 end_cells[slot] = cell
                 for axis in range(3):
                     end_keys[slot, axis] = keys[run, axis]
-                votes[slot, :] = 0
+                for c in range(num_classes):
+                    votes[slot, c] = 0
                 num_ends += 1
         if 0 < kinds[run] <= num_classes:
             votes[slot, kinds[run] - 1] += lengths[run]

@@ -35,7 +35,7 @@ def apply_marks(bricks, indices, touched, marks, words, hit, miss, hit_other, cl
     """Add one scan's log-odds to the bricks ``indices`` (n,) whose marks are the scratch bricks ``touched`` (n,).
 
     A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped. ``words`` is the memory of ``marks`` seen as uint64. Room for the rows that may be needed must be there.
+    are clamped. ``words`` are the marks, eight to a word. Room for the rows that may be needed must be there.
     """
     num_classes = bricks.vector.shape[1]
     for t in range(indices.size):

@@ -173,6 +173,20 @@ def find_all(bricks, codes, indices):
 
 
 @kernel
+def _fill(row, value):
+    """Set a row of values to one value. Loops, because numba compiles assignments to slices slowly."""
+    for i in range(BRICK_CELLS):
+        row[i] = value
+
+
+@kernel
+def _copy(row, source):
+    """Copy a row of values."""
+    for i in range(BRICK_CELLS):
+        row[i] = source[i]
+
+
+@kernel
 def make_scalar(bricks, index):
     """Raise a UNIFORM brick to SCALAR. Room for one row must be there."""
     if bricks.tiers[index] != UNIFORM:
@@ -184,7 +198,7 @@ def make_scalar(bricks, index):
     else:
         row = bricks.counters[NUM_SCALAR]
         bricks.counters[NUM_SCALAR] = row + 1
-    bricks.scalar[row, :] = bricks.values[index]
+    _fill(bricks.scalar[row], bricks.values[index])
     bricks.tiers[index] = SCALAR
     bricks.rows[index] = row
 
@@ -205,11 +219,12 @@ def make_vector(bricks, index):
     row = bricks.counters[NUM_VECTOR]
     bricks.counters[NUM_VECTOR] = row + 1
     if bricks.tiers[index] == UNIFORM:
-        bricks.vector[row, :, :] = bricks.values[index]
+        for c in range(bricks.vector.shape[1]):
+            _fill(bricks.vector[row, c], bricks.values[index])
     else:
         source = bricks.scalar[bricks.rows[index]]
         for c in range(bricks.vector.shape[1]):
-            bricks.vector[row, c, :] = source
+            _copy(bricks.vector[row, c], source)
         _release_scalar(bricks, index)
     bricks.tiers[index] = VECTOR
     bricks.rows[index] = row
@@ -253,18 +268,19 @@ def copy_bricks(source, indices, target, target_indices):
             target.values[b] = source.values[a]
         elif target.tiers[b] == SCALAR:
             if tier == UNIFORM:
-                target.scalar[target.rows[b], :] = source.values[a]
+                _fill(target.scalar[target.rows[b]], source.values[a])
             else:
-                target.scalar[target.rows[b], :] = source.scalar[source.rows[a]]
+                _copy(target.scalar[target.rows[b]], source.scalar[source.rows[a]])
             collapse(target, b)
-        elif tier == VECTOR:
-            target.vector[target.rows[b], :, :] = source.vector[source.rows[a]]
         else:
             for c in range(target.vector.shape[1]):
+                row = target.vector[target.rows[b], c]
                 if tier == UNIFORM:
-                    target.vector[target.rows[b], c, :] = source.values[a]
+                    _fill(row, source.values[a])
+                elif tier == SCALAR:
+                    _copy(row, source.scalar[source.rows[a]])
                 else:
-                    target.vector[target.rows[b], c, :] = source.scalar[source.rows[a]]
+                    _copy(row, source.vector[source.rows[a], c])
 
 
 @kernel
