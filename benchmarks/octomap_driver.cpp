@@ -1,6 +1,6 @@
 // Times native OctoMap, shows which cells it touches, and what its colour tree allocates.
 //
-//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   nanoseconds of each insertPointCloud call, a line each
+//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   nanoseconds of each insertPointCloud, one a line
 //   octomap_driver keys CLOUDS RESOLUTION DISCRETIZE MAX_RANGE     cells of each cloud, to standard output as int32:
 //                                                                  free count, keys, occupied count, keys
 //   octomap_driver memory CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   of one ColorOcTree with all clouds: allocated bytes,

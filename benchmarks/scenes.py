@@ -10,6 +10,7 @@ import math
 import os
 import tempfile
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -58,10 +59,14 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """What a peer is given for a frame: the sensor's ``origin`` (3,) and ``points`` (P, 3), float32, world frame."""
+    """What a peer is given for a frame, in the world's frame.
+
+    ``origin`` (3,) float32 of the sensor, ``points`` (P, 3) float32, ``class_ids`` (P,) uint8.
+    """
 
     origin: Float32Array
     points: Float32Array
+    class_ids: UInt8Array
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,8 @@ def camera_scene(num_frames: int = 100, seed: int = 0, track: int = 0, tracks: i
     Depth is uint16 millimetres along z, 0 beyond 10 m and where nothing is met. ``track`` of ``tracks`` chooses the
     part of the village, for several robots.
     """
-    camera = CameraModel(640, 480, *(2 * [320 / math.tan(math.radians(35.0))]), 319.5, 239.5)
+    focal = 320 / math.tan(math.radians(35.0))
+    camera = CameraModel(640, 480, focal, focal, 319.5, 239.5)
     path = cache_folder() / f"camera-v{_VERSION}-{num_frames}-{seed}-{track}of{tracks}.npz"
     if not path.exists():
         eye = _Eye(seed)
@@ -141,7 +147,7 @@ def lidar_scene(num_frames: int = 100, seed: int = 0, track: int = 0, tracks: in
         all_points, all_labels, bounds, poses = (stored[name] for name in ("points", "labels", "ends", "poses"))
     frames = tuple(
         CloudFrame("robot", index * 100_000_000, all_points[start:end], all_labels[start:end], poses[index])
-        for index, (start, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
+        for index, (start, end) in enumerate(pairwise(bounds))
     )
     return Scene("lidar", frames, LIDAR_RANGE)
 
@@ -196,12 +202,10 @@ def world_points(frame: Frame) -> tuple[Float64Array, UInt8Array]:
     return points @ pose[:3, :3].T + pose[:3, 3], labels
 
 
-def point_cloud(frame: Frame, max_range: float) -> PointCloud:
-    """A frame as ready-made points for a peer; what lies beyond the range is left out."""
-    points, _ = world_points(frame)
-    origin = frame.T_team_sensor[:3, 3]
-    near = np.linalg.norm(points - origin, axis=1) <= max_range
-    return PointCloud(origin.astype(np.float32), np.ascontiguousarray(points[near], np.float32))
+def point_cloud(frame: Frame) -> PointCloud:
+    """A frame as ready-made points for a peer."""
+    points, class_ids = world_points(frame)
+    return PointCloud(frame.T_team_sensor[:3, 3].astype(np.float32), points.astype(np.float32, order="C"), class_ids)
 
 
 def workload(scene: Scene, resolution: float) -> Workload:
@@ -209,7 +213,7 @@ def workload(scene: Scene, resolution: float) -> Workload:
     caster = ScanCaster(scene.sensor(), MapConfig(resolution=resolution), NUM_CLASSES)
     rows = []
     for frame in scene.frames:
-        cloud = point_cloud(frame, scene.max_range)
+        cloud = point_cloud(frame)
         keys = distinct_keys(cloud.points, resolution)
         start = np.floor(cloud.origin.astype(np.float64) / resolution).astype(np.int64)
         octree = SemanticOctree(resolution, NUM_CLASSES)
@@ -344,13 +348,13 @@ class _Eye:
         self._add(vertices, faces[is_road], ROAD)
         self._add(vertices, faces[~is_road], GROUND)
 
-    def _add_box(
-        self, x: float, y: float, a: float, b: float, top: float, class_id: int, bottom: float = -0.5
-    ) -> None:
+    def _add_box(self, x: float, y: float, a: float, b: float, top: float, class_id: int, bottom: float = -0.5) -> None:
         """A box of half lengths a and b between two heights above the ground."""
         box = self._o3d.geometry.TriangleMesh.create_box(2 * a, 2 * b, top - bottom)
         ground = float(_ground_height(np.array(x), np.array(y)))
-        self._add(np.asarray(box.vertices) + [x - a, y - b, ground + bottom], np.asarray(box.triangles), class_id)
+        self._add(
+            np.asarray(box.vertices) + np.array([x - a, y - b, ground + bottom]), np.asarray(box.triangles), class_id
+        )
 
     def _add_house(self, x: float, y: float, a: float, b: float) -> None:
         """Walls and a gable roof with eaves."""
@@ -360,7 +364,7 @@ class _Eye:
         c, d = a + 0.4, b + 0.4
         corners = [(-c, -d, eaves), (c, -d, eaves), (c, d, eaves), (-c, d, eaves), (-c, 0.0, ridge), (c, 0.0, ridge)]
         faces = [(0, 1, 5), (0, 5, 4), (2, 3, 4), (2, 4, 5), (1, 2, 5), (3, 0, 4), (0, 3, 2), (0, 2, 1)]
-        self._add(np.array(corners) + [x, y, ground], faces, ROOF)
+        self._add(np.array(corners) + np.array([x, y, ground]), faces, ROOF)
 
     def _add_tree(self, x: float, y: float) -> None:
         """A trunk and a crown of loose leaves."""
@@ -369,7 +373,8 @@ class _Eye:
         ground = float(_ground_height(np.array(x), np.array(y)))
         height, crown = rng.uniform(1.8, 2.6), rng.uniform(1.1, 1.7)
         trunk = mesh.create_cylinder(rng.uniform(0.12, 0.22), height + 0.5, 10, 1)
-        self._add(np.asarray(trunk.vertices) + [x, y, ground + height / 2 - 0.25], np.asarray(trunk.triangles), TRUNK)
+        middle = np.array([x, y, ground + height / 2 - 0.25])
+        self._add(np.asarray(trunk.vertices) + middle, np.asarray(trunk.triangles), TRUNK)
         leaves = rng.normal(size=(1200, 3))
         leaves *= crown * rng.uniform(0.3, 1.0, (1200, 1)) ** (1 / 3) / np.linalg.norm(leaves, axis=1, keepdims=True)
         corners = leaves[:, None] + rng.normal(scale=0.08, size=(1200, 3, 3)) + [x, y, ground + height + 0.6 * crown]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import math
 import signal
 import sys
@@ -361,6 +362,8 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code; SIGTERM ends a run as Ctrl-C does."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("octoreplay").setLevel(logging.INFO)
     sys.exit(_exit_code(arguments))
 
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
+from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams, unpruned_bytes
 from octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
@@ -45,6 +46,49 @@ def test_a_packet_gives_the_map_back_bit_for_bit(octree, compress, prune):
     assert cells_of(decoded) == cells_of(octree)
     # The octree is canonical, so the same map gives the same bytes, however it was pruned before.
     assert codec.encode_packet(decoded) == codec.encode_packet(octree)
+
+
+@settings(max_examples=60, deadline=None)
+@given(octree=octrees(), prune=st.booleans())
+def test_the_streams_read_as_the_format_says(octree, prune):
+    streams = octree.streams(prune=prune)
+    assert _naive_cells(streams.words.tolist(), streams.scalars, streams.vectors) == cells_of(octree)
+
+
+def _naive_cells(words, scalars, vectors):
+    """{key: bytes of its values} read recursively, as docs/packet-format.md says it; None for words that are no octree.
+
+    Leaves larger than 32 cells are left out.
+    """
+    rest = [list(words), list(scalars), list(vectors)]
+    content = {}
+
+    def read_node(corner, edge):
+        word = rest[0].pop(0)
+        for child in range(8):
+            state = (word >> (2 * child)) & 3
+            low = [k + edge // 2 * (child >> axis & 1) for axis, k in enumerate(corner)]
+            if state == 1:
+                if edge == 2:
+                    raise IndexError
+                read_node(low, edge // 2)
+            elif state:
+                value = np.broadcast_to(rest[state - 1].pop(0), vectors.shape[1])
+                if edge <= 64:
+                    content.update(cube(low, edge // 2, value.tobytes()))
+
+    try:
+        if rest[0]:
+            read_node((-LIMIT,) * 3, 2 * LIMIT)
+    except IndexError:
+        return None
+    return None if any(rest) else content
+
+
+@settings(max_examples=60, deadline=None)
+@given(octree=octrees())
+def test_the_unpruned_size_is_counted_without_writing(octree):
+    assert unpruned_bytes(octree) == octree.streams(prune=False).num_bytes
 
 
 @settings(max_examples=40, deadline=None)
@@ -91,6 +135,39 @@ def test_an_empty_map():
     assert len(packet) == codec.HEADER_BYTES
     assert codec.decode_packet(packet).num_bricks == 0
     assert codec.decode_packet(codec.encode_packet(octree)).num_classes == 3
+
+
+def test_bricks_without_a_known_cell_take_no_words():
+    octree = octree_of({(0, 0, 0): [1.0, 2.0]})
+    packet = codec.encode_packet(octree)
+    octree.find_or_add(np.array([0, 1, 77], np.int64))
+    assert codec.encode_packet(octree) == packet
+    octree.bricks.known[:] = 0
+    assert octree.streams().words.size == octree.streams(prune=False).words.size == unpruned_bytes(octree) == 0
+
+
+def test_equal_maps_are_equal_bytes_whatever_the_sign_of_0_and_the_order_of_bricks():
+    cells = cube((-9, 0, 3), 12, [0.0, 1.0]) | cube((0, 0, 0), 4, [0.0, 0.0]) | {(50, 0, 0): [0.0, 0.0]}
+    packet = codec.encode_packet(octree_of(cells))
+    signed = {key: [-value if value == 0 else value for value in values] for key, values in reversed(cells.items())}
+    assert codec.encode_packet(octree_of(signed)) == packet
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("tolerance", [0.0, 0.5])
+def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
+    """They never come from scans, but may from a packet: nothing else may change, and nothing is written outside."""
+    octree = SemanticOctree(0.25, 3)
+    octree.find_or_add(np.arange(64))
+    octree.raise_tiers((np.arange(64) % 3).astype(np.uint8))
+    octree.bricks.known[:64] = storage.ALL_CELLS
+    for array in (octree.bricks.values, octree.bricks.scalar, octree.bricks.vector):
+        array[:] = value
+    streams = octree.streams(tolerance=tolerance)
+    decoded = octree_from_streams(streams, 0.25)
+    assert decoded.num_cells == octree.num_cells
+    assert all(np.array_equal(array, np.full_like(array, value), equal_nan=True) for array in streams[1:])
+    assert len(cells_of(decoded)) == 64 * 64
 
 
 def test_the_bytes_by_hand():
@@ -280,3 +357,35 @@ def test_any_words_give_an_octree_or_a_packet_error(words, scalars, vectors):
     except PacketError:
         return
     assert octree.streams().num_leaves <= scalars + vectors
+
+
+@settings(max_examples=200, deadline=None)
+@given(octree=octrees(num_classes=2), prune=st.booleans(), data=st.data())
+def test_damaged_words_give_what_the_format_says_or_a_packet_error(octree, prune, data):
+    """A few wrong words, or some too many or missing, deep in a real octree; the checksum holds."""
+    streams = octree.streams(prune=prune)
+    words = streams.words.tolist()
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(words)))
+        new = data.draw(st.lists(st.sampled_from([0, 1, 2, 3, 0x5555, 0xAAAA, 0xFFFF, 0x9000, 0x4002]), max_size=2))
+        words[place : place + data.draw(st.integers(0, 2))] = new
+    expected = _naive_cells(words, streams.scalars, streams.vectors)
+    payload = _words(*words) + streams.scalars.tobytes() + streams.vectors.tobytes()
+    counts = (len(words), streams.scalars.size, len(streams.vectors))
+    packet = _forged(payload, resolution=octree.resolution, counts=counts)
+    refusal, decoded = "", None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(octree_module, "MAX_BRICKS", 5000)
+        try:
+            decoded = codec.decode_packet(packet)
+        except PacketError as error:
+            refusal = str(error)
+    if expected is None:
+        assert "no octree" in refusal
+    elif decoded is None:
+        assert "more space" in refusal
+    elif decoded.num_cells == len(expected):
+        assert cells_of(decoded) == expected
+    else:
+        # Leaves that are too large to be written out here.
+        assert decoded.num_cells > len(expected)

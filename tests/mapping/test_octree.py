@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, leaf_list, octree_from_streams
 from octoreplay.records import LeafTable
 from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
@@ -91,6 +91,17 @@ def test_lookup_of_nothing_and_in_nothing():
     assert log_odds.shape == (4, 2)
 
 
+@settings(max_examples=20, deadline=None)
+@given(cells=cell_maps(num_classes=2), prior=st.sampled_from([0.0, 0.4, -0.7]))
+def test_occupied_leaves_are_those_with_a_class_above_free(cells, prior):
+    octree = octree_of(cells)
+    everything, occupied = octree.leaves(prior), octree.leaves(prior, occupied_only=True)
+    chosen = (everything.log_odds > 0).any(axis=1)
+    np.testing.assert_array_equal(occupied.centers, everything.centers[chosen])
+    np.testing.assert_array_equal(occupied.sizes, everything.sizes[chosen])
+    np.testing.assert_array_equal(occupied.log_odds, everything.log_odds[chosen])
+
+
 def test_the_prior_is_added_to_leaves():
     octree = octree_of({(0, 0, 0): [1.0, -0.25]})
     table = octree.leaves(prior=-1.5)
@@ -126,6 +137,24 @@ def test_merging_stays_within_its_bound(seed, tolerance):
         assert len(group) < 8 or np.ptp(np.array(group), axis=0).max() > tolerance
 
 
+def test_leaves_that_merge_to_equal_classes_are_scalars():
+    cells = cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [0.0, 1.0]}
+    merged = octree_of(cells).streams(tolerance=1.0)
+    assert (merged.scalars.tolist(), merged.vectors.size) == ([0.5], 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(cells=cell_maps(num_classes=2), prune=st.booleans())
+def test_leaves_of_a_stream_do_not_overlap_and_fill_the_known_space(cells, prune):
+    octree = octree_of(cells)
+    codes, depths, _ = leaf_list(octree.streams(prune=prune))
+    spans = np.int64(1) << (3 * (storage.KEY_BITS - depths.astype(np.int64)))
+    assert (codes[1:] >= (codes + spans)[:-1]).all()
+    assert (codes % spans == 0).all()
+    assert spans.sum() == octree.num_cells
+    assert prune or (depths == storage.KEY_BITS).all()
+
+
 def test_without_pruning_every_known_cell_is_a_leaf():
     octree = octree_of(cube((0, 0, 0), 16, [-5.0, -5.0]) | {(40, 1, 1): [1.0, 0.0]})
     streams = octree.streams(prune=False)
@@ -138,10 +167,11 @@ def test_equal_siblings_that_are_not_all_known_stay_apart():
     cells = cube((0, 0, 0), 8, [-5.0, -5.0])
     del cells[7, 7, 7]
     octree = octree_of(cells)
-    assert octree.bricks.tiers[0] == storage.SCALAR
+    assert sorted(octree.bricks.tiers[: octree.num_bricks].tolist()) == [storage.UNIFORM] * 7 + [storage.SCALAR]
     assert len(octree.leaves()) == 7 + 7 + 7
     whole = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
-    assert whole.bricks.tiers[0] == storage.UNIFORM
+    assert whole.bricks.tiers[: whole.num_bricks].tolist() == [storage.UNIFORM] * 8
+    assert len(whole.leaves()) == 1
 
 
 @settings(max_examples=20, deadline=None)
@@ -196,4 +226,5 @@ def test_memory_is_what_the_bricks_take():
     octree = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
     assert octree.memory_bytes < 2000
     hit = octree_of({(0, 0, 0): [1.0, 0.0]})
-    assert 4096 < hit.memory_bytes < 4096 + 2000
+    values = storage.BRICK_CELLS * 4 * 2
+    assert values < hit.memory_bytes < values + 2000

@@ -5,8 +5,10 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import zstandard
 
 from octoreplay.errors import PacketError
@@ -65,15 +67,19 @@ def encode_delta(octree: SemanticOctree, indices: Int64Array, *, compress: bool 
 
 def pack(streams: TreeStreams, resolution: float, kind: int, *, compress: bool) -> bytes:
     """The packet of an octree's streams."""
-    payload = b"".join(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes() for array in streams)
+    little_endian = (np.ascontiguousarray(array, array.dtype.newbyteorder("<")) for array in streams)
+    parts: list[bytes | memoryview] = [array.data for array in little_endian]
     if compress:
-        payload = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(payload)
+        parts = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(b"".join(parts))]
     fields = (
         MAGIC, VERSION, kind, CONTENT_FLOAT32, ZSTD if compress else NO_COMPRESSION, streams.vectors.shape[1], 0,
-        resolution, streams.words.size, streams.scalars.size, streams.vectors.shape[0], len(payload),
+        resolution, streams.words.size, streams.scalars.size, streams.vectors.shape[0],
+        len(parts[0]) if compress else streams.num_bytes,
     )  # fmt: skip
-    checksum = zlib.crc32(payload, zlib.crc32(_HEADER.pack(*fields, 0)))
-    return _HEADER.pack(*fields, checksum) + payload
+    checksum = zlib.crc32(_HEADER.pack(*fields, 0))
+    for part in parts:
+        checksum = zlib.crc32(part, checksum)
+    return b"".join((_HEADER.pack(*fields, checksum), *parts))
 
 
 def read_header(data: bytes) -> PacketHeader:
@@ -83,7 +89,7 @@ def read_header(data: bytes) -> PacketHeader:
     _, version, kind, content, compression, num_classes, zero, resolution, *sizes, checksum = _HEADER.unpack_from(data)
     if version != VERSION:
         raise PacketError(f"map packet of format version {version}, this octoreplay reads version {VERSION}")
-    payload = data[HEADER_BYTES:]
+    payload = memoryview(data)[HEADER_BYTES:]
     if len(payload) != sizes[3]:
         raise PacketError(f"map packet cut: {len(payload)} bytes of payload, its header says {sizes[3]}")
     if zlib.crc32(payload, zlib.crc32(data[: HEADER_BYTES - 4] + bytes(4))) != checksum:
@@ -115,17 +121,17 @@ def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0) -> None:
 
 def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
     """The octree of a packet with a good header."""
-    payload = data[HEADER_BYTES:]
+    payload = memoryview(data)[HEADER_BYTES:]
     if header.compression == ZSTD:
-        payload = _unpack(payload, header.raw_bytes)
+        payload = memoryview(_unpack(payload, header.raw_bytes))
     if len(payload) != header.raw_bytes:
         raise PacketError("map packet damaged: its size does not match its counts")
     words_end = 2 * header.num_words
     scalars_end = words_end + 4 * header.num_scalars
     streams = TreeStreams(
-        np.frombuffer(payload[:words_end], "<u2"),
-        np.frombuffer(payload[words_end:scalars_end], "<f4"),
-        np.frombuffer(payload[scalars_end:], "<f4").reshape(-1, header.num_classes),
+        _array(payload[:words_end], np.uint16),
+        _array(payload[words_end:scalars_end], np.float32),
+        _array(payload[scalars_end:], np.float32).reshape(-1, header.num_classes),
     )
     try:
         return octree_from_streams(streams, header.resolution)
@@ -133,7 +139,12 @@ def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
         raise PacketError(f"map packet damaged: {error}") from error
 
 
-def _unpack(payload: bytes, size: int) -> bytes:
+def _array(content: memoryview, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """The little-endian numbers of a part of a payload; copied where it is not aligned."""
+    return np.require(np.frombuffer(content, np.dtype(dtype).newbyteorder("<")), dtype, "A")
+
+
+def _unpack(payload: memoryview, size: int) -> bytes:
     """The content of one zstd frame, which must say itself that it holds ``size`` bytes."""
     try:
         parameters = zstandard.get_frame_parameters(payload)

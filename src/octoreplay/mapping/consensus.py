@@ -10,6 +10,7 @@ import numpy as np
 from octoreplay.config import ConsensusConfig
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.kernels.consensus import OWN
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float32Array, Int64Array, UInt8Array
 
@@ -46,6 +47,7 @@ def consensus_step(
     revision: int,
     base: SemanticOctree | None = None,
     last_log_likelihood: SemanticOctree | None = None,
+    since: int | None = None,
 ) -> float:
     """One iteration, in place in ``own``; returns the largest change of a log-odds.
 
@@ -60,18 +62,26 @@ def consensus_step(
     - ``local``: h_i = log q_i.
 
     h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same step done cell by cell.
+
+    With ``since``, the ``revision`` of an earlier step with the same rule, gamma, weights and neighbours, the bricks
+    at rest are skipped: those that no map has given a revision from ``since`` on. That step changed nothing in them,
+    so this one would not either. All maps' revisions must then be right, the decoded ones' included.
     """
-    sources = (log_likelihood, *neighbours)
-    known_changed = _take_known(own, sources)
-    codes = own.codes
     columns = [own, own if base is None else base, log_likelihood]
     columns += [log_likelihood if last_log_likelihood is None else last_log_likelihood, *neighbours]
-    _, tiers = address_table(columns, codes)
-    needed = np.empty(codes.size, np.uint8)
-    consensus_kernels.needed_tiers(tiers, needed)
-    own.raise_tiers(needed)
+    known_changed = _take_known(own, [(octree, _changed(octree, since)) for octree in (log_likelihood, *neighbours)])
+    rows = _changed_rows(own, columns, since)
+    codes = own.codes[rows]
     addresses, tiers = address_table(columns, codes)
-    changes = np.empty(codes.size, np.float32)
+    needed = _needed_tiers(tiers)
+    if (needed > tiers[:, OWN]).any():
+        all_needed = own.bricks.tiers[: own.num_bricks].copy()
+        all_needed[rows] = needed
+        own.raise_tiers(all_needed)
+        for column, octree in enumerate(columns):
+            if octree is own:
+                addresses[:, column], tiers[:, column] = own.addresses(rows)
+    changes = np.empty(rows.size, np.float32)
     consensus_kernels.consensus_step(
         addresses,
         tiers,
@@ -79,27 +89,59 @@ def consensus_step(
         _RULES[rule],
         np.float32(gamma),
         own.num_classes,
+        np.empty((5 * own.num_classes + 3) * storage.BRICK_CELLS, np.float32),
         changes,
     )
-    consensus_kernels.finish_step(own.bricks, changes, known_changed, revision)
+    all_changes = np.zeros(own.num_bricks, np.float32)
+    all_changes[rows] = changes
+    consensus_kernels.finish_step(own.bricks, all_changes, known_changed, revision)
     return float(changes.max(initial=0.0))
 
 
-def _take_known(own: SemanticOctree, sources: Sequence[SemanticOctree]) -> UInt8Array:
-    """Add the cells that the sources know to the robot's map; a flag (n,) for each brick where that changed it."""
-    indices = [own.find_or_add(source.codes) for source in sources]
-    changed = np.zeros(own.num_bricks, np.uint8)
-    for source, places in zip(sources, indices, strict=True):
-        changed[places] |= storage.merge_known(own.bricks.known, places, source.known)
-    return changed
+def _take_known(own: SemanticOctree, sources: Sequence[tuple[SemanticOctree, Int64Array | slice]]) -> UInt8Array:
+    """Add the cells of the sources' chosen bricks to the robot's map; a flag (n,) for each brick that this changed."""
+    places = [own.find_or_add(source.codes[chosen]) for source, chosen in sources]
+    known_changed = np.zeros(own.num_bricks, np.uint8)
+    for (source, chosen), indices in zip(sources, places, strict=True):
+        known_changed[indices] |= storage.merge_known(own.bricks.known, indices, source.known[chosen])
+    return known_changed
+
+
+def _changed_rows(own: SemanticOctree, octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
+    """The robot's own bricks (n,) that changed in any of the octrees ``since`` then; None: all of them."""
+    if since is None:
+        return np.arange(own.num_bricks)
+    changed = np.zeros(own.num_bricks, np.bool_)
+    for octree in octrees:
+        indices = own.find(octree.codes[_changed(octree, since)])
+        changed[indices[indices >= 0]] = True
+    return np.flatnonzero(changed)
+
+
+def _changed(octree: SemanticOctree, since: int | None) -> Int64Array | slice:
+    """The octree's bricks that changed ``since`` then; None: all of them."""
+    return slice(None) if since is None else np.flatnonzero(octree.revisions >= since)
+
+
+def _needed_tiers(tiers: UInt8Array) -> UInt8Array:
+    """The highest tier (n,) that is present in each row of ``tiers`` (n, columns)."""
+    needed = np.empty(len(tiers), np.uint8)
+    consensus_kernels.needed_tiers(tiers, needed)
+    return needed
 
 
 def address_table(octrees: Sequence[SemanticOctree], codes: Int64Array) -> tuple[Int64Array, UInt8Array]:
     """Memory addresses and tiers (n, len(octrees)) of the bricks ``codes`` (n,); valid until an octree grows."""
     addresses = np.empty((codes.size, len(octrees)), np.int64)
     tiers = np.empty((codes.size, len(octrees)), np.uint8)
+    first: dict[int, int] = {}
     for column, octree in enumerate(octrees):
-        addresses[:, column], tiers[:, column] = octree.addresses(octree.find(codes))
+        # An octree may be there twice; its second column is a copy.
+        same = first.setdefault(id(octree), column)
+        if same < column:
+            addresses[:, column], tiers[:, column] = addresses[:, same], tiers[:, same]
+        else:
+            addresses[:, column], tiers[:, column] = octree.addresses(octree.find(codes))
     return addresses, tiers
 
 
@@ -112,8 +154,7 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
     octrees = [entry.octree for entry in evidence]
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     addresses, tiers = address_table([*octrees, *counts], codes)
-    needed = np.empty(codes.size, np.uint8)
-    consensus_kernels.needed_tiers(tiers, needed)
+    needed = _needed_tiers(tiers)
     all_needed = target.bricks.tiers[: target.num_bricks].copy()
     all_needed[indices] = np.maximum(all_needed[indices], needed)
     target.raise_tiers(all_needed)

@@ -10,8 +10,9 @@ import numpy as np
 
 from octoreplay.mapping.consensus import address_table
 from octoreplay.mapping.kernels import metrics as metrics_kernels
+from octoreplay.mapping.kernels.storage import BRICK_CELLS
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import BoolArray, Float64Array, Int64Array
+from octoreplay.records import Float64Array, Int32Array, Int64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +37,13 @@ class MapComparer:
     """
 
     def __init__(self, num_robots: int, prior: float) -> None:
-        self._num_robots = num_robots
         self._prior = prior
-        self._codes: Int64Array = np.empty(0, np.int64)
-        self._distances: Float64Array = np.empty((0, 2))
-        self._counts: Int64Array = np.empty((0, 3 + 3 * num_robots), np.int64)
-        self._entropies: Float64Array = np.empty((0, num_robots))
+        # A brick's place in this octree is its row in the tables below.
+        self._bricks = SemanticOctree(1.0, 1)
         self._links: Int64Array | None = None
-        self._link_cells: Int64Array = np.empty((0, 0), np.int64)
+        self._distances: Float64Array = np.empty((0, 2))
+        self._counts: Int32Array = np.empty((0, 4 + 3 * num_robots), np.int32)
+        self._entropies: Float64Array = np.empty((0, num_robots))
 
     def compare(
         self,
@@ -52,47 +52,34 @@ class MapComparer:
         links: Sequence[tuple[int, int]],
         since: int,
     ) -> MapComparison:
-        """The comparison; bricks whose revisions are all below ``since`` keep what was found before."""
-        codes = np.unique(np.concatenate([octree.codes for octree in (*maps, oracle)]))
+        """The comparison; bricks whose revisions are all below ``since`` keep what was found before.
+
+        ``links`` names each linked pair of robots once.
+        """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
-        stale = self._adopt(codes)
+        rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]
+        stale = np.zeros(self._bricks.num_bricks, np.bool_)
+        stale[np.concatenate(rows)] = True
         if self._links is None or not np.array_equal(self._links, link_ends):
             stale[:] = True
             self._links = link_ends
-            self._link_cells = np.zeros((codes.size, len(link_ends)), np.int64)
-        for octree in (*maps, oracle):
-            changed = octree.codes[octree.revisions >= since]
-            stale[np.searchsorted(codes, changed)] = True
+        for name in ("_distances", "_counts", "_entropies"):
+            old = getattr(self, name)
+            if len(old) < len(stale):
+                setattr(self, name, np.concatenate([old, np.zeros((len(stale) - len(old), old.shape[1]), old.dtype)]))
         self._refresh(maps, oracle, np.flatnonzero(stale), link_ends)
         return self._result()
-
-    def _adopt(self, codes: Int64Array) -> BoolArray:
-        """Make room for the bricks ``codes`` (n,), sorted; a flag for those that are new."""
-        places = np.searchsorted(codes, self._codes)
-        new = np.ones(codes.size, np.bool_)
-        new[places] = False
-        if codes.size > self._codes.size:
-            for name in ("_distances", "_counts", "_entropies", "_link_cells"):
-                old = getattr(self, name)
-                larger = np.zeros((codes.size, old.shape[1]), old.dtype)
-                larger[places] = old
-                setattr(self, name, larger)
-            self._codes = codes
-        return new
 
     def _refresh(
         self, maps: Sequence[SemanticOctree], oracle: SemanticOctree, rows: Int64Array, link_ends: Int64Array
     ) -> None:
-        """Compare the bricks ``rows`` anew."""
-        codes = self._codes[rows]
+        """Compare the bricks ``rows`` (n,) anew."""
+        codes = self._bricks.codes[rows]
         addresses, tiers = address_table([*maps, oracle], codes)
         known = np.zeros((rows.size, len(maps)), np.uint64)
         for robot, octree in enumerate(maps):
-            found = octree.find(codes)
-            known[found >= 0, robot] = octree.known[found[found >= 0]]
-        distances = np.empty((rows.size, 2))
-        counts = np.empty((rows.size, self._counts.shape[1]), np.int64)
-        entropies = np.empty((rows.size, len(maps)))
+            indices = octree.find(codes)
+            known[indices >= 0, robot] = octree.known[indices[indices >= 0]]
         metrics_kernels.compare_maps(
             addresses,
             tiers,
@@ -100,22 +87,19 @@ class MapComparer:
             link_ends,
             np.float32(self._prior),
             maps[0].num_classes,
-            distances,
-            counts,
-            entropies,
+            np.empty(((len(maps) + 1) * maps[0].num_classes + 5, BRICK_CELLS), np.float32),
+            np.empty((5, BRICK_CELLS), np.int32),
+            rows,
+            self._distances,
+            self._counts,
+            self._entropies,
         )
-        self._distances[rows] = distances
-        self._counts[rows] = counts
-        self._entropies[rows] = entropies
-        for column, (a, b) in enumerate(link_ends):
-            either = known[:, a] | known[:, b]
-            self._link_cells[rows, column] = np.bitwise_count(either)
 
     def _result(self) -> MapComparison:
         """The sums over all bricks."""
         distances = self._distances.sum(axis=0)
-        counts = self._counts.sum(axis=0)
-        per_robot = counts[3:].reshape(-1, 3)
+        counts = self._counts.sum(axis=0, dtype=np.int64)
+        per_robot = counts[4:].reshape(-1, 3)
         cells = per_robot[:, 0]
         entropies = self._entropies.sum(axis=0) / math.log(2.0)
         return MapComparison(
@@ -123,7 +107,7 @@ class MapComparer:
             total_distance_all=float(distances[1]),
             num_known_cells=int(counts[0]),
             label_disagreement=float(counts[2] / counts[0]) if counts[0] else 0.0,
-            num_link_cells=int(self._link_cells.sum()),
+            num_link_cells=int(counts[3]),
             num_cells=cells,
             agreement=_share(per_robot[:, 1], counts[0]),
             agreement_occupied=_share(per_robot[:, 2], counts[1]),

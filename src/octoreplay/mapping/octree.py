@@ -177,22 +177,32 @@ class SemanticOctree:
         Eight sibling leaves whose values differ by at most ``tolerance`` are one leaf; without ``prune`` every known
         finest cell is a leaf.
         """
-        chosen = np.arange(self.num_bricks) if indices is None else indices
-        order = chosen[np.argsort(self.bricks.codes[chosen], kind="stable")]
+        order = _code_order(self, indices)
         tiers = self.bricks.tiers[order]
-        num_vector = int(np.count_nonzero(tiers == storage.VECTOR))
-        num_uniform = int(np.count_nonzero(tiers == storage.UNIFORM)) if prune else 0
-        cells = (order.size - num_uniform) * storage.BRICK_CELLS + num_uniform
-        words = np.empty(order.size * (storage.BRICK_DEPTH + 9), np.uint16)
-        scalars = np.empty(cells, np.float32)
-        vectors = np.empty((num_vector * storage.BRICK_CELLS, self.num_classes), np.float32)
-        totals = packets.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors)
+        num_cells = np.bitwise_count(self.bricks.known[order])
+        num_uniform = np.count_nonzero((tiers == storage.UNIFORM) & (num_cells == storage.BRICK_CELLS)) if prune else 0
+        num_leaves = int(num_cells.sum()) - num_uniform * (storage.BRICK_CELLS - 1)
+        words = np.empty(order.size * (storage.BRICK_DEPTH + 9) + 1, np.uint16)
+        scalars = np.empty(num_leaves + 1, np.float32)
+        vectors = np.empty((int(num_cells[tiers == storage.VECTOR].sum()), self.num_classes), np.float32)
+        totals = np.zeros(3, np.int64)
+        packets.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors, totals)
         return TreeStreams(words[: totals[0]], scalars[: totals[1]], vectors[: totals[2]])
 
-    def leaves(self, prior: float = 0.0) -> LeafTable:
-        """All leaves in Morton order; ``prior`` h_0 is added to the deviations."""
+    def leaves(self, prior: float = 0.0, *, occupied_only: bool = False) -> LeafTable:
+        """All leaves in Morton order, or those that are more likely occupied by some class than free.
+
+        ``prior`` h_0 is added to the deviations.
+        """
         streams = self.streams()
         codes, depths, is_vector = leaf_list(streams)
+        if occupied_only:
+            scalars = streams.scalars + np.float32(prior) > 0
+            vectors = (streams.vectors + np.float32(prior) > 0).any(axis=1)
+            chosen = np.empty(codes.size, np.bool_)
+            chosen[is_vector], chosen[~is_vector] = vectors, scalars
+            codes, depths, is_vector = codes[chosen], depths[chosen], is_vector[chosen]
+            streams = TreeStreams(streams.words, streams.scalars[scalars], streams.vectors[vectors])
         sizes = np.exp2(storage.KEY_BITS - depths.astype(np.float64)) * self.resolution
         keys = np.empty((codes.size, 3), np.int64)
         storage.codes_to_keys(codes, keys)
@@ -224,10 +234,79 @@ class SemanticOctree:
 
 
 def _grown(array: npt.NDArray[Any], used: int, wanted: int) -> npt.NDArray[Any]:
-    """A copy of the first ``used`` rows with room for at least ``wanted``, growing by half."""
-    larger = np.empty((max(wanted, array.shape[0] * 3 // 2, 64), *array.shape[1:]), array.dtype)
+    """A copy of the first ``used`` rows with room for at least ``wanted``; rows never touched take no memory."""
+    larger = np.empty((max(wanted, 2 * array.shape[0], 64), *array.shape[1:]), array.dtype)
     larger[:used] = array[:used]
     return larger
+
+
+def _code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int64Array:
+    """Indices (n,) of the bricks (all, or ``indices``) with any known cell, sorted by their codes."""
+    chosen = np.arange(octree.num_bricks) if indices is None else indices
+    chosen = chosen[octree.bricks.known[chosen] != 0]
+    order: Int64Array = chosen[np.argsort(octree.bricks.codes[chosen])]
+    return order
+
+
+def unpruned_bytes(octree: SemanticOctree) -> int:
+    """Size of the octree's streams without pruning, counted without writing them."""
+    order = _code_order(octree)
+    if order.size == 0:
+        return 0
+    codes, known = octree.bricks.codes[order], octree.bricks.known[order]
+    # A brick opens as many nodes above it as the digits of its code that differ from the last one's, without the last.
+    num_bits = np.frexp((codes[1:] ^ codes[:-1]).astype(np.float64))[1]
+    num_nodes = storage.BRICK_DEPTH + int(((num_bits - 1) // 3).sum())
+    num_words = num_nodes + order.size + np.count_nonzero(known.view(np.uint8))
+    masks = np.empty(order.size, np.uint64)
+    packets.vector_masks(octree.bricks, order, masks)
+    num_vectors = int(np.bitwise_count(masks).sum())
+    num_scalars = int(np.bitwise_count(known).sum()) - num_vectors
+    return int(2 * num_words + 4 * num_scalars + 4 * num_vectors * octree.num_classes)
+
+
+def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A view that cannot be written: what comes from a packet cannot either, and kernels are compiled once for both."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class BrickMasks(NamedTuple):
+    """What words say of the bricks, in code order: first code, number of bricks from there on, masks; (n,) each.
+
+    ``known`` are the known cells, ``starts`` the first cell of each leaf, ``vector`` those of the vector leaves.
+    """
+
+    codes: Int64Array
+    spans: Int64Array
+    known: UInt64Array
+    starts: UInt64Array
+    vector: UInt64Array
+
+    @property
+    def is_leaf(self) -> BoolArray:
+        """Which entries (n,) are one leaf, of one brick or more."""
+        is_leaf: BoolArray = (self.known == storage.ALL_CELLS) & (self.starts == 1)
+        return is_leaf
+
+
+def _brick_masks(streams: TreeStreams) -> BrickMasks:
+    """The bricks of a stream. Raises ValueError when the words are no octree with so many leaves."""
+    size = min(streams.num_leaves, 8 * streams.words.size)
+    arrays = (*np.empty((2, size), np.int64), *np.empty((3, size), np.uint64))
+    found = packets.read_words(_read_only(streams.words), *arrays)
+    masks = BrickMasks(*(array[: max(found, 0)] for array in arrays))
+    num_vectors = np.bitwise_count(masks.vector).sum()
+    num_scalars = np.bitwise_count(masks.starts).sum() - num_vectors
+    if found < 0 or (num_scalars, num_vectors) != (streams.scalars.size, streams.vectors.shape[0]):
+        raise ValueError("the words are no octree with that many leaves")
+    return masks
+
+
+def _cells(masks: UInt64Array) -> BoolArray:
+    """Whether each cell is in its brick's mask: (64 n,) of masks (n,)."""
+    return np.unpackbits(masks.astype("<u8").view(np.uint8), bitorder="little").view(np.bool_)
 
 
 def leaf_list(streams: TreeStreams) -> tuple[Int64Array, Int32Array, BoolArray]:
@@ -235,14 +314,16 @@ def leaf_list(streams: TreeStreams) -> tuple[Int64Array, Int32Array, BoolArray]:
 
     Raises ValueError when the words are no octree with so many leaves.
     """
-    count = streams.num_leaves
-    codes = np.empty(count, np.int64)
-    depths = np.empty(count, np.int32)
-    is_vector = np.empty(count, np.bool_)
-    found = packets.walk_leaves(streams.words, codes, depths, is_vector)
-    if found != count or np.count_nonzero(is_vector) != streams.vectors.shape[0]:
-        raise ValueError("the words are no octree with that many leaves")
-    return codes, depths, is_vector
+    masks = _brick_masks(streams)
+    first_cells = np.flatnonzero(_cells(masks.starts))
+    bricks, cells = first_cells >> storage.CELL_BITS, first_cells & (storage.BRICK_CELLS - 1)
+    codes = masks.codes[bricks] << storage.CELL_BITS | cells
+    # The second cell of a leaf of eight or more is known and starts none.
+    eights = _cells((masks.known & ~masks.starts) >> np.uint64(1))[first_cells]
+    depths = np.int32(storage.KEY_BITS) - eights.astype(np.int32)
+    whole = np.flatnonzero(masks.is_leaf[bricks])
+    depths[whole] = storage.BRICK_DEPTH - np.log2(masks.spans[bricks[whole]]).astype(np.int32) // 3
+    return codes, depths, _cells(masks.vector)[first_cells]
 
 
 def leaf_values(streams: TreeStreams, is_vector: BoolArray) -> Float32Array:
@@ -259,25 +340,18 @@ MAX_BYTES = 1 << 32
 """Most memory for the values of one octree that is built from leaves."""
 
 
-def _num_distinct(ordered: Int64Array) -> int:
-    """Number of distinct values of an array in order."""
-    return int(np.count_nonzero(ordered[1:] != ordered[:-1])) + (ordered.size > 0)
-
-
 def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctree:
-    """The octree of a depth-first stream. Raises ValueError when the stream is no octree."""
-    codes, depths, is_vector = leaf_list(streams)
+    """The octree of a depth-first stream. Raises ValueError when the stream is no octree, or too large a one."""
+    masks = _brick_masks(streams)
     octree = SemanticOctree(resolution, streams.vectors.shape[1])
-    large = depths <= storage.BRICK_DEPTH
-    spans = np.int64(1) << (3 * np.maximum(storage.BRICK_DEPTH - depths[large].astype(np.int64), 0))
-    small_codes = codes[~large] >> storage.CELL_BITS
-    num_small = _num_distinct(small_codes)
-    num_bricks = int(spans.sum(dtype=np.float64)) + num_small
+    num_bricks = int(masks.spans.sum())
     if num_bricks > MAX_BRICKS:
         raise ValueError("the stream holds more space than an octree may")
-    num_vector = int(spans[is_vector[large]].sum()) + _num_distinct(small_codes[is_vector[~large]])
-    if (num_small + num_vector * octree.num_classes) * storage.BRICK_CELLS * 4 > MAX_BYTES:
+    is_vector = masks.vector != 0
+    num_vector = int(masks.spans[is_vector].sum())
+    num_scalar = int(np.count_nonzero(~is_vector & ~masks.is_leaf))
+    if (num_scalar + num_vector * octree.num_classes) * storage.BRICK_CELLS * 4 > MAX_BYTES:
         raise ValueError("the stream holds more values than an octree may")
-    octree.reserve(bricks=num_bricks, scalar=num_small, vector=num_vector)
-    packets.fill_from_leaves(octree.bricks, codes, depths, is_vector, streams.scalars, streams.vectors)
+    octree.reserve(bricks=num_bricks, scalar=num_scalar, vector=num_vector)
+    packets.fill_bricks(octree.bricks, *masks, _read_only(streams.scalars), _read_only(streams.vectors))
     return octree

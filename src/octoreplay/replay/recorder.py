@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 
 import numpy as np
 
 from octoreplay.config import RunConfig
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.mapping import codec
-from octoreplay.records import FrameCounts, MapState, RunSummary, TickMetrics
-from octoreplay.replay.tick import Tick
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.records import FrameCounts, LeafTable, MapState, RunSummary, TickMetrics
+from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
 """Every so many stored states of a robot, the first included, is a key frame."""
 
 
 class Recorder:
-    """Writes ticks to a result (or nowhere) and sums them up."""
+    """Writes ticks to a result (or nowhere) and sums them up; robots' maps are encoded in parallel ``threads``."""
 
-    def __init__(self, config: RunConfig, writer: ResultWriter | None) -> None:
+    def __init__(self, config: RunConfig, writer: ResultWriter | None, threads: Executor) -> None:
         self.start_ns = 0
         self.last: Tick | None = None
         self._config = config
         self._writer = writer
+        self._threads = threads
         self._num_states = {robot.robot_id: 0 for robot in config.robots}
         self._state_tick = -1
         self._view_tick = -1
@@ -98,16 +101,15 @@ class Recorder:
 
     def _is_due(self, tick: Tick, every: float) -> bool:
         """True when a multiple of ``every`` seconds of log time fell into the period that ends with this tick."""
-        period = round(self._config.network.publish_period * 1e9)
-        interval = max(round(every * 1e9), 1)
-        elapsed = tick.stamp_ns - self.start_ns
-        return elapsed // interval > (elapsed - period) // interval
+        period_ns = round(self._config.network.publish_period * 1e9)
+        return falls_due(tick.stamp_ns - self.start_ns, period_ns, every)
 
     def _write_states(self, tick: Tick) -> None:
         """Store every robot's map: a key frame now and then, otherwise the bricks that changed since the last state."""
         if self._writer is None:
             return
-        for robot_id, octree in zip(tick.graph.robot_ids, tick.maps, strict=True):
+
+        def encode(robot_id: str, octree: SemanticOctree) -> MapState:
             sequence = self._num_states[robot_id]
             is_key_frame = sequence % STATES_PER_KEY_FRAME == 0
             if is_key_frame:
@@ -115,15 +117,21 @@ class Recorder:
             else:
                 data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self._state_tick))
             base = sequence if is_key_frame else sequence - 1
-            self._writer.write_state(MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data))
-            self._num_states[robot_id] = sequence + 1
+            return MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
+
+        for state in self._threads.map(encode, tick.graph.robot_ids, tick.maps):
+            self._writer.write_state(state)
+            self._num_states[state.robot_id] += 1
         self._state_tick = tick.number
 
     def _write_views(self, tick: Tick) -> None:
         """Store every robot's map for viewing."""
         if self._writer is None:
             return
-        for robot_id, octree in zip(tick.graph.robot_ids, tick.maps, strict=True):
-            prior = self._config.map.prior(octree.num_classes)
-            self._writer.write_view(robot_id, tick.stamp_ns, octree.leaves(prior))
+
+        def occupied(octree: SemanticOctree) -> LeafTable:
+            return octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True)
+
+        for robot_id, leaves in zip(tick.graph.robot_ids, self._threads.map(occupied, tick.maps), strict=True):
+            self._writer.write_view(robot_id, tick.stamp_ns, leaves)
         self._view_tick = tick.number

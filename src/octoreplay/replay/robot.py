@@ -10,7 +10,7 @@ import numpy as np
 from octoreplay.config import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams, octree_from_streams, unpruned_bytes
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -96,19 +96,22 @@ class Robot:
             return self._own_sum.codes.copy()
         return self._own_sum.codes[changed]
 
-    def publish(self) -> PublishedMap:
-        """The robot's map as a packet, with the sizes it would have in other encodings."""
+    def publish(self, *, with_unpruned: bool) -> PublishedMap:
+        """The robot's map as a packet, with the sizes it would have in other encodings.
+
+        Only ``with_unpruned`` is the map without pruning compressed, which takes as long as the packet itself.
+        """
         compress = self._config.network.packet_compression == "zstd"
         resolution = self.map.resolution
         packet = codec.pack(self.streams, resolution, codec.FULL, compress=compress)
-        unpruned = self.map.streams(prune=False)
         return PublishedMap(
             packet=packet,
-            octree=codec.decode_packet(packet),
+            # What decoding the packet gives, without undoing the compression.
+            octree=octree_from_streams(self.streams, resolution),
             octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
             grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + unpruned.num_bytes,
-            unpruned_compressed_bytes=len(codec.pack(unpruned, resolution, codec.FULL, compress=True)),
+            unpruned_bytes=codec.HEADER_BYTES + unpruned_bytes(self.map),
+            unpruned_compressed_bytes=len(codec.encode_packet(self.map, prune=False)) if with_unpruned else 0,
         )
 
     def iterate(

@@ -39,7 +39,7 @@ from octoreplay.replay.graph import (
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.robot import PublishedMap, Robot
-from octoreplay.replay.tick import Tick
+from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import FrameSource, Timeline
 
 CONVERGED = "converged"
@@ -84,7 +84,7 @@ class Session:
         self._oracle = SemanticOctree(config.map.resolution, num_classes)
         self._comparer = MapComparer(len(self._robots), config.map.prior(num_classes))
         self._period_ns = round(config.network.publish_period * 1e9)
-        self._num_threads = num_threads or min(len(self._robots), os.cpu_count() or 1)
+        self.num_threads = num_threads or min(len(self._robots), os.cpu_count() or 1)
         self._graph = build_graph(config.network, self._robot_ids, [False] * len(self._robots))
 
     def ticks(self) -> Iterator[Tick]:
@@ -92,7 +92,7 @@ class Session:
         start_ns = self._timeline.first_stamp_ns
         if start_ns is None:
             raise InputError("no robot has a frame that can be used")
-        with ThreadPoolExecutor(self._num_threads) as self._threads:
+        with ThreadPoolExecutor(self.num_threads) as self._threads:
             number = 0
             while not self._timeline.exhausted or number == 0:
                 yield self._tick(number, start_ns + number * self._period_ns)
@@ -126,7 +126,7 @@ class Session:
                 flags = [i in active for i in range(len(self._robots))]
                 self._graph = build_graph(self.config.network, self._robot_ids, flags)
         graph = self._graph
-        published = self._publish(graph)
+        published = self._publish(graph, number)
         changes = self._iterate(graph, published, gamma_factor, number)
         metrics = self._measure(graph, published, max(changes, default=0.0), number, stamp_ns, settling)
         return Tick(
@@ -155,12 +155,14 @@ class Session:
 
         return tuple(index for index in range(len(self._robots)) if is_active(index))
 
-    def _publish(self, graph: CommunicationGraph) -> tuple[PublishedMap | None, ...]:
+    def _publish(self, graph: CommunicationGraph, number: int) -> tuple[PublishedMap | None, ...]:
         """Every active robot's map as a packet, and decoded once for all its receivers: the bytes are the same."""
         if self.config.consensus.rule == "local":
             return (None,) * len(self._robots)
         talking = [self._robots[index] for index in graph.active]
-        maps = dict(zip(graph.active, self._each(Robot.publish, talking), strict=True))
+        with_unpruned = falls_due(number * self._period_ns, self._period_ns, self.config.output.state_every)
+        packets = self._each(lambda robot: robot.publish(with_unpruned=with_unpruned), talking)
+        maps = dict(zip(graph.active, packets, strict=True))
         return tuple(maps.get(index) for index in range(len(self._robots)))
 
     def _iterate(
@@ -279,8 +281,9 @@ def replay_team(
     with ExitStack() as stack:
         logs = [stack.enter_context(RobotLog(robot, config.time, config.classes)) for robot in config.robots]
         session = Session(config, logs, num_threads=num_threads)
+        threads = stack.enter_context(ThreadPoolExecutor(session.num_threads))
         writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
-        recorder = Recorder(config, writer)
+        recorder = Recorder(config, writer, threads)
         total_ns = _total_ns(logs)
         _check_num_ticks(config, total_ns)
         try:

@@ -23,3 +23,9 @@ class Tick:
     oracle: SemanticOctree
     poses: tuple[RobotPose, ...]
     metrics: TickMetrics
+
+
+def falls_due(elapsed_ns: int, period_ns: int, every: float) -> bool:
+    """True when a multiple of ``every`` seconds fell into the period that ends ``elapsed_ns`` after the start."""
+    interval = max(round(every * 1e9), 1)
+    return elapsed_ns // interval > (elapsed_ns - period_ns) // interval

@@ -30,12 +30,16 @@ def _cache_folder() -> str | None:
         places = [Path(numba.config.CACHE_DIR)]
     for place in places:
         folder = place / f"kernels-{digest.hexdigest()[:16]}"
+        is_new = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:
             continue
         if os.access(folder, os.W_OK):
+            if is_new:
+                logger.info("compiling kernels for this machine, which takes up to half a minute; they are kept")
             return str(folder)
+    logger.warning("no folder for compiled kernels can be written; they are compiled anew in every run")
     return None
 
 

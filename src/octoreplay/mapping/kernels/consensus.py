@@ -1,73 +1,140 @@
-"""One iteration of a consensus rule, and the sum of evidence, brick by brick."""
+"""One iteration of a consensus rule, and the sum of evidence, brick by brick.
+
+The loops run over whole bricks that lie in one piece, so that they become vector instructions. Only integers are
+reduced over lanes: the order of a floating point sum is part of the result.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numba import carray
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.storage import ABSENT, BRICK_CELLS, SCALAR, UNIFORM, VECTOR, collapse, float_pointer
+from octoreplay.mapping.kernels.storage import (
+    ABSENT,
+    BRICK_CELLS,
+    SCALAR,
+    UNIFORM,
+    VECTOR,
+    collapse,
+    float_pointer,
+)
 
 GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
 
+@intrinsic
+# The parameters' names and number are numba's.
+def same_bits(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
+    """The int32 with the bits of a float32, or the float32 with the lowest 32 bits of an integer."""
+    result = types.int32 if isinstance(value, types.Float) else types.float32
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        number = arguments[0]
+        if isinstance(value, types.Integer) and value.bitwidth > result.bitwidth:
+            number = builder.trunc(number, ir.IntType(result.bitwidth))
+        return builder.bitcast(number, context.get_value_type(result))
+
+    return result(value), generate
+
+
+@intrinsic
+# The parameters' names and number are numba's.
+def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:  # noqa: ARG001
+    """The float32 a x b + c, rounded once: one instruction, with the same result on every machine."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        return builder.fma(*arguments)
+
+    return types.float32(types.float32, types.float32, types.float32), generate
+
+
+@inline_kernel
+def exp_negative(x):
+    """Exp of a float32 that is at most 0, within 3e-7 of it; 5e-38 below -86. 2^n times a minimax polynomial."""
+    bounded = max(x, np.float32(-86.0))
+    # Adding 1.5 x 2^23 rounds to an integer, which then stands in the lowest bits.
+    shifted = fma(bounded, np.float32(1.44269504088896341), np.float32(12582912.0))
+    f = fma(shifted - np.float32(12582912.0), np.float32(-0.69314718056), bounded)
+    p = fma(np.float32(0.008312521), f, np.float32(0.041890156))
+    p = fma(p, f, np.float32(0.16667114))
+    p = fma(p, f, np.float32(0.4999923))
+    p = fma(p, f, np.float32(1.0))
+    p = fma(p, f, np.float32(1.0))
+    return same_bits(same_bits(p) + (same_bits(shifted) << np.int32(23)))
+
+
+@intrinsic
+# The parameters' names and number are numba's.
+def _prefetch_line(typing_context: Any, address: Any) -> Any:  # noqa: ARG001
+    """Ask for the cache line at an integer address."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        pointer = builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        fetch = builder.module.declare_intrinsic(
+            "llvm.prefetch", (pointer.type,), ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
+        )
+        # Read, keep in all caches, data.
+        builder.call(fetch, [pointer, number(0), number(2), number(1)])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
 @kernel
-def exp_negative(x, out, powers, scales):
-    """Exp of ``x`` (64,), all at most 0, into ``out``: 2^n times a polynomial (Cephes' expf, Moshier 1992).
-
-    ``powers`` (64,) int32 and ``scales``, the same memory seen as float32, are scratch.
-    """
-    for i in range(x.size):
-        value = max(x[i], np.float32(-87.0))
-        n = np.floor(value * np.float32(1.44269504088896341) + np.float32(0.5))
-        f = value - n * np.float32(0.693359375) + n * np.float32(2.12194440e-4)
-        p = np.float32(1.9875691500e-4)
-        p = p * f + np.float32(1.3981999507e-3)
-        p = p * f + np.float32(8.3334519073e-3)
-        p = p * f + np.float32(4.1665795894e-2)
-        p = p * f + np.float32(1.6666665459e-1)
-        p = p * f + np.float32(5.0000001201e-1)
-        out[i] = p * f * f + f + np.float32(1.0)
-        powers[i] = (np.int32(n) + np.int32(127)) << np.int32(23)
-    for i in range(x.size):
-        out[i] *= scales[i]
+def prefetch(address, tier, num_classes):
+    """Ask for a brick's data ahead of its use: bricks lie in another order in every octree."""
+    if tier == ABSENT:
+        return
+    size = 4 if tier == UNIFORM else BRICK_CELLS * 4
+    if tier == VECTOR:
+        size *= num_classes
+    for offset in range(0, size, 64):
+        _prefetch_line(address + offset)
 
 
-@inline_kernel
-def _add_scaled(target, address, tier, c, factor, num_classes):
-    """Target (64,) += factor x class c of the brick at ``address``."""
-    if tier == UNIFORM:
-        value = carray(float_pointer(address), (1,))[0] * factor
+@kernel
+def load(target, address, tier, width):
+    """Target (width x 64,) = the brick at ``address``, repeated over the classes; 0 where there is none."""
+    if tier == VECTOR or (tier == SCALAR and width == 1):
+        source = carray(float_pointer(address), target.shape)
         for i in range(target.size):
-            target[i] += value
+            target[i] = source[i]
     elif tier == SCALAR:
-        data = carray(float_pointer(address), (BRICK_CELLS,))
+        cells = carray(float_pointer(address), (BRICK_CELLS,))
+        rows = target.reshape((width, BRICK_CELLS))
+        for c in range(width):
+            for i in range(BRICK_CELLS):
+                rows[c, i] = cells[i]
+    else:
+        value = carray(float_pointer(address), (1,))[0] if tier == UNIFORM else np.float32(0.0)
         for i in range(target.size):
-            target[i] += data[i] * factor
-    elif tier == VECTOR:
-        rows = carray(float_pointer(address), (num_classes, BRICK_CELLS))
-        for i in range(target.size):
-            target[i] += rows[c, i] * factor
+            target[i] = value
 
 
-@inline_kernel
-def load(target, address, tier, c, num_classes):
-    """Target (64,) = class c of the brick at ``address``, 0 where there is none."""
-    target[:] = np.float32(0.0)
-    _add_scaled(target, address, tier, c, np.float32(1.0), num_classes)
-
-
-@inline_kernel
-def _load_evidence(target, addresses, tiers, column, count_column, scale, c, counts, num_classes):
-    """Target (64,) = class c of log q: the evidence times ``scale``, or divided by the cells' scan counts."""
-    load(target, addresses[column], tiers[column], c, num_classes)
-    if count_column >= 0:
-        load(counts, addresses[count_column], tiers[count_column], 0, 1)
+@kernel
+def _add_difference(target, base, address, tier, width, weight):
+    """Target (width x 64,) += weight x (the brick at ``address`` - base)."""
+    if tier == VECTOR or (tier == SCALAR and width == 1):
+        source = carray(float_pointer(address), target.shape)
         for i in range(target.size):
-            target[i] /= max(counts[i], np.float32(1.0))
-    elif scale != np.float32(1.0):
+            target[i] = fma(source[i] - base[i], weight, target[i])
+    elif tier == SCALAR:
+        cells = carray(float_pointer(address), (BRICK_CELLS,))
+        rows = target.reshape((width, BRICK_CELLS))
+        base_rows = base.reshape((width, BRICK_CELLS))
+        for c in range(width):
+            for i in range(BRICK_CELLS):
+                rows[c, i] = fma(cells[i] - base_rows[c, i], weight, rows[c, i])
+    else:
+        value = carray(float_pointer(address), (1,))[0] if tier == UNIFORM else np.float32(0.0)
         for i in range(target.size):
-            target[i] *= scale
+            target[i] = fma(value - base[i], weight, target[i])
 
 
 OWN, BASE, EVIDENCE, OLD_EVIDENCE, NEIGHBOURS = 0, 1, 2, 3, 4
@@ -75,89 +142,104 @@ OWN, BASE, EVIDENCE, OLD_EVIDENCE, NEIGHBOURS = 0, 1, 2, 3, 4
 differences), its evidence log q, its evidence at the last iteration, then the neighbours' maps."""
 
 
+PREFETCH_AHEAD = 6
+"""Bricks between the one that is asked for and the one in work: about a microsecond."""
+
+
 @kernel
-def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, changes):
+def _add_gradient(mixed_at, delta_at, sigma_at, top_at, width, terms, gamma):
+    """Mixed (width, 64) += gamma x the gradient, with ``delta`` (width, 64) = h~ - log q; all given by address.
+
+    Every row stands for ``terms`` equal classes. ``sigma`` (width, 64) and ``top`` (3, 64) are scratch.
+    """
+    mixed = carray(float_pointer(mixed_at), (width, BRICK_CELLS))
+    delta = carray(float_pointer(delta_at), (width, BRICK_CELLS))
+    sigma = carray(float_pointer(sigma_at), (width, BRICK_CELLS))
+    top = carray(float_pointer(top_at), (BRICK_CELLS,))
+    total = carray(float_pointer(top_at + BRICK_CELLS * 4), (BRICK_CELLS,))
+    dot = carray(float_pointer(top_at + BRICK_CELLS * 8), (BRICK_CELLS,))
+    for i in range(BRICK_CELLS):
+        top[i] = np.float32(0.0)
+        total[i] = np.float32(0.0)
+        dot[i] = np.float32(0.0)
+    for c in range(width):
+        for i in range(BRICK_CELLS):
+            top[i] = max(top[i], mixed[c, i])
+    for c in range(width):
+        for i in range(BRICK_CELLS):
+            share = exp_negative(mixed[c, i] - top[i])
+            sigma[c, i] = share
+            total[i] += share
+            dot[i] = fma(share, delta[c, i], dot[i])
+    for i in range(BRICK_CELLS):
+        share = np.float32(1.0) / fma(terms, total[i], exp_negative(-top[i]))
+        dot[i] *= terms * share
+        total[i] = gamma * share
+    for c in range(width):
+        for i in range(BRICK_CELLS):
+            mixed[c, i] = fma(sigma[c, i] * total[i], dot[i] - delta[c, i], mixed[c, i])
+
+
+@kernel
+def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, scratch, changes):
     """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
 
     ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of
-    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``changes`` (n,) gets each brick's largest change.
+    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``scratch`` has room for 5 bricks of all classes and 3 of
+    one. ``changes`` (n,) gets each brick's largest change.
     All classes of a brick that is not VECTOR are equal; the sums over classes then are ``num_classes`` times one term.
     """
-    num_neighbours = weights.size
-    mixed = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    delta = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    sigma = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    base = np.empty(BRICK_CELLS, dtype=np.float32)
-    other = np.empty(BRICK_CELLS, dtype=np.float32)
-    top = np.empty(BRICK_CELLS, dtype=np.float32)
-    total = np.empty(BRICK_CELLS, dtype=np.float32)
-    dot = np.empty(BRICK_CELLS, dtype=np.float32)
-    moved = np.empty(BRICK_CELLS, dtype=np.float32)
-    powers = np.empty(BRICK_CELLS, dtype=np.int32)
-    scales = powers.view(np.float32)
+    own_at, room = np.int64(scratch.ctypes.data), num_classes * BRICK_CELLS * 4
+    mixed_at, delta_at, sigma_at, top_at = own_at + room, own_at + 2 * room, own_at + 3 * room, own_at + 5 * room
+    last = addresses.shape[0] - 1
     for b in range(addresses.shape[0]):
+        ahead = min(b + PREFETCH_AHEAD, last)
         tier = tiers[b, OWN]
         width = num_classes if tier == VECTOR else 1
         terms = np.float32(1.0) if tier == VECTOR else np.float32(num_classes)
-        cells = 1 if tier == UNIFORM else BRICK_CELLS
-        top[:] = np.float32(0.0)
-        for c in range(width):
-            row = mixed[c, :cells]
-            load(row, addresses[b, OWN], tier, c, num_classes)
-            load(base[:cells], addresses[b, BASE], tiers[b, BASE], c, num_classes)
-            other[:cells] = np.float32(0.0)
-            for j in range(num_neighbours):
-                if tiers[b, NEIGHBOURS + j] == ABSENT:
-                    for i in range(cells):
-                        other[i] -= base[i] * weights[j]
-                else:
-                    load(total[:cells], addresses[b, NEIGHBOURS + j], tiers[b, NEIGHBOURS + j], c, num_classes)
-                    for i in range(cells):
-                        other[i] += (total[i] - base[i]) * weights[j]
-            for i in range(cells):
-                row[i] += other[i]
-                top[i] = max(top[i], row[i])
-            if rule == BAYES:
-                _add_scaled(row, addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, np.float32(1.0), num_classes)
-                _add_scaled(row, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], c, np.float32(-1.0), num_classes)
-            elif rule == LOCAL:
-                load(row, addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, num_classes)
-            else:
-                load(other[:cells], addresses[b, EVIDENCE], tiers[b, EVIDENCE], c, num_classes)
-                for i in range(cells):
-                    delta[c, i] = row[i] - other[i]
-        if rule == NATURAL:
-            for c in range(width):
-                for i in range(cells):
-                    mixed[c, i] -= gamma * delta[c, i]
-        elif rule == GRADIENT and gamma != np.float32(0.0):
-            for i in range(cells):
-                base[i] = -top[i]
-            exp_negative(base[:cells], total[:cells], powers[:cells], scales[:cells])
-            dot[:] = np.float32(0.0)
-            for c in range(width):
-                for i in range(cells):
-                    base[i] = mixed[c, i] - top[i]
-                exp_negative(base[:cells], sigma[c, :cells], powers[:cells], scales[:cells])
-                for i in range(cells):
-                    total[i] += terms * sigma[c, i]
-                    dot[i] += terms * sigma[c, i] * delta[c, i]
-            for i in range(cells):
-                total[i] = np.float32(1.0) / total[i]
-                dot[i] *= total[i]
-            for c in range(width):
-                for i in range(cells):
-                    mixed[c, i] += gamma * (sigma[c, i] * total[i]) * (dot[i] - delta[c, i])
-        moved[:cells] = np.float32(0.0)
-        for c in range(width):
-            target = carray(float_pointer(addresses[b, OWN] + c * BRICK_CELLS * 4), (cells,))
-            for i in range(cells):
-                moved[i] = max(moved[i], abs(mixed[c, i] - target[i]))
-                target[i] = mixed[c, i]
-        largest = np.float32(0.0)
-        for i in range(cells):
-            largest = max(largest, moved[i])
-        changes[b] = largest
+        size = width * BRICK_CELLS
+        own = carray(float_pointer(own_at), (size,))
+        mixed = carray(float_pointer(mixed_at), (size,))
+        delta = carray(float_pointer(delta_at), (size,))
+        prefetch(addresses[ahead, OWN], tiers[ahead, OWN], num_classes)
+        load(own, addresses[b, OWN], tier, width)
+        base = own
+        if addresses[b, BASE] != addresses[b, OWN]:
+            base = carray(float_pointer(own_at + 4 * room), (size,))
+            load(base, addresses[b, BASE], tiers[b, BASE], width)
+        # The sum of the differences comes first: it is exactly 0 where all maps agree.
+        mixed[:] = np.float32(0.0)
+        for j in range(weights.size):
+            column = NEIGHBOURS + j
+            prefetch(addresses[ahead, column], tiers[ahead, column], num_classes)
+            _add_difference(mixed, base, addresses[b, column], tiers[b, column], width, weights[j])
+        prefetch(addresses[ahead, EVIDENCE], tiers[ahead, EVIDENCE], num_classes)
+        load(delta, addresses[b, EVIDENCE], tiers[b, EVIDENCE], width)
+        if rule == LOCAL:
+            mixed[:] = delta
+        elif rule == BAYES:
+            old = carray(float_pointer(sigma_at), (size,))
+            load(old, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], width)
+            for i in range(size):
+                mixed[i] += own[i] + (delta[i] - old[i])
+        else:
+            for i in range(size):
+                mixed[i] += own[i]
+                delta[i] = mixed[i] - delta[i]
+            if rule == NATURAL:
+                for i in range(size):
+                    mixed[i] -= gamma * delta[i]
+            elif gamma != np.float32(0.0):
+                _add_gradient(mixed_at, delta_at, sigma_at, top_at, width, terms, gamma)
+        # Numbers that are not negative are in the order of their bits.
+        largest = np.int32(0)
+        for i in range(size):
+            largest = max(largest, same_bits(abs(mixed[i] - own[i])))
+        changes[b] = same_bits(largest)
+        if largest > 0:
+            target = carray(float_pointer(addresses[b, OWN]), (size,))
+            for i in range(1 if tier == UNIFORM else size):
+                target[i] = mixed[i]
 
 
 @kernel
@@ -188,21 +270,24 @@ def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targ
     ``count_tiers_offset`` is N, and -1 means that the evidence is multiplied by ``scales`` (N,).
     """
     robots = scales.size
-    total = np.empty(BRICK_CELLS, dtype=np.float32)
-    term = np.empty(BRICK_CELLS, dtype=np.float32)
-    counts = np.empty(BRICK_CELLS, dtype=np.float32)
+    all_terms = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
+    all_counts = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
+    all_totals = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
     for b in range(addresses.shape[0]):
         width = num_classes if target_tiers[b] == VECTOR else 1
-        cells = 1 if target_tiers[b] == UNIFORM else BRICK_CELLS
-        for c in range(width):
-            total[:] = np.float32(0.0)
-            for r in range(robots):
-                count_column = count_tiers_offset + r if count_tiers_offset >= 0 else -1
-                _load_evidence(
-                    term[:cells], addresses[b], tiers[b], r, count_column, scales[r], c, counts[:cells], num_classes
-                )
-                for i in range(cells):
-                    total[i] += term[i]
-            out = carray(float_pointer(targets[b] + c * BRICK_CELLS * 4), (cells,))
-            for i in range(cells):
-                out[i] = total[i]
+        size = width * BRICK_CELLS
+        term, count, total = all_terms[:size], all_counts[:size], all_totals[:size]
+        total[:] = np.float32(0.0)
+        for r in range(robots):
+            load(term, addresses[b, r], tiers[b, r], width)
+            count[:] = np.float32(1.0)
+            if count_tiers_offset >= 0:
+                # Counts are an octree of one class: its VECTOR bricks have one row, like the SCALAR ones.
+                column = count_tiers_offset + r
+                count_tier = SCALAR if tiers[b, column] == VECTOR else tiers[b, column]
+                load(count, addresses[b, column], count_tier, width)
+            for i in range(size):
+                total[i] += term[i] * scales[r] / max(count[i], np.float32(1.0))
+        out = carray(float_pointer(targets[b]), (size,))
+        for i in range(1 if target_tiers[b] == UNIFORM else size):
+            out[i] = total[i]

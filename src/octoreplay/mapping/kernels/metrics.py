@@ -1,136 +1,208 @@
-"""The maps of a team compared brick by brick."""
+"""The maps of a team compared brick by brick, in loops over the cells of a brick that become vector instructions."""
 
 from __future__ import annotations
 
 import numpy as np
+from numba import carray
 
-from octoreplay.mapping.kernels.compiler import kernel
-from octoreplay.mapping.kernels.consensus import exp_negative, load
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR
+from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
+from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, fma, load, prefetch, same_bits
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR, float_pointer
+
+
+@inline_kernel
+def _log(x):
+    """Natural logarithm of a float32 from 1 to 1e30: exponent and polynomial (Cephes' logf, Moshier 1992)."""
+    # The exponent counts from sqrt(1/2), so that the mantissa m lies in [sqrt(1/2), sqrt(2)).
+    exponent = (same_bits(x) - np.int32(0x3F3504F3)) >> np.int32(23)
+    m = same_bits(same_bits(x) - (exponent << np.int32(23))) - np.float32(1.0)
+    p = np.float32(7.0376836292e-2)
+    p = p * m - np.float32(1.1514610310e-1)
+    p = p * m + np.float32(1.1676998740e-1)
+    p = p * m - np.float32(1.2420140846e-1)
+    p = p * m + np.float32(1.4249322787e-1)
+    p = p * m - np.float32(1.6668057665e-1)
+    p = p * m + np.float32(2.0000714765e-1)
+    p = p * m - np.float32(2.4999993993e-1)
+    p = p * m + np.float32(3.3333331174e-1)
+    return (p * m - np.float32(0.5)) * m * m + m + np.float32(exponent) * np.float32(0.69314718056)
 
 
 @kernel
-def _brick_labels(address, tier, prior, num_classes, labels, best, row):
-    """Argmax class (64,) of a brick and its log-odds; free is 0, ties go to the lower id."""
-    labels[:] = 0
-    best[:] = np.float32(0.0)
-    width = num_classes if tier == VECTOR else 1
-    for c in range(width):
-        load(row, address, tier, c, num_classes)
+def _count_bits(mask):
+    """Number of ones in a uint64."""
+    x = mask - (mask >> np.uint64(1) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + (x >> np.uint64(2) & np.uint64(0x3333333333333333))
+    x = x + (x >> np.uint64(4)) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64(x * np.uint64(0x0101010101010101) >> np.uint64(56))
+
+
+@kernel
+def _total(cells):
+    """Sum of ``cells`` (64,) float32 in a fixed order."""
+    for i in range(8):
+        cells[i] += cells[i + 8] + cells[i + 16] + cells[i + 24]
+        cells[i] += cells[i + 32] + cells[i + 40] + cells[i + 48] + cells[i + 56]
+    total = 0.0
+    for i in range(8):
+        total += cells[i]
+    return total
+
+
+@kernel
+def _label_cells(rows, oracle, prior, labels, best, oracle_there):
+    """Argmax class (64,) of a brick (width, 64) and its log-odds; free is 0, ties go to the lower id.
+
+    ``oracle_there`` gets the log-odds that the oracle (width, 64) gives to this class.
+    """
+    for i in range(BRICK_CELLS):
+        labels[i] = np.int32(0)
+        best[i] = np.float32(0.0)
+        oracle_there[i] = np.float32(0.0)
+    for c in range(rows.shape[0]):
         for i in range(BRICK_CELLS):
-            value = row[i] + prior
+            value = rows[c, i] + prior
             higher = value > best[i]
-            labels[i] = np.uint8(c + 1) if higher else labels[i]
+            labels[i] = np.int32(c + 1) if higher else labels[i]
+            oracle_there[i] = oracle[c, i] + prior if higher else oracle_there[i]
             best[i] = value if higher else best[i]
 
 
 @kernel
-def compare_maps(addresses, tiers, known, link_ends, prior, num_classes, distances, counts, entropies):
-    """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``addresses``) and the oracle (column N).
-
-    ``known`` (n, N) are the robots' masks and ``link_ends`` (L, 2) the links' robots. Outputs per brick:
-    ``distances`` (n, 2): sum of squared differences over the links, and over all pairs of robots;
-    ``counts`` (n, 3 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
-    labels; then per robot known cells, agreeing cells, agreeing cells that the oracle calls occupied;
-    ``entropies`` (n, N): sum over the robot's known cells in nats.
-    """
-    robots = known.shape[1]
-    labels = np.empty((robots + 1, BRICK_CELLS), dtype=np.uint8)
-    best = np.empty(BRICK_CELLS, dtype=np.float32)
-    best_oracle = np.empty(BRICK_CELLS, dtype=np.float32)
-    rows = np.empty((robots, BRICK_CELLS), dtype=np.float32)
-    row = np.empty(BRICK_CELLS, dtype=np.float32)
-    oracle = np.empty((num_classes + 1, BRICK_CELLS), dtype=np.float32)
-    seen = np.empty((robots, BRICK_CELLS), dtype=np.bool_)
-    powers = np.empty(BRICK_CELLS, dtype=np.int32)
-    scales = powers.view(np.float32)
-    exps = np.empty(BRICK_CELLS, dtype=np.float32)
-    total = np.empty(BRICK_CELLS, dtype=np.float32)
-    weighted = np.empty(BRICK_CELLS, dtype=np.float32)
-    for b in range(addresses.shape[0]):
-        for r in range(robots):
-            _brick_labels(addresses[b, r], tiers[b, r], prior, num_classes, labels[r], best, row)
-            for i in range(BRICK_CELLS):
-                seen[r, i] = (known[b, r] >> np.uint64(i)) & np.uint64(1)
-            width = num_classes if tiers[b, r] == VECTOR else 1
-            terms = np.float32(1.0) if tiers[b, r] == VECTOR else np.float32(num_classes)
-            for i in range(BRICK_CELLS):
-                exps[i] = -best[i]
-            exp_negative(exps, total, powers, scales)
-            weighted[:] = np.float32(0.0)
-            for c in range(width):
-                load(row, addresses[b, r], tiers[b, r], c, num_classes)
-                for i in range(BRICK_CELLS):
-                    row[i] += prior - best[i]
-                exp_negative(row, exps, powers, scales)
-                for i in range(BRICK_CELLS):
-                    total[i] += terms * exps[i]
-                    weighted[i] += terms * exps[i] * (row[i] + best[i])
-            entropy = 0.0
-            for i in range(BRICK_CELLS):
-                if seen[r, i]:
-                    entropy += best[i] + np.log(total[i]) - weighted[i] / total[i]
-            entropies[b, r] = entropy
-        _brick_labels(addresses[b, robots], tiers[b, robots], prior, num_classes, labels[robots], best_oracle, row)
-        oracle[0, :] = np.float32(0.0)
-        for c in range(num_classes):
-            load(oracle[c + 1], addresses[b, robots], tiers[b, robots], c, num_classes)
-            for i in range(BRICK_CELLS):
-                oracle[c + 1, i] += prior
-        counts[b, :] = 0
+def _brick_entropy(rows, terms, prior, best, seen, total, weighted):
+    """Sum of the entropies of the cells with ``seen`` (64,) 1, in nats; a row stands for ``terms`` equal classes."""
+    for i in range(BRICK_CELLS):
+        total[i] = np.float32(0.0)
+        weighted[i] = np.float32(0.0)
+    for c in range(rows.shape[0]):
         for i in range(BRICK_CELLS):
-            anyone = False
-            first = labels[0, i] if seen[0, i] else 255
-            differs = False
-            for r in range(robots):
-                anyone |= seen[r, i]
-                differs |= (labels[r, i] if seen[r, i] else 255) != first
-            if not anyone:
-                continue
-            occupied = labels[robots, i] > 0
-            counts[b, 0] += 1
-            counts[b, 1] += occupied
-            counts[b, 2] += differs
-            for r in range(robots):
-                if seen[r, i]:
-                    agrees = oracle[labels[r, i], i] >= best_oracle[i] - np.float32(1e-3)
-                    counts[b, 3 + 3 * r] += 1
-                    counts[b, 4 + 3 * r] += agrees
-                    counts[b, 5 + 3 * r] += agrees and occupied
-        _brick_distances(addresses[b], tiers[b], link_ends, num_classes, rows, row, weighted, total, distances[b])
+            value = rows[c, i] + prior
+            share = exp_negative(value - best[i])
+            total[i] += share
+            weighted[i] = fma(share, value, weighted[i])
+    for i in range(BRICK_CELLS):
+        whole = fma(terms, total[i], exp_negative(-best[i]))
+        entropy = best[i] + _log(whole) - terms * weighted[i] / whole
+        weighted[i] = entropy if seen[i] > 0 else np.float32(0.0)
+    return _total(weighted)
 
 
 @kernel
-def _brick_distances(
-    addresses, tiers, link_ends, num_classes, rows, mean, over_links, over_pairs, distances
-):  # fmt: skip
-    """Squared differences of one brick, summed over the links and over all pairs: N sum_i ||h_i - mean||^2."""
-    robots = rows.shape[0]
-    width = 1
-    for r in range(robots):
-        if tiers[r] == VECTOR:
-            width = num_classes
-    over_links[:] = np.float32(0.0)
-    over_pairs[:] = np.float32(0.0)
+def _pair_distance(bricks, square, mean):
+    """Squared differences of the robots' bricks (N, width, 64), summed over all pairs of robots.
+
+    With differences d_i to robot 0, which are exact where the maps are close, this is N sum_i d_i^2 - (sum_i d_i)^2.
+    """
+    robots, width, _ = bricks.shape
+    distance = 0.0
     for c in range(width):
-        mean[:] = np.float32(0.0)
-        for r in range(robots):
-            load(rows[r], addresses[r], tiers[r], c, num_classes)
-        # Differences to robot 0 are exact where the maps are close, which a mean of large values would not be.
+        for i in range(BRICK_CELLS):
+            square[i] = np.float32(0.0)
+            mean[i] = np.float32(0.0)
         for r in range(1, robots):
             for i in range(BRICK_CELLS):
-                mean[i] += rows[r, i] - rows[0, i]
+                difference = bricks[r, c, i] - bricks[0, c, i]
+                mean[i] += difference
+                square[i] = fma(difference, difference, square[i])
         for i in range(BRICK_CELLS):
-            mean[i] /= np.float32(robots)
-        for r in range(robots):
+            square[i] = np.float32(robots) * square[i] - mean[i] * mean[i]
+        distance += _total(square)
+    return distance
+
+
+@kernel
+def _link_distance(bricks, link_ends, square):
+    """Squared differences of the robots' bricks (N, width, 64), summed over the links."""
+    for i in range(BRICK_CELLS):
+        square[i] = np.float32(0.0)
+    for k in range(link_ends.shape[0]):
+        a, z = link_ends[k, 0], link_ends[k, 1]
+        for c in range(bricks.shape[1]):
             for i in range(BRICK_CELLS):
-                difference = (rows[r, i] - rows[0, i]) - mean[i]
-                over_pairs[i] += difference * difference
+                difference = bricks[a, c, i] - bricks[z, c, i]
+                square[i] = fma(difference, difference, square[i])
+    return _total(square)
+
+
+@kernel
+def compare_maps(
+    addresses, tiers, known, link_ends, prior, num_classes, scratch, int_scratch, places, distances, counts, entropies
+):
+    """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``addresses``) and the oracle (column N).
+
+    ``known`` (n, N) are the robots' masks and ``link_ends`` (L, 2) the links' robots; ``scratch`` float32 has room for
+    N + 1 bricks of all classes and 5 of one, ``int_scratch`` int32 for 5. Outputs, in the row ``places`` (n,) of each
+    brick: ``distances`` (m, 2): sum of squared differences over the links, and over all pairs of robots;
+    ``counts`` (m, 4 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
+    labels, cells known to either end of each link; then per robot known cells, agreeing cells, agreeing cells that the
+    oracle calls occupied; ``entropies`` (m, N): sum over the robot's known cells in nats.
+    """
+    robots = known.shape[1]
+    is_complete = link_ends.shape[0] == robots * (robots - 1) // 2
+    cells_at = np.int64(scratch.ctypes.data)
+    bricks_at = cells_at + 5 * BRICK_CELLS * 4
+    # Arrays made of addresses, because those that own memory are counted at every use.
+    cells = carray(float_pointer(cells_at), (5, BRICK_CELLS))
+    best, oracle_best, oracle_there, total, weighted = cells[0], cells[1], cells[2], cells[3], cells[4]
+    labels, first, differs, occupied, seen = (
+        int_scratch[0],
+        int_scratch[1],
+        int_scratch[2],
+        int_scratch[3],
+        int_scratch[4],
+    )
+    for b in range(addresses.shape[0]):
+        place = places[b]
+        width = 1
+        anyone = np.uint64(0)
+        for r in range(robots + 1):
+            width = num_classes if tiers[b, r] == VECTOR else width
+            anyone |= known[b, r] if r < robots else np.uint64(0)
+        terms = np.float32(num_classes) if width == 1 else np.float32(1.0)
+        bricks = carray(float_pointer(bricks_at), (robots + 1, width, BRICK_CELLS))
+        rows = carray(float_pointer(bricks_at), (robots + 1, width * BRICK_CELLS))
+        ahead = min(b + PREFETCH_AHEAD, addresses.shape[0] - 1)
+        for r in range(robots + 1):
+            prefetch(addresses[ahead, r], tiers[ahead, r], num_classes)
+            load(rows[r], addresses[b, r], tiers[b, r], width)
+        link_cells = 0
         for k in range(link_ends.shape[0]):
-            a, z = link_ends[k, 0], link_ends[k, 1]
+            link_cells += _count_bits(known[b, link_ends[k, 0]] | known[b, link_ends[k, 1]])
+        oracle = bricks[robots]
+        _label_cells(oracle, oracle, prior, labels, oracle_best, oracle_there)
+        num_occupied = 0
+        for i in range(BRICK_CELLS):
+            in_any = np.int32(anyone >> np.uint64(i) & np.uint64(1))
+            occupied[i] = in_any if labels[i] > 0 else np.int32(0)
+            num_occupied += occupied[i]
+            differs[i] = np.int32(0)
+        for r in range(robots):
+            mask = known[b, r]
             for i in range(BRICK_CELLS):
-                difference = rows[a, i] - rows[z, i]
-                over_links[i] += difference * difference
-    repeats = num_classes if width == 1 else 1
-    distances[0] = over_links.sum() * repeats
-    distances[1] = over_pairs.sum() * repeats * robots
+                seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
+            _label_cells(bricks[r], oracle, prior, labels, best, oracle_there)
+            entropies[place, r] = _brick_entropy(bricks[r], terms, prior, best, seen, total, weighted)
+            agreeing, agreeing_occupied = 0, 0
+            for i in range(BRICK_CELLS):
+                agrees = seen[i] if oracle_there[i] >= oracle_best[i] - np.float32(1e-3) else np.int32(0)
+                agreeing += agrees
+                agreeing_occupied += agrees & occupied[i]
+                # An unknown cell has a label of its own.
+                label = labels[i] if seen[i] > 0 else np.int32(-1)
+                first[i] = label if r == 0 else first[i]
+                differs[i] |= label ^ first[i]
+            counts[place, 4 + 3 * r] = _count_bits(mask)
+            counts[place, 5 + 3 * r] = agreeing
+            counts[place, 6 + 3 * r] = agreeing_occupied
+        num_differing = 0
+        for i in range(BRICK_CELLS):
+            num_differing += differs[i] != 0
+        counts[place, 0] = _count_bits(anyone)
+        counts[place, 1] = num_occupied
+        counts[place, 2] = num_differing
+        counts[place, 3] = link_cells
+        repeats = num_classes if width == 1 else 1
+        distances[place, 1] = repeats * _pair_distance(bricks[:robots], total, weighted)
+        distances[place, 0] = distances[place, 1]
+        if not is_complete:
+            distances[place, 0] = repeats * _link_distance(bricks, link_ends, total)
