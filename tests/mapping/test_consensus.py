@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
+from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.replay.session import CONVERGED, Session
 from octree_factory import cells_of, cube, octree_of
@@ -138,6 +139,62 @@ def test_a_step_without_change_marks_nothing():
     same = octree.copy()
     assert consensus_step(octree, [same], [0.5], same, rule="natural", gamma=0.5, revision=9) == 0.0
     assert (octree.revisions == before).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES))
+def test_maps_that_agree_do_not_change_by_a_bit(seed, rule):
+    """With any weights, in bricks of all tiers; log-odds of any size."""
+    rng = np.random.default_rng(seed)
+    cells = _random_cells(rng, scale=10.0 ** rng.integers(-3, 8))
+    weights = rng.uniform(0.0, 0.5, rng.integers(0, 4)).tolist()
+    octree, same = _octree(cells), _octree(cells)
+    last = {"last_log_likelihood": same} if rule == "bayes" else {}
+    assert consensus_step(octree, [same] * len(weights), weights, same, rule=rule, gamma=0.5, revision=4, **last) == 0.0
+    assert cells_of(octree) == cells_of(same)
+    assert (octree.revisions < 4).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES))
+def test_skipping_bricks_at_rest_changes_nothing(seed, rule):
+    """Steps that only look at what changed since the step before, beside steps that look at everything."""
+    rng = np.random.default_rng(seed)
+    common = _random_cells(rng)
+    skipping, log_q, last, *neighbours = (
+        _octree(common | (_random_cells(rng) if rng.random() < 0.5 else {})) for _ in range(5)
+    )
+    full = skipping.copy()
+    for revision in range(5, 11):
+        maps = (log_q, *neighbours)
+        arguments = {"rule": rule, "gamma": 0.5, "revision": revision, "last_log_likelihood": last}
+        since = revision - 1 if revision > 5 else None
+        changes = [
+            consensus_step(full, neighbours, [0.3, 0.4], log_q, **arguments),
+            consensus_step(skipping, neighbours, [0.3, 0.4], log_q, since=since, **arguments),
+        ]
+        assert changes[0] == changes[1]
+        assert cells_of(full) == cells_of(skipping)
+        np.testing.assert_array_equal(full.revisions, skipping.revisions)
+        if rng.random() < 0.6:
+            source = _octree(_random_cells(rng))
+            maps[rng.integers(3)].overwrite(source, np.arange(source.num_bricks), revision)
+
+
+def test_only_bricks_that_changed_are_looked_at():
+    """A map that changes without a revision is not noticed: nothing else says that a brick is awake."""
+    own, other = octree_of(cube((0, 0, 0), 4, [1.0, 2.0])), octree_of(cube((0, 0, 0), 4, [3.0, 2.0]))
+    arguments = {"rule": "natural", "gamma": 0.0, "revision": 9}
+    assert consensus_step(own, [other], [0.5], own.copy(), since=7, **arguments) == 0.0
+    assert consensus_step(own, [other], [0.5], own.copy(), since=1, **arguments) == 1.0
+
+
+def test_the_exponential_of_what_is_at_most_zero():
+    x = np.concatenate([np.linspace(-86.0, 0.0, 100_001), -np.logspace(-40, 1.9, 1000), [-0.0]]).astype(np.float32)
+    found = np.array([consensus_kernels.exp_negative(value) for value in x])
+    np.testing.assert_allclose(found, np.exp(x.astype(np.float64)), rtol=5e-7)
+    for value in (-87.0, -104.0, -1e10, -3e38):
+        assert 0.0 <= consensus_kernels.exp_negative(np.float32(value)) < 1e-37
 
 
 def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():

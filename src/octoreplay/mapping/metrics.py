@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.mapping.consensus import address_table
+from octoreplay.mapping.consensus import address_table, scratch_rows
 from octoreplay.mapping.kernels import metrics as metrics_kernels
-from octoreplay.mapping.kernels.storage import BRICK_CELLS
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array, Int32Array, Int64Array
 
@@ -28,6 +28,10 @@ class MapComparison:
     agreement: Float64Array
     agreement_occupied: Float64Array
     entropy_bits: Float64Array
+
+
+NUM_PARTS = 16
+"""Parts that a comparison in threads is cut into."""
 
 
 class MapComparer:
@@ -51,10 +55,11 @@ class MapComparer:
         oracle: SemanticOctree,
         links: Sequence[tuple[int, int]],
         since: int,
+        threads: Executor | None = None,
     ) -> MapComparison:
         """The comparison; bricks whose revisions are all below ``since`` keep what was found before.
 
-        ``links`` names each linked pair of robots once.
+        ``links`` names each linked pair of robots once. Parts are compared in parallel ``threads``, with the same result.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
         rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]
@@ -67,7 +72,12 @@ class MapComparer:
             old = getattr(self, name)
             if len(old) < len(stale):
                 setattr(self, name, np.concatenate([old, np.zeros((len(stale) - len(old), old.shape[1]), old.dtype)]))
-        self._refresh(maps, oracle, np.flatnonzero(stale), link_ends)
+        parts = np.array_split(np.flatnonzero(stale), 1 if threads is None else NUM_PARTS)
+
+        def refresh(rows: Int64Array) -> None:
+            self._refresh(maps, oracle, rows, link_ends)
+
+        list(map(refresh, parts) if threads is None else threads.map(refresh, parts))
         return self._result()
 
     def _refresh(
@@ -87,8 +97,8 @@ class MapComparer:
             link_ends,
             np.float32(self._prior),
             maps[0].num_classes,
-            np.empty(((len(maps) + 1) * maps[0].num_classes + 5, BRICK_CELLS), np.float32),
-            np.empty((5, BRICK_CELLS), np.int32),
+            scratch_rows((len(maps) + 1) * maps[0].num_classes + 5),
+            scratch_rows(5).view(np.int32),
             rows,
             self._distances,
             self._counts,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,14 @@ class PublishedMap:
     unpruned_compressed_bytes: int
 
 
+class Arrival(NamedTuple):
+    """A neighbour's map as it arrived, with the step weight 2 epsilon A_ij of its link."""
+
+    sender: int
+    octree: SemanticOctree
+    weight: float
+
+
 class Robot:
     """A robot's evidence s_i, its map h_i and the iterations that bring them together.
 
@@ -60,6 +69,8 @@ class Robot:
         self._last_log_likelihood = octree()
         self._scan_tick = -1
         self._likelihood_tick = -1
+        self._last_step_tick = -1
+        self._last_conditions: tuple[object, ...] = ()
         self.map = octree()
         self.streams: TreeStreams = self.map.streams()
 
@@ -99,25 +110,25 @@ class Robot:
     def publish(self, *, with_unpruned: bool) -> PublishedMap:
         """The robot's map as a packet, with the sizes it would have in other encodings.
 
-        Only ``with_unpruned`` is the map without pruning compressed, which takes as long as the packet itself.
+        The sizes without pruning are 0 unless ``with_unpruned``: they take as long as the packet itself.
         """
         compress = self._config.network.packet_compression == "zstd"
         resolution = self.map.resolution
         packet = codec.pack(self.streams, resolution, codec.FULL, compress=compress)
+        # What decoding the packet gives, without undoing the compression.
+        received = octree_from_streams(self.streams, resolution)
+        received.revisions[:] = self.map.revisions[self.map.find(received.codes)]
         return PublishedMap(
             packet=packet,
-            # What decoding the packet gives, without undoing the compression.
-            octree=octree_from_streams(self.streams, resolution),
+            octree=received,
             octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
             grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + unpruned_bytes(self.map),
+            unpruned_bytes=codec.HEADER_BYTES + unpruned_bytes(self.map) if with_unpruned else 0,
             unpruned_compressed_bytes=len(codec.encode_packet(self.map, prune=False)) if with_unpruned else 0,
         )
 
-    def iterate(
-        self, own: PublishedMap | None, arrived: Sequence[tuple[SemanticOctree, float]], factor: float, tick: int
-    ) -> float:
-        """All iterations of one tick; ``arrived`` are the neighbours' maps with their step weights 2 epsilon A_ij.
+    def iterate(self, own: PublishedMap | None, arrived: Sequence[Arrival], factor: float, tick: int) -> float:
+        """All iterations of one tick with the neighbours' maps that ``arrived``.
 
         ``factor`` scales gamma (settling ramps it to 0). Returns the largest change of a log-odds.
         """
@@ -125,7 +136,11 @@ class Robot:
         self._update_log_likelihood(tick)
         if consensus.mode == "sync" or not arrived:
             lossy = self._config.map.prune_tolerance > 0
-            change = self._step(own.octree if own and lossy else None, arrived, factor, tick)
+            gamma = factor * gamma_at(consensus, self.num_iterations)
+            conditions = (gamma, *((sender, weight) for sender, _, weight in arrived))
+            since = self._last_step_tick if conditions == self._last_conditions and not lossy else None
+            change = self._step(own.octree if own and lossy else None, arrived, factor, tick, since)
+            self._last_conditions, self._last_step_tick = conditions, tick
         else:
             # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
             base = own.octree if own is not None and consensus.rule == "bayes" else None
@@ -139,25 +154,31 @@ class Robot:
         return change
 
     def _step(
-        self, base: SemanticOctree | None, arrived: Sequence[tuple[SemanticOctree, float]], factor: float, tick: int
+        self,
+        base: SemanticOctree | None,
+        arrived: Sequence[Arrival],
+        factor: float,
+        tick: int,
+        since: int | None = None,
     ) -> float:
-        """One iteration of the rule."""
+        """One iteration of the rule; bricks at rest ``since`` the last one are skipped."""
         consensus = self._config.consensus
         change = consensus_step(
             self.map,
-            [octree for octree, _ in arrived],
-            [weight for _, weight in arrived],
+            [arrival.octree for arrival in arrived],
+            [arrival.weight for arrival in arrived],
             self._log_likelihood,
             rule=consensus.rule,
             gamma=factor * gamma_at(consensus, self.num_iterations),
             revision=tick,
             base=base,
             last_log_likelihood=self._last_log_likelihood,
+            since=since,
         )
         self.num_iterations += 1
         if consensus.rule == "bayes":
             changed = np.flatnonzero(self._log_likelihood.revisions > self._likelihood_tick)
-            self._last_log_likelihood.overwrite(self._log_likelihood, changed)
+            self._last_log_likelihood.overwrite(self._log_likelihood, changed, tick)
             self._likelihood_tick = tick
         return change
 

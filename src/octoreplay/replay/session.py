@@ -38,7 +38,7 @@ from octoreplay.replay.graph import (
 )
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.robot import PublishedMap, Robot
+from octoreplay.replay.robot import Arrival, PublishedMap, Robot
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import FrameSource, Timeline
 
@@ -173,7 +173,7 @@ class Session:
 
         def iterate(index: int) -> float:
             arrived = [
-                (packet.octree, 2.0 * epsilon * float(graph.weights[index, sender]))
+                Arrival(sender, packet.octree, 2.0 * epsilon * float(graph.weights[index, sender]))
                 for sender in graph.neighbours(index)
                 if (packet := published[sender]) is not None
             ]
@@ -194,7 +194,7 @@ class Session:
         changed = np.unique(np.concatenate([robot.changed_evidence(number) for robot in self._robots]))
         sum_of_evidence(self._oracle, [robot.evidence for robot in self._robots], changed, number)
         maps = [robot.map for robot in self._robots]
-        comparison = self._comparer.compare(maps, self._oracle, graph.links, number)
+        comparison = self._comparer.compare(maps, self._oracle, graph.links, number, self._threads)
         robots = tuple(
             self._robot_metrics(index, index in graph.active, published[index], comparison)
             for index in range(len(self._robots))

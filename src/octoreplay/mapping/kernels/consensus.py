@@ -55,7 +55,7 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:  # noqa: ARG001
 
 @inline_kernel
 def exp_negative(x):
-    """Exp of a float32 that is at most 0, within 3e-7 of it; 5e-38 below -86. 2^n times a minimax polynomial."""
+    """Exp of a float32 that is at most 0, within a relative 5e-7; 5e-38 below -86. 2^n times a minimax polynomial."""
     bounded = max(x, np.float32(-86.0))
     # Adding 1.5 x 2^23 rounds to an integer, which then stands in the lowest bits.
     shifted = fma(bounded, np.float32(1.44269504088896341), np.float32(12582912.0))
@@ -143,7 +143,7 @@ differences), its evidence log q, its evidence at the last iteration, then the n
 
 
 PREFETCH_AHEAD = 6
-"""Bricks between the one that is asked for and the one in work: about a microsecond."""
+"""Bricks between the one that is asked for and the one in work: a few microseconds."""
 
 
 @kernel
@@ -185,8 +185,8 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, scratch,
     """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
 
     ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of
-    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``scratch`` has room for 5 bricks of all classes and 3 of
-    one. ``changes`` (n,) gets each brick's largest change.
+    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``scratch`` float32 has room for 5 bricks of all classes
+    and 3 of one. ``changes`` (n,) gets each brick's largest change.
     All classes of a brick that is not VECTOR are equal; the sums over classes then are ``num_classes`` times one term.
     """
     own_at, room = np.int64(scratch.ctypes.data), num_classes * BRICK_CELLS * 4

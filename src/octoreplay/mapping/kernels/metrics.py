@@ -14,18 +14,18 @@ from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR, float_pointe
 def _log(x):
     """Natural logarithm of a float32 from 1 to 1e30: exponent and polynomial (Cephes' logf, Moshier 1992)."""
     # The exponent counts from sqrt(1/2), so that the mantissa m lies in [sqrt(1/2), sqrt(2)).
-    exponent = (same_bits(x) - np.int32(0x3F3504F3)) >> np.int32(23)
+    exponent = np.int32(np.int32(same_bits(x) - np.int32(0x3F3504F3)) >> np.int32(23))
     m = same_bits(same_bits(x) - (exponent << np.int32(23))) - np.float32(1.0)
     p = np.float32(7.0376836292e-2)
-    p = p * m - np.float32(1.1514610310e-1)
-    p = p * m + np.float32(1.1676998740e-1)
-    p = p * m - np.float32(1.2420140846e-1)
-    p = p * m + np.float32(1.4249322787e-1)
-    p = p * m - np.float32(1.6668057665e-1)
-    p = p * m + np.float32(2.0000714765e-1)
-    p = p * m - np.float32(2.4999993993e-1)
-    p = p * m + np.float32(3.3333331174e-1)
-    return (p * m - np.float32(0.5)) * m * m + m + np.float32(exponent) * np.float32(0.69314718056)
+    p = fma(p, m, np.float32(-1.1514610310e-1))
+    p = fma(p, m, np.float32(1.1676998740e-1))
+    p = fma(p, m, np.float32(-1.2420140846e-1))
+    p = fma(p, m, np.float32(1.4249322787e-1))
+    p = fma(p, m, np.float32(-1.6668057665e-1))
+    p = fma(p, m, np.float32(2.0000714765e-1))
+    p = fma(p, m, np.float32(-2.4999993993e-1))
+    p = fma(p, m, np.float32(3.3333331174e-1))
+    return fma(fma(p, m, np.float32(-0.5)), m * m, fma(np.float32(exponent), np.float32(0.69314718056), m))
 
 
 @kernel
@@ -76,13 +76,14 @@ def _brick_entropy(rows, terms, prior, best, seen, total, weighted):
         weighted[i] = np.float32(0.0)
     for c in range(rows.shape[0]):
         for i in range(BRICK_CELLS):
-            value = rows[c, i] + prior
-            share = exp_negative(value - best[i])
+            below = (rows[c, i] + prior) - best[i]
+            share = exp_negative(below)
             total[i] += share
-            weighted[i] = fma(share, value, weighted[i])
+            weighted[i] = fma(share, below, weighted[i])
     for i in range(BRICK_CELLS):
-        whole = fma(terms, total[i], exp_negative(-best[i]))
-        entropy = best[i] + _log(whole) - terms * weighted[i] / whole
+        free = exp_negative(-best[i])
+        whole = fma(terms, total[i], free)
+        entropy = _log(whole) - fma(terms, weighted[i], -free * best[i]) / whole
         weighted[i] = entropy if seen[i] > 0 else np.float32(0.0)
     return _total(weighted)
 
@@ -93,15 +94,17 @@ def _pair_distance(bricks, square, mean):
 
     With differences d_i to robot 0, which are exact where the maps are close, this is N sum_i d_i^2 - (sum_i d_i)^2.
     """
-    robots, width, _ = bricks.shape
+    robots = bricks.shape[0]
     distance = 0.0
-    for c in range(width):
+    for c in range(bricks.shape[1]):
+        zero = bricks[0, c]
         for i in range(BRICK_CELLS):
             square[i] = np.float32(0.0)
             mean[i] = np.float32(0.0)
         for r in range(1, robots):
+            row = bricks[r, c]
             for i in range(BRICK_CELLS):
-                difference = bricks[r, c, i] - bricks[0, c, i]
+                difference = row[i] - zero[i]
                 mean[i] += difference
                 square[i] = fma(difference, difference, square[i])
         for i in range(BRICK_CELLS):
@@ -116,10 +119,10 @@ def _link_distance(bricks, link_ends, square):
     for i in range(BRICK_CELLS):
         square[i] = np.float32(0.0)
     for k in range(link_ends.shape[0]):
-        a, z = link_ends[k, 0], link_ends[k, 1]
         for c in range(bricks.shape[1]):
+            row, other = bricks[link_ends[k, 0], c], bricks[link_ends[k, 1], c]
             for i in range(BRICK_CELLS):
-                difference = bricks[a, c, i] - bricks[z, c, i]
+                difference = row[i] - other[i]
                 square[i] = fma(difference, difference, square[i])
     return _total(square)
 
@@ -170,23 +173,25 @@ def compare_maps(
             link_cells += _count_bits(known[b, link_ends[k, 0]] | known[b, link_ends[k, 1]])
         oracle = bricks[robots]
         _label_cells(oracle, oracle, prior, labels, oracle_best, oracle_there)
-        num_occupied = 0
+        num_occupied = np.int32(0)
         for i in range(BRICK_CELLS):
             in_any = np.int32(anyone >> np.uint64(i) & np.uint64(1))
             occupied[i] = in_any if labels[i] > 0 else np.int32(0)
-            num_occupied += occupied[i]
+            num_occupied = np.int32(num_occupied + occupied[i])
             differs[i] = np.int32(0)
         for r in range(robots):
             mask = known[b, r]
-            for i in range(BRICK_CELLS):
-                seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
+            if r == 0 or mask != known[b, r - 1]:
+                for i in range(BRICK_CELLS):
+                    seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
             _label_cells(bricks[r], oracle, prior, labels, best, oracle_there)
             entropies[place, r] = _brick_entropy(bricks[r], terms, prior, best, seen, total, weighted)
-            agreeing, agreeing_occupied = 0, 0
+            # Sums of int32 have to be kept as such, or they would take half as many lanes.
+            agreeing, agreeing_occupied = np.int32(0), np.int32(0)
             for i in range(BRICK_CELLS):
                 agrees = seen[i] if oracle_there[i] >= oracle_best[i] - np.float32(1e-3) else np.int32(0)
-                agreeing += agrees
-                agreeing_occupied += agrees & occupied[i]
+                agreeing = np.int32(agreeing + agrees)
+                agreeing_occupied = np.int32(agreeing_occupied + (agrees & occupied[i]))
                 # An unknown cell has a label of its own.
                 label = labels[i] if seen[i] > 0 else np.int32(-1)
                 first[i] = label if r == 0 else first[i]
@@ -194,9 +199,9 @@ def compare_maps(
             counts[place, 4 + 3 * r] = _count_bits(mask)
             counts[place, 5 + 3 * r] = agreeing
             counts[place, 6 + 3 * r] = agreeing_occupied
-        num_differing = 0
+        num_differing = np.int32(0)
         for i in range(BRICK_CELLS):
-            num_differing += differs[i] != 0
+            num_differing = np.int32(num_differing + (np.int32(1) if differs[i] != 0 else np.int32(0)))
         counts[place, 0] = _count_bits(anyone)
         counts[place, 1] = num_occupied
         counts[place, 2] = num_differing

@@ -234,9 +234,10 @@ def make_vector(bricks, index):
 def make_tiers(bricks, tiers):
     """Raise each brick (n,) to at least the tier (n,) that is asked for. Room must be there."""
     for index in range(tiers.size):
-        if tiers[index] == VECTOR:
+        # Asked here, because a call copies the whole record of arrays.
+        if tiers[index] == VECTOR and bricks.tiers[index] != VECTOR:
             make_vector(bricks, index)
-        elif tiers[index] == SCALAR:
+        elif tiers[index] == SCALAR and bricks.tiers[index] == UNIFORM:
             make_scalar(bricks, index)
 
 
