@@ -79,17 +79,26 @@ class Team:
         """Directed links."""
         return sum(len(neighbours) for neighbours in self._neighbours)
 
-    def tick(self) -> tuple[float, float]:
-        """One tick; milliseconds of publishing and of iterating, all robots together."""
+    def tick(self, *, awake: bool = True) -> tuple[float, float]:
+        """One tick; milliseconds of publishing and of iterating, all robots together.
+
+        Bricks at rest since the last tick are worked on only if ``awake``.
+        """
         started = time.perf_counter()
-        published = [decode_packet(encode_packet(octree)) for octree in self.maps]
+        published = [_received(octree) for octree in self.maps]
         decoded = time.perf_counter()
-        self.max_change = max(self._iterate(robot, published) for robot in range(len(self.maps)))
+        since = None if awake else self._last_tick
+        self.max_change = max(self._iterate(robot, published, since) for robot in range(len(self.maps)))
         self._last_tick = self.tick_number
         self.tick_number += 1
         return (decoded - started) * 1e3, (time.perf_counter() - decoded) * 1e3
 
-    def _iterate(self, robot: int, published: Sequence[SemanticOctree]) -> float:
+    def share_awake(self) -> float:
+        """Share of the bricks of the robots' maps that the last tick changed."""
+        awake = sum(np.count_nonzero(octree.revisions >= self._last_tick) for octree in self.maps)
+        return float(awake / sum(octree.num_bricks for octree in self.maps))
+
+    def _iterate(self, robot: int, published: Sequence[SemanticOctree], since: int | None) -> float:
         """One robot's iteration with Metropolis weights and epsilon = 0.5."""
         others = self._neighbours[robot]
         weight = 1.0 / (1 + max(len(neighbours) for neighbours in self._neighbours))
@@ -97,11 +106,19 @@ class Team:
         change = consensus_step(
             self.maps[robot], [published[other] for other in others], [weight] * len(others), evidence,
             rule=self.rule, gamma=GAMMA, revision=self.tick_number, last_log_likelihood=self._last_evidence[robot],
+            since=since,
         )  # fmt: skip
         if self.rule == "bayes":
             changed = np.flatnonzero(evidence.revisions > self._last_tick)
-            self._last_evidence[robot].overwrite(evidence, changed)
+            self._last_evidence[robot].overwrite(evidence, changed, self.tick_number)
         return change
+
+
+def _received(octree: SemanticOctree) -> SemanticOctree:
+    """A map as its receivers have it, with the revisions that its sender gave."""
+    received = decode_packet(encode_packet(octree))
+    received.revisions[:] = octree.revisions[octree.find(received.codes)]
+    return received
 
 
 def complete_graph(robot: int, num_robots: int) -> list[int]:
@@ -141,13 +158,14 @@ def _add_changed_tick(report: Report, team: Team, rounds: int, rest: int) -> Non
     """Ticks after new scans changed at least a tenth of the union's bricks, the others at rest; and full ticks."""
     full = [team.tick()[1] for _ in range(rest)]
     report.add(Row(f"{team.rule}: largest change after {rest} ticks", team.max_change, ""))
+    report.add(Row(f"{team.rule}: bricks that still change then", 100 * team.share_awake(), "%"))
     fresh = _fresh_frames()
     ratios, shares = [], []
     for _ in range(rounds):
         shares.append(100 * _change_bricks(team, fresh))
-        ratios.append(team.tick()[1] / float(np.median(full[: max(rounds, 1)])))
+        ratios.append(team.tick(awake=False)[1] / float(np.median(full[: max(rounds, 1)])))
         for _ in range(rest // 4):
-            team.tick()
+            team.tick(awake=False)
     report.add(measured(f"{team.rule}: bricks changed", shares, "%"))
     report.add(measured(f"{team.rule}: tick with few changes / full tick", ratios, "", must=0.2))
 

@@ -388,6 +388,30 @@ def test_threads_do_not_change_a_byte(rule, mode):
     assert runs[0] == runs[1] == runs[2]
 
 
+@pytest.mark.parametrize("rule", ["gradient", "bayes", "natural"])
+@pytest.mark.parametrize("topology", ["complete", "line"])
+def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
+    scenario = _scenario(1, SMALL)
+    config = scenario.config(rule=rule, topology=topology, settle=3)
+    step, since_of_steps = robot_module.consensus_step, []
+
+    def recorded(*args, since, **kwargs):
+        since_of_steps.append(since)
+        return step(*args, since=since, **kwargs)
+
+    def whole(*args, since, **kwargs):
+        return step(*args, since=None, **kwargs)
+
+    runs = []
+    for function in (recorded, whole):
+        monkeypatch.setattr(robot_module, "consensus_step", function)
+        session = Session(config, _sources(config, scenario.frames))
+        packets = [[published and published.packet for published in tick.published] for tick in session.ticks()]
+        runs.append(packets)
+    assert runs[0] == runs[1]
+    assert sum(since is not None for since in since_of_steps) > len(since_of_steps) / 3
+
+
 # --- faults that the comparison must see -----------------------------------------------------------------------------
 
 
