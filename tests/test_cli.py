@@ -56,8 +56,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_compiling_is_said_once(result: Path, tmp_path: Path) -> None:
     for said in (True, False):
         done = subprocess.run(
-            [sys.executable, "-m", "octoreplay", "query", str(result), "--at", "1", "0", "0"], text=True, capture_output=True,
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True, timeout=300,
+            [sys.executable, "-m", "octoreplay", "query", str(result), "--at", "1", "0", "0"], text=True,
+            capture_output=True, env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True, timeout=300,
         )  # fmt: skip
         assert done.stderr.startswith("compiling kernels") == said
         assert done.stderr.count("\n") == said

@@ -59,7 +59,7 @@ class MapComparer:
     ) -> MapComparison:
         """The comparison; bricks whose revisions are all below ``since`` keep what was found before.
 
-        ``links`` names each linked pair of robots once. Parts are compared in parallel ``threads``, with the same result.
+        ``links`` names each linked pair of robots once. The result does not depend on ``threads``.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
         rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]

@@ -188,7 +188,7 @@ def _fraction(coord, cell, resolution):
 def _line(start, step, slope, distance, n, goes_first):
     """Position along an axis at the k-th wall of the main one: first + k x second is in the cell behind the wall.
 
-    ``start`` is the origin's position, ``slope`` at most 1, and ``distance`` the origin's from the wall k = 0 behind it.
+    ``start`` is the origin's position, ``slope`` at most 1, and ``distance`` the origin's from wall k = 0 behind it.
     Rounding must not decide the order of walls that are met at once: an axis that ``goes_first`` is put ahead by what
     n roundings can amount to, the others behind.
     """
