@@ -208,7 +208,8 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, scratch,
             base = carray(float_pointer(own_at + 4 * room), (size,))
             load(base, addresses[b, BASE], tiers[b, BASE], width)
         # The sum of the differences comes first: it is exactly 0 where all maps agree.
-        mixed[:] = np.float32(0.0)
+        for i in range(size):
+            mixed[i] = np.float32(0.0)
         for j in range(weights.size):
             column = NEIGHBOURS + j
             prefetch(addresses[ahead, column], tiers[ahead, column], num_classes)
@@ -216,7 +217,8 @@ def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, scratch,
         prefetch(addresses[ahead, EVIDENCE], tiers[ahead, EVIDENCE], num_classes)
         load(delta, addresses[b, EVIDENCE], tiers[b, EVIDENCE], width)
         if rule == LOCAL:
-            mixed[:] = delta
+            for i in range(size):
+                mixed[i] = delta[i]
         elif rule == BAYES:
             old = carray(float_pointer(sigma_at), (size,))
             load(old, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], width)
@@ -277,10 +279,12 @@ def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targ
         width = num_classes if target_tiers[b] == VECTOR else 1
         size = width * BRICK_CELLS
         term, count, total = all_terms[:size], all_counts[:size], all_totals[:size]
-        total[:] = np.float32(0.0)
+        for i in range(size):
+            total[i] = np.float32(0.0)
         for r in range(robots):
             load(term, addresses[b, r], tiers[b, r], width)
-            count[:] = np.float32(1.0)
+            for i in range(size):
+                count[i] = np.float32(1.0)
             if count_tiers_offset >= 0:
                 # Counts are an octree of one class: its VECTOR bricks have one row, like the SCALAR ones.
                 column = count_tiers_offset + r
