@@ -139,7 +139,7 @@ class Robot:
             gamma = factor * gamma_at(consensus, self.num_iterations)
             conditions = (gamma, *((sender, weight) for sender, _, weight in arrived))
             since = self._last_step_tick if conditions == self._last_conditions and not lossy else None
-            change = self._step(own.octree if own and lossy else None, arrived, factor, tick, since)
+            change = self._step(own.octree if own and lossy else None, arrived, gamma, tick, since)
             self._last_conditions, self._last_step_tick = conditions, tick
         else:
             # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
@@ -147,7 +147,7 @@ class Robot:
             share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
             before = self.map.copy()
             for arrival in arrived:
-                self._step(base, [arrival], share, tick)
+                self._step(base, [arrival], share * gamma_at(consensus, self.num_iterations), tick)
             # What one arrival changes another may undo; what counts is the change over the tick.
             change = consensus_step(before, (), (), self.map, rule="local", gamma=0.0, revision=tick)
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
@@ -157,7 +157,7 @@ class Robot:
         self,
         base: SemanticOctree | None,
         arrived: Sequence[Arrival],
-        factor: float,
+        gamma: float,
         tick: int,
         since: int | None = None,
     ) -> float:
@@ -169,7 +169,7 @@ class Robot:
             [arrival.weight for arrival in arrived],
             self._log_likelihood,
             rule=consensus.rule,
-            gamma=factor * gamma_at(consensus, self.num_iterations),
+            gamma=gamma,
             revision=tick,
             base=base,
             last_log_likelihood=self._last_log_likelihood,

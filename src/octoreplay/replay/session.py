@@ -156,7 +156,7 @@ class Session:
         return tuple(index for index in range(len(self._robots)) if is_active(index))
 
     def _publish(self, graph: CommunicationGraph, number: int) -> tuple[PublishedMap | None, ...]:
-        """Every active robot's map as a packet, and decoded once for all its receivers: the bytes are the same."""
+        """Every active robot's map as a packet, and once what all its receivers make of it: the bytes are the same."""
         if self.config.consensus.rule == "local":
             return (None,) * len(self._robots)
         talking = [self._robots[index] for index in graph.active]

@@ -32,7 +32,7 @@ def _offset(coordinate, unit, stride):
     """
     within = np.uint32(np.uint32(coordinate & 1) | np.uint32(np.uint32(coordinate & 2) << 2))
     within = np.uint32(within | np.uint32(np.uint32(coordinate & 4) << 4))
-    return np.uint32(np.uint32(np.uint32(coordinate >> 3) * stride) + np.uint32(within * unit))
+    return np.uint32(np.uint32(np.uint32(coordinate >> BLOCK_BITS) * stride) + np.uint32(within * unit))
 
 
 @kernel
@@ -92,6 +92,7 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
         # Which of the walls ahead of cells k_b and k_c comes first: they are k x scale + shift away.
         scale_b, shift_b = step_b * lengths[c], ((step_b > 0) - start[b]) * step_b * lengths[c]
         scale_c, shift_c = step_c * lengths[b], ((step_c > 0) - start[c]) * step_c * lengths[b]
+        sides = (scale_b, shift_b, scale_c, shift_c, step_b, step_c, unit_b, unit_c, stride_b, stride_c)
         at_b, at_c = first_b, first_c
         if n > 0:
             distance = start[a] - first_a if step_a > 0 else first_a + 1 - start[a]
@@ -102,25 +103,8 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
             at_b = np.int64(min(max(np.int32(from_b + rise_b), low_b), high_b))
             at_c = np.int64(min(max(np.int32(from_c + rise_c), low_c), high_c))
             _mark_slab(
-                marks,
-                flags,
-                _offset(first_a, unit_a, stride_a),
-                first_b,
-                first_c,
-                at_b,
-                at_c,
-                True,
-                scale_b,
-                shift_b,
-                scale_c,
-                shift_c,
-                step_b,
-                step_c,
-                unit_b,
-                unit_c,
-                stride_b,
-                stride_c,
-            )
+                marks, flags, _offset(first_a, unit_a, stride_a), first_b, first_c, at_b, at_c, True, sides
+            )  # fmt: skip
             for piece in range(1, n, _PIECE):
                 size = min(_PIECE, n - piece)
                 begin = first_a + piece if step_a > 0 else longest - 1 - first_a + piece
@@ -137,13 +121,8 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
                 for k in range(whole):
                     both = (coords_b[k] != after_b[k]) & (coords_c[k] != after_c[k])
                     c_first = coords_c[k] * scale_c + shift_c <= coords_b[k] * scale_b + shift_b
-                    place_a, place_b, place_c, next_b, next_c = (
-                        places_a[k],
-                        places_b[k],
-                        places_c[k],
-                        there_b[k],
-                        there_c[k],
-                    )
+                    place_a, place_b, place_c = places_a[k], places_b[k], places_c[k]
+                    next_b, next_c = there_b[k], there_c[k]
                     b_between = next_b if both & (not c_first) else place_b
                     c_between = next_c if both & c_first else place_c
                     entered[k] = np.uint32(np.uint32(place_a + place_b) + place_c)
@@ -156,26 +135,7 @@ def mark_free(origin, ends, end_keys, resolution, corner, num_blocks, marks, fla
                     marks[between[k]] = 1
             at_b = np.int64(min(max(np.int32(from_b + rise_b * n), low_b), high_b))
             at_c = np.int64(min(max(np.int32(from_c + rise_c * n), low_c), high_c))
-        _mark_slab(
-            marks,
-            flags,
-            _offset(last[a], unit_a, stride_a),
-            at_b,
-            at_c,
-            last_b,
-            last_c,
-            False,
-            scale_b,
-            shift_b,
-            scale_c,
-            shift_c,
-            step_b,
-            step_c,
-            unit_b,
-            unit_c,
-            stride_b,
-            stride_c,
-        )
+        _mark_slab(marks, flags, _offset(last[a], unit_a, stride_a), at_b, at_c, last_b, last_c, False, sides)
 
 
 @inline_kernel
@@ -216,11 +176,9 @@ def _flag_blocks(flags, places_a, places_b, places_c, skipped, size):
 
 
 @kernel
-def _mark_slab(
-    marks, flags, place, at_b, at_c, to_b, to_c, mark_last, scale_b, shift_b, scale_c, shift_c, step_b, step_c, unit_b,
-    unit_c, stride_b, stride_c,
-):  # fmt: skip
+def _mark_slab(marks, flags, place, at_b, at_c, to_b, to_c, mark_last, sides):
     """Mark the cells of one slab, one by one, from (at_b, at_c) to (to_b, to_c)."""
+    scale_b, shift_b, scale_c, shift_c, step_b, step_c, unit_b, unit_c, stride_b, stride_c = sides
     while True:
         done = at_b == to_b and at_c == to_c
         if done and not mark_last:

@@ -6,14 +6,11 @@ reduced over lanes: the order of a floating point sum is part of the result.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import carray, types
-from numba.extending import intrinsic
+from numba import carray
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
+from octoreplay.mapping.kernels.intrinsics import float_pointer, fma, prefetch_line, same_bits
 from octoreplay.mapping.kernels.storage import (
     ABSENT,
     BRICK_CELLS,
@@ -21,36 +18,9 @@ from octoreplay.mapping.kernels.storage import (
     UNIFORM,
     VECTOR,
     collapse,
-    float_pointer,
 )
 
 GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
-
-
-@intrinsic
-# The parameters' names and number are numba's.
-def same_bits(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
-    """The int32 with the bits of a float32, or the float32 with the lowest 32 bits of an integer."""
-    result = types.int32 if isinstance(value, types.Float) else types.float32
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        number = arguments[0]
-        if isinstance(value, types.Integer) and value.bitwidth > result.bitwidth:
-            number = builder.trunc(number, ir.IntType(result.bitwidth))
-        return builder.bitcast(number, context.get_value_type(result))
-
-    return result(value), generate
-
-
-@intrinsic
-# The parameters' names and number are numba's.
-def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:  # noqa: ARG001
-    """The float32 a x b + c, rounded once: one instruction, with the same result on every machine."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        return builder.fma(*arguments)
-
-    return types.float32(types.float32, types.float32, types.float32), generate
 
 
 @inline_kernel
@@ -68,24 +38,6 @@ def exp_negative(x):
     return same_bits(same_bits(p) + (same_bits(shifted) << np.int32(23)))
 
 
-@intrinsic
-# The parameters' names and number are numba's.
-def _prefetch_line(typing_context: Any, address: Any) -> Any:  # noqa: ARG001
-    """Ask for the cache line at an integer address."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        pointer = builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
-        number = ir.IntType(32)
-        fetch = builder.module.declare_intrinsic(
-            "llvm.prefetch", (pointer.type,), ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
-        )
-        # Read, keep in all caches, data.
-        builder.call(fetch, [pointer, number(0), number(2), number(1)])
-        return context.get_dummy_value()
-
-    return types.void(types.int64), generate
-
-
 @kernel
 def prefetch(address, tier, num_classes):
     """Ask for a brick's data ahead of its use: bricks lie in another order in every octree."""
@@ -95,7 +47,7 @@ def prefetch(address, tier, num_classes):
     if tier == VECTOR:
         size *= num_classes
     for offset in range(0, size, 64):
-        _prefetch_line(address + offset)
+        prefetch_line(address + offset)
 
 
 @kernel

@@ -6,8 +6,9 @@ import numpy as np
 from numba import carray
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, fma, load, prefetch, same_bits
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR, float_pointer
+from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, load, prefetch
+from octoreplay.mapping.kernels.intrinsics import float_pointer, fma, same_bits
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR
 
 
 @inline_kernel
@@ -147,13 +148,8 @@ def compare_maps(
     # Arrays made of addresses, because those that own memory are counted at every use.
     cells = carray(float_pointer(cells_at), (5, BRICK_CELLS))
     best, oracle_best, oracle_there, total, weighted = cells[0], cells[1], cells[2], cells[3], cells[4]
-    labels, first, differs, occupied, seen = (
-        int_scratch[0],
-        int_scratch[1],
-        int_scratch[2],
-        int_scratch[3],
-        int_scratch[4],
-    )
+    labels, first, differs = int_scratch[0], int_scratch[1], int_scratch[2]
+    occupied, seen = int_scratch[3], int_scratch[4]
     for b in range(addresses.shape[0]):
         place = places[b]
         width = 1

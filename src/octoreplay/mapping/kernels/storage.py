@@ -7,11 +7,9 @@ the classes: no cell was ever hit), VECTOR one value per class and cell.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
 from octoreplay.mapping.kernels.compiler import kernel
 from octoreplay.records import Float32Array, Int32Array, Int64Array, UInt8Array, UInt64Array
@@ -49,18 +47,6 @@ class Bricks(NamedTuple):
     free_scalar: Int32Array
     scalar: Float32Array
     vector: Float32Array
-
-
-@intrinsic
-# The parameters' names and number are numba's.
-def float_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ARG001
-    """The float32 pointer of an integer address."""
-    pointer = types.CPointer(types.float32)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        return builder.inttoptr(arguments[0], context.get_value_type(pointer))
-
-    return pointer(types.int64), generate
 
 
 @kernel
