@@ -18,7 +18,7 @@ from scenes import NUM_CLASSES
 
 from octoreplay.config import MapConfig, SensorConfig
 from octoreplay.mapping.codec import decode_packet, encode_packet
-from octoreplay.mapping.consensus import consensus_step
+from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import Frame, Int64Array
@@ -88,7 +88,12 @@ class Team:
         published = [_received(octree) for octree in self.maps]
         decoded = time.perf_counter()
         since = None if awake else self._last_tick
-        self.max_change = max(self._iterate(robot, published, since) for robot in range(len(self.maps)))
+        steps = [self._step(robot, published, since) for robot in range(len(self.maps))]
+        self.max_change = max(team_step(steps, rule=self.rule, revision=self.tick_number))
+        if self.rule == "bayes":
+            for evidence, last in zip(self.evidence, self._last_evidence, strict=True):
+                changed = np.flatnonzero(evidence.revisions > self._last_tick)
+                last.overwrite(evidence, changed, self.tick_number)
         self._last_tick = self.tick_number
         self.tick_number += 1
         return (decoded - started) * 1e3, (time.perf_counter() - decoded) * 1e3
@@ -98,20 +103,14 @@ class Team:
         awake = sum(np.count_nonzero(octree.revisions >= self._last_tick) for octree in self.maps)
         return float(awake / sum(octree.num_bricks for octree in self.maps))
 
-    def _iterate(self, robot: int, published: Sequence[SemanticOctree], since: int | None) -> float:
+    def _step(self, robot: int, published: Sequence[SemanticOctree], since: int | None) -> Step:
         """One robot's iteration with Metropolis weights and epsilon = 0.5."""
         others = self._neighbours[robot]
         weight = 1.0 / (1 + max(len(neighbours) for neighbours in self._neighbours))
-        evidence = self.evidence[robot]
-        change = consensus_step(
-            self.maps[robot], [published[other] for other in others], [weight] * len(others), evidence,
-            rule=self.rule, gamma=GAMMA, revision=self.tick_number, last_log_likelihood=self._last_evidence[robot],
-            since=since,
+        return Step(
+            self.maps[robot], [published[other] for other in others], [weight] * len(others), self.evidence[robot],
+            GAMMA, last_log_likelihood=self._last_evidence[robot], since=since,
         )  # fmt: skip
-        if self.rule == "bayes":
-            changed = np.flatnonzero(evidence.revisions > self._last_tick)
-            self._last_evidence[robot].overwrite(evidence, changed, self.tick_number)
-        return change
 
 
 def _received(octree: SemanticOctree) -> SemanticOctree:

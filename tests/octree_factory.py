@@ -6,9 +6,8 @@ import itertools
 
 import numpy as np
 
-from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.octree import SemanticOctree, mask_bytes
 
 BRICK_EDGE = storage.BRICK_EDGE
 
@@ -21,23 +20,42 @@ def octree_of(cells, *, num_classes=2, resolution=0.25):
         by_brick.setdefault(tuple(k >> storage.BRICK_BITS for k in key), {})[key] = np.broadcast_to(
             np.asarray(values, np.float32), num_classes
         )
-    codes = np.array([brick_code(brick) for brick in by_brick], np.int64)
-    indices = octree.find_or_add(codes)
-    is_vector = [any((v != v[0]).any() for v in content.values()) for content in by_brick.values()]
-    octree.raise_tiers(np.where(is_vector, storage.VECTOR, storage.SCALAR).astype(np.uint8))
-    for index, content, vector in zip(indices, by_brick.values(), is_vector, strict=True):
-        row = octree.bricks.rows[index]
-        for key, values in content.items():
+    indices = octree.find_or_add(np.array([brick_code(brick) for brick in by_brick], np.int64))
+    for index, content in zip(indices, by_brick.values(), strict=True):
+        values = np.zeros((num_classes, storage.BRICK_CELLS), np.float32)
+        for key, cell_values in content.items():
             cell = storage.key_to_code(*key) & (storage.BRICK_CELLS - 1)
             octree.bricks.known[index] |= np.uint64(1 << cell)
-            if vector:
-                octree.bricks.vector[row, :, cell] = values
-            else:
-                octree.bricks.scalar[row, cell] = values[0]
-    consensus_kernels.finish_step(
-        octree.bricks, np.ones(octree.num_bricks, np.float32), np.ones(octree.num_bricks, np.uint8), 1
-    )
+            values[:, cell] = cell_values
+        _write_brick(octree, int(index), values)
+        octree.bricks.revisions[index] = 1
     return octree
+
+
+def _write_brick(octree, index, values):
+    """Write a brick's values (C, 64), in each octet in another of the ways in which they may be stored."""
+    octets = values.reshape(octree.num_classes, storage.OCTETS, storage.OCTETS)
+    shared = [octets[e % 2 - 1, e] for e in range(storage.OCTETS)]
+    # An octet in three gives every class a row, the others only those that differ from the first or the last class.
+    has_row = [
+        [(octets[c, e] != shared[e]).any() or (e % 3 == 0 and np.ptp(octets[:, e]) > 0) for e in range(storage.OCTETS)]
+        for c in range(octree.num_classes)
+    ]
+    masks = np.zeros((1, mask_bytes(octree.num_classes)), np.uint64)
+    for c, e in itertools.product(range(octree.num_classes), range(storage.OCTETS)):
+        masks[0, c // 8] |= np.uint64(has_row[c][e] << (8 * e + c % 8))
+    octree.raise_bricks(np.array([index]), masks)
+    row = octree.bricks.blocks[index] + storage.OCTETS
+    octree.bricks.rows[row - storage.OCTETS : row] = shared
+    for word, e in itertools.product(range(masks.size), range(storage.OCTETS)):
+        for c in range(8 * word, min(8 * word + 8, octree.num_classes)):
+            if has_row[c][e]:
+                octree.bricks.rows[row] = octets[c, e]
+                row += 1
+    storage.share_first_class(
+        octree.bricks.rows, octree.bricks.blocks[index], octree.bricks.masks, index, octree.num_classes
+    )
+    storage.collapse(octree.bricks, index)
 
 
 def brick_code(brick):
@@ -56,17 +74,25 @@ def cells_of(octree):
     content = {}
     for index in range(octree.num_bricks):
         known = (octree.known[index] >> np.arange(storage.BRICK_CELLS, dtype=np.uint64)) & np.uint64(1) == 1
-        tier, row = octree.bricks.tiers[index], octree.bricks.rows[index]
-        values = np.empty((octree.num_classes, storage.BRICK_CELLS), np.float32)
-        if tier == storage.UNIFORM:
-            values[:] = octree.bricks.values[index]
-        elif tier == storage.SCALAR:
-            values[:] = octree.bricks.scalar[row]
-        else:
-            values[:] = octree.bricks.vector[row]
+        values = np.full((octree.num_classes, storage.BRICK_CELLS), octree.bricks.values[index])
+        if octree.bricks.blocks[index] >= 0:
+            values = octree.bricks.rows[class_rows(octree, np.array([index]))[0]].reshape(values.shape)
         cells = np.flatnonzero(known)
         keys = np.empty((len(cells), 3), np.int64)
         storage.codes_to_keys((octree.codes[index] << storage.CELL_BITS) + cells, keys)
         for key, cell in zip(keys.tolist(), cells, strict=True):
             content[tuple(key)] = values[:, cell].tobytes()
     return content
+
+
+def class_rows(octree, indices):
+    """Which rows (n, C, 8) hold the values of every class in every octet of the bricks ``indices`` (n,) with blocks."""
+    blocks, masks = octree.bricks.blocks[indices].astype(np.int64), octree.bricks.masks[indices]
+    rows = np.empty((len(indices), octree.num_classes, storage.OCTETS), np.int64)
+    for c, e in itertools.product(range(octree.num_classes), range(storage.OCTETS)):
+        word, bit = masks[:, c // 8], np.uint64(1) << np.uint64(8 * e + c % 8)
+        before = np.bitwise_count(masks[:, : c // 8]).sum(axis=1, dtype=np.int64) + np.bitwise_count(
+            word & (bit - np.uint64(1))
+        )
+        rows[:, c, e] = np.where(word & bit, blocks + storage.OCTETS + before, blocks + e)
+    return rows

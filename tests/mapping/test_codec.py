@@ -14,7 +14,7 @@ from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
 from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, octree_from_streams, unpruned_bytes
+from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values, octree_from_streams
 from octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
@@ -25,14 +25,16 @@ VALUES = st.sampled_from([0.0, -5.0, 5.0, -0.3, 1.0, 1e-30, -3e38, float(np.floa
 @st.composite
 def octrees(draw, num_classes=None):
     """Octrees of single cells and cubes, near the origin (both signs) and at the ends of the key space."""
-    num_classes = num_classes or draw(st.sampled_from([1, 2, 5]))
+    num_classes = num_classes or draw(st.sampled_from([1, 2, 5, 9, 20]))
     corners = st.sampled_from([-LIMIT, -LIMIT + 64, -64, -17, -8, -1, 0, 3, 8, 40, LIMIT - 64])
     cells = {}
     for _ in range(draw(st.integers(0, 6))):
         edge = draw(st.sampled_from([1, 1, 2, 3, 4, 8, 16]))
         corner = [draw(corners) for _ in range(3)]
-        equal = draw(st.booleans())
-        values = [draw(VALUES)] * num_classes if equal else [draw(VALUES) for _ in range(num_classes)]
+        # As many values as classes, or a few that several classes share.
+        palette = [draw(VALUES) for _ in range(draw(st.integers(1, 3)))]
+        values = [draw(VALUES if draw(st.booleans()) else st.sampled_from(palette)) for _ in range(num_classes)]
+        values = [palette[0]] * num_classes if draw(st.booleans()) else values
         cells.update(cube(corner, edge, values))
     return octree_of(cells, num_classes=num_classes, resolution=draw(st.sampled_from([0.25, 0.3, 1e-3, 7.0])))
 
@@ -52,16 +54,24 @@ def test_a_packet_gives_the_map_back_bit_for_bit(octree, compress, prune):
 @given(octree=octrees(), prune=st.booleans())
 def test_the_streams_read_as_the_format_says(octree, prune):
     streams = octree.streams(prune=prune)
-    assert _naive_cells(streams.words.tolist(), streams.scalars, streams.vectors) == cells_of(octree)
+    assert _naive_cells(streams.words.tolist(), streams, octree.num_classes) == cells_of(octree)
 
 
-def _naive_cells(words, scalars, vectors):
+def _naive_cells(words, streams, num_classes):
     """{key: bytes of its values} read recursively, as docs/packet-format.md says it; None for words that are no octree.
 
     Leaves larger than 32 cells are left out.
     """
-    rest = [list(words), list(scalars), list(vectors)]
+    rest = [list(words), list(streams.values), streams.masks.tolist(), list(streams.own_values)]
     content = {}
+
+    def read_leaf(state):
+        values = np.full(num_classes, rest[1].pop(0))
+        mask = rest[2].pop(0) if state == 3 else []
+        for c in range(num_classes if mask else 0):
+            if mask[c // 8] >> (c % 8) & 1:
+                values[c] = rest[3].pop(0)
+        return values.tobytes()
 
     def read_node(corner, edge):
         word = rest[0].pop(0)
@@ -73,9 +83,9 @@ def _naive_cells(words, scalars, vectors):
                     raise IndexError
                 read_node(low, edge // 2)
             elif state:
-                value = np.broadcast_to(rest[state - 1].pop(0), vectors.shape[1])
+                value = read_leaf(state)
                 if edge <= 64:
-                    content.update(cube(low, edge // 2, value.tobytes()))
+                    content.update(cube(low, edge // 2, value))
 
     try:
         if rest[0]:
@@ -87,8 +97,15 @@ def _naive_cells(words, scalars, vectors):
 
 @settings(max_examples=60, deadline=None)
 @given(octree=octrees())
-def test_the_unpruned_size_is_counted_without_writing(octree):
-    assert unpruned_bytes(octree) == octree.streams(prune=False).num_bytes
+def test_a_leaf_holds_the_value_of_most_classes_and_those_that_differ(octree):
+    streams = octree.streams(prune=False)
+    _, _, is_vector = leaf_list(streams)
+    values = leaf_values(streams, is_vector, octree.num_classes)
+    places = np.cumsum([0, *np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)])
+    for leaf, shared, start, end in zip(values[is_vector], streams.values[is_vector], places, places[1:], strict=False):
+        counts = [np.count_nonzero(leaf == value) for value in leaf]
+        assert shared == leaf[np.argmax(counts)]
+        assert streams.own_values[start:end].tolist() == [value for value in leaf if value != shared]
 
 
 @settings(max_examples=40, deadline=None)
@@ -113,11 +130,12 @@ def _code(key):
 def test_large_uniform_cubes_are_one_leaf():
     octree = octree_of(cube((-64, -64, -64), 64, [-5.0, -5.0]))
     streams = octree.streams()
-    assert (streams.scalars.tolist(), streams.vectors.shape) == ([-5.0], (0, 2))
+    assert (streams.values.tolist(), streams.masks.shape, streams.own_values.size) == ([-5.0], (0, 1), 0)
     assert codec.decode_packet(codec.encode_packet(octree)).num_cells == 64**3
     hit = octree_of(cube((64, 0, -32), 32, [1.0, -0.3]))
     streams = hit.streams()
-    assert (streams.scalars.size, streams.vectors.tolist()) == (0, [[1.0, pytest.approx(-0.3)]])
+    assert (streams.values.tolist(), streams.masks.tolist()) == ([1.0], [[2]])
+    assert streams.own_values.tolist() == [pytest.approx(-0.3)]
     assert cells_of(codec.decode_packet(codec.encode_packet(hit))) == cells_of(hit)
 
 
@@ -143,7 +161,7 @@ def test_bricks_without_a_known_cell_take_no_words():
     octree.find_or_add(np.array([0, 1, 77], np.int64))
     assert codec.encode_packet(octree) == packet
     octree.bricks.known[:] = 0
-    assert octree.streams().words.size == octree.streams(prune=False).words.size == unpruned_bytes(octree) == 0
+    assert octree.streams().words.size == octree.streams(prune=False).words.size == 0
 
 
 def test_equal_maps_are_equal_bytes_whatever_the_sign_of_0_and_the_order_of_bricks():
@@ -159,25 +177,27 @@ def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
     """They never come from scans, but may from a packet: nothing else may change, and nothing is written outside."""
     octree = SemanticOctree(0.25, 3)
     octree.find_or_add(np.arange(64))
-    octree.raise_tiers((np.arange(64) % 3).astype(np.uint8))
+    octree.raise_bricks(np.arange(0, 64, 3), np.zeros((22, 1), np.uint64))
+    octree.raise_bricks(np.arange(1, 64, 3), np.full((21, 1), 0x0001_0507_0203_0004, np.uint64))
     octree.bricks.known[:64] = storage.ALL_CELLS
-    for array in (octree.bricks.values, octree.bricks.scalar, octree.bricks.vector):
+    for array in (octree.bricks.values, octree.bricks.rows):
         array[:] = value
     streams = octree.streams(tolerance=tolerance)
-    decoded = octree_from_streams(streams, 0.25)
+    decoded = octree_from_streams(streams, 0.25, 3)
     assert decoded.num_cells == octree.num_cells
-    assert all(np.array_equal(array, np.full_like(array, value), equal_nan=True) for array in streams[1:])
+    assert np.array_equal(streams.values, np.full_like(streams.values, value), equal_nan=True)
+    assert streams.masks.size == 0
     assert len(cells_of(decoded)) == 64 * 64
 
 
 def test_the_bytes_by_hand():
-    """A root with a single cell at key (0, 0, 0): child 7 of the root, then child 0 of each; one vector."""
+    """A root with a single cell at key (0, 0, 0): child 7 of the root, then child 0 of each; one vector leaf."""
     packet = codec.encode_packet(octree_of({(0, 0, 0): [1.5, -2.0]}), compress=False)
     words = [codec_state << (2 * child) for codec_state, child in [(1, 7)] + [(1, 0)] * 17 + [(3, 0)]]
-    payload = struct.pack("<19H2f", *words, 1.5, -2.0)
-    fields = (b"OCTM", 1, 0, 0, 0, 2, 0, 0.25, 19, 0, 1, len(payload))
-    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIII", *fields, 0)))
-    assert packet == struct.pack("<4sBBBBHHdIIIII", *fields, checksum) + payload
+    payload = struct.pack("<19HfBf", *words, 1.5, 0b10, -2.0)
+    fields = (b"OCTM", 2, 0, 0, 0, 2, 0, 0.25, 19, 1, 1, 1, len(payload))
+    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIIII", *fields, 0)))
+    assert packet == struct.pack("<4sBBBBHHdIIIIII", *fields, checksum) + payload
 
 
 def test_tolerance_merges_within_its_bound():
@@ -251,27 +271,27 @@ def test_kinds_are_not_mixed_up(sample):
         codec.apply_delta(sample, codec.encode_delta(other, np.arange(1)))
 
 
-def _forged(payload, *, version=1, kind=0, content=0, compression=0, num_classes=2, zero=0, resolution=0.25, counts):
+def _forged(payload, *, version=2, kind=0, content=0, compression=0, num_classes=2, zero=0, resolution=0.25, counts):
     """A packet with a good checksum and any content."""
     fields = (b"OCTM", version, kind, content, compression, num_classes, zero, resolution, *counts, len(payload))
-    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIII", *fields, 0)))
-    return struct.pack("<4sBBBBHHdIIIII", *fields, checksum) + payload
+    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIIII", *fields, 0)))
+    return struct.pack("<4sBBBBHHdIIIIII", *fields, checksum) + payload
 
 
 @pytest.mark.parametrize(
     "fields",
     [
-        {"version": 0}, {"version": 2}, {"kind": 2}, {"content": 1}, {"compression": 2}, {"num_classes": 0},
+        {"version": 1}, {"version": 3}, {"kind": 2}, {"content": 1}, {"compression": 2}, {"num_classes": 0},
         {"num_classes": 255}, {"zero": 1},
         {"resolution": 0.0}, {"resolution": -0.25}, {"resolution": float("nan")}, {"resolution": float("inf")},
     ],
     ids=str,
 )  # fmt: skip
 def test_unknown_headers_are_refused(fields):
-    good = _forged(b"", counts=(0, 0, 0))
+    good = _forged(b"", counts=(0, 0, 0, 0))
     assert codec.decode_packet(good).num_bricks == 0
     with pytest.raises(PacketError):
-        codec.decode_packet(_forged(b"", counts=(0, 0, 0), **fields))
+        codec.decode_packet(_forged(b"", counts=(0, 0, 0, 0), **fields))
 
 
 def _words(*words):
@@ -285,17 +305,22 @@ CHAIN = (1,) * 18
 @pytest.mark.parametrize(
     ("payload", "counts"),
     [
-        pytest.param(_words(*CHAIN, 2) + np.float32(1).tobytes(), (19, 2, 0), id="more scalars than leaves"),
-        pytest.param(_words(*CHAIN, 2), (19, 0, 0), id="fewer scalars than leaves"),
-        pytest.param(_words(*CHAIN, 2) + bytes(8), (19, 0, 1), id="a vector for a scalar leaf"),
-        pytest.param(_words(*CHAIN, 3) + bytes(4), (19, 1, 0), id="a scalar for a vector leaf"),
-        pytest.param(_words(*CHAIN, 1), (19, 0, 0), id="an inner node at the finest level"),
-        pytest.param(_words(*CHAIN), (18, 0, 0), id="words that end too early"),
-        pytest.param(_words(*CHAIN, 2, 0) + bytes(4), (20, 1, 0), id="words that are not reached"),
-        pytest.param(_words(0) + bytes(4), (1, 1, 0), id="a scalar without a leaf"),
-        pytest.param(bytes(4), (0, 1, 0), id="a scalar without a word"),
-        pytest.param(_words(2) + bytes(4), (1, 1, 0), id="a leaf of an eighth of the key space"),
-        pytest.param(_words(*[1] * 7, 3) + bytes(8), (8, 0, 1), id="a vector leaf of 2^11 cells each side"),
+        pytest.param(_words(*CHAIN, 2) + bytes(8), (19, 2, 0, 0), id="more values than leaves"),
+        pytest.param(_words(*CHAIN, 2), (19, 0, 0, 0), id="fewer values than leaves"),
+        pytest.param(_words(*CHAIN, 2) + bytes(4) + b"\1" + bytes(4), (19, 1, 1, 1), id="a mask for a scalar leaf"),
+        pytest.param(_words(*CHAIN, 3) + bytes(4), (19, 1, 0, 0), id="no mask for a vector leaf"),
+        pytest.param(_words(*CHAIN, 3) + bytes(4) + b"\1", (19, 1, 1, 0), id="fewer values than the mask names"),
+        pytest.param(_words(*CHAIN, 3) + bytes(4) + b"\1" + bytes(8), (19, 1, 1, 2), id="more than the mask names"),
+        pytest.param(_words(*CHAIN, 3) + bytes(4) + b"\4" + bytes(4), (19, 1, 1, 1), id="a class that is none"),
+        pytest.param(_words(*CHAIN, 1), (19, 0, 0, 0), id="an inner node at the finest level"),
+        pytest.param(_words(*CHAIN), (18, 0, 0, 0), id="words that end too early"),
+        pytest.param(_words(*CHAIN, 2, 0) + bytes(4), (20, 1, 0, 0), id="words that are not reached"),
+        pytest.param(_words(0) + bytes(4), (1, 1, 0, 0), id="a value without a leaf"),
+        pytest.param(bytes(4), (0, 1, 0, 0), id="a value without a word"),
+        pytest.param(_words(2) + bytes(4), (1, 1, 0, 0), id="a leaf of an eighth of the key space"),
+        pytest.param(
+            _words(*[1] * 7, 3) + bytes(4) + b"\1" + bytes(4), (8, 1, 1, 1), id="a vector leaf of 2^11 cells each side"
+        ),
     ],
 )
 @pytest.mark.parametrize("compression", [0, 1])
@@ -317,7 +342,7 @@ def _refused_without_memory(packet, limit=20_000_000):
 
 @pytest.mark.parametrize("num_classes", [2, 254, 65535])
 @pytest.mark.parametrize("compression", [0, 1])
-@pytest.mark.parametrize("counts", [(2**32 - 1, 0, 0), (0, 2**32 - 1, 0), (0, 0, 2**32 - 1), (2**32 - 1,) * 3])
+@pytest.mark.parametrize("counts", [*np.diag([2**32 - 1] * 4).tolist(), (2**32 - 1,) * 4])
 def test_hostile_counts_take_no_memory(counts, compression, num_classes):
     compressor = zstandard.ZstdCompressor()
     unsized = zstandard.ZstdCompressor(write_content_size=False)
@@ -328,7 +353,7 @@ def test_hostile_counts_take_no_memory(counts, compression, num_classes):
 @pytest.mark.parametrize("write_content_size", [True, False])
 def test_a_payload_that_unpacks_to_more_than_its_counts_is_refused(write_content_size):
     bomb = zstandard.ZstdCompressor(write_content_size=write_content_size).compress(bytes(100_000_000))
-    _refused_without_memory(_forged(bomb, counts=(1, 1, 1), compression=1))
+    _refused_without_memory(_forged(bomb, counts=(1, 1, 1, 1), compression=1))
 
 
 def test_bytes_behind_the_compressed_payload_are_refused():
@@ -336,7 +361,7 @@ def test_bytes_behind_the_compressed_payload_are_refused():
     octree = octree_of({(0, 0, 0): [1.0, 2.0]})
     packet = codec.encode_packet(octree)
     header = codec.read_header(packet)
-    counts = (header.num_words, header.num_scalars, header.num_vectors)
+    counts = (header.num_words, header.num_leaves, header.num_vectors, header.num_own_values)
     payload = packet[codec.HEADER_BYTES :]
     assert codec.decode_packet(_forged(payload, counts=counts, compression=1)).num_cells == 1
     for tail in (b"\0", payload):
@@ -347,16 +372,18 @@ def test_bytes_behind_the_compressed_payload_are_refused():
 @settings(max_examples=150, deadline=None)
 @given(
     words=st.lists(st.integers(0, 2**16 - 1), max_size=40),
-    scalars=st.integers(0, 40),
-    vectors=st.integers(0, 40),
+    leaves=st.integers(0, 40),
+    masks=st.lists(st.integers(0, 4), max_size=40),
+    data=st.data(),
 )
-def test_any_words_give_an_octree_or_a_packet_error(words, scalars, vectors):
-    payload = _words(*words) + bytes(4 * scalars + 8 * vectors)
+def test_any_words_give_an_octree_or_a_packet_error(words, leaves, masks, data):
+    own = data.draw(st.sampled_from([sum(mask.bit_count() for mask in masks), data.draw(st.integers(0, 40))]))
+    payload = _words(*words) + bytes(4 * leaves) + bytes(masks) + bytes(4 * own)
     try:
-        octree = codec.decode_packet(_forged(payload, counts=(len(words), scalars, vectors)))
+        octree = codec.decode_packet(_forged(payload, counts=(len(words), leaves, len(masks), own)))
     except PacketError:
         return
-    assert octree.streams().num_leaves <= scalars + vectors
+    assert octree.streams().num_leaves <= leaves
 
 
 @settings(max_examples=200, deadline=None)
@@ -369,9 +396,9 @@ def test_damaged_words_give_what_the_format_says_or_a_packet_error(octree, prune
         place = data.draw(st.integers(0, len(words)))
         new = data.draw(st.lists(st.sampled_from([0, 1, 2, 3, 0x5555, 0xAAAA, 0xFFFF, 0x9000, 0x4002]), max_size=2))
         words[place : place + data.draw(st.integers(0, 2))] = new
-    expected = _naive_cells(words, streams.scalars, streams.vectors)
-    payload = _words(*words) + streams.scalars.tobytes() + streams.vectors.tobytes()
-    counts = (len(words), streams.scalars.size, len(streams.vectors))
+    expected = _naive_cells(words, streams, 2)
+    payload = _words(*words) + b"".join(array.tobytes() for array in streams[1:])
+    counts = (len(words), *(len(array) for array in streams[1:]))
     packet = _forged(payload, resolution=octree.resolution, counts=counts)
     refusal, decoded = "", None
     with pytest.MonkeyPatch.context() as patch:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
+from octoreplay.mapping.consensus import Evidence, Step, gamma_at, sum_of_evidence, team_step
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.replay.session import CONVERGED, Session
@@ -22,6 +23,12 @@ from reference.scenarios import TeamShape, make_scenario
 NUM_CLASSES = 3
 RULES = ("gradient", "natural", "bayes", "local")
 TOPOLOGIES = ("complete", "ring", "line", "star")
+
+
+def consensus_step(own, neighbours, step_weights, log_likelihood, *, rule, gamma, revision, **others):
+    """One robot's iteration."""
+    step = Step(own, neighbours, step_weights, log_likelihood, gamma, **others)
+    return team_step([step], rule=rule, revision=revision)[0]
 
 
 # --- one iteration ---------------------------------------------------------------------------------------------------
@@ -83,15 +90,14 @@ def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, rule, gamma, with_base
         base=_octree(base) if with_base else None, last_log_likelihood=_octree(last),
     )  # fmt: skip
     found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
-    known = set().union(own, log_q, *neighbours)
-    assert found.keys() == known
-    # Cells of the base or of old evidence alone do not occur in a run: what a robot published, it knows.
-    compared = [row for row, key in enumerate(keys) if key in known]
+    keys_known = set(keys) if with_base else set().union(own, log_q, last, *neighbours)
+    assert found.keys() == keys_known
+    compared = [row for row, key in enumerate(keys) if key in keys_known]
     for row in compared:
         np.testing.assert_allclose(found[keys[row]], expected[row, 1:], atol=3e-5, rtol=1e-5)
     most = np.abs(expected - dense_own)[compared].max(initial=0.0)
     assert change == pytest.approx(most, rel=1e-4, abs=3e-5) or change > most
-    changed = {key for key in known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
+    changed = {key for key in keys_known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
     revised = set(octree.codes[octree.revisions == 4].tolist())
     assert {int(storage.key_to_code(*key)) >> storage.CELL_BITS for key in changed} <= revised
 
@@ -204,6 +210,38 @@ def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():
     assert (octree.revisions == 9).all()
 
 
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES), with_threads=st.booleans())
+def test_a_team_steps_as_its_robots_do_one_by_one(seed, rule, with_threads):
+    """Robots with other cells, neighbours, weights and gammas each, all awake or most bricks at rest."""
+    rng = np.random.default_rng(seed)
+    common = _random_cells(rng)
+    maps, published, evidence, last = (
+        [_octree(common | (_random_cells(rng) if rng.random() < 0.5 else {})) for _ in range(4)] for _ in range(4)
+    )
+    for octree in (*maps, *published, *evidence, *last):
+        octree.revisions[:] = rng.integers(0, 3, octree.num_bricks)
+    steps = []
+    for robot in range(4):
+        others = [other for other in range(4) if other != robot and rng.random() < 0.6]
+        steps.append(
+            Step(
+                maps[robot], [published[other] for other in others], rng.uniform(0, 0.3, len(others)).tolist(),
+                evidence[robot], float(rng.choice([0.0, 0.5])), published[robot] if rng.random() < 0.3 else None,
+                last[robot], since=1 if rng.random() < 0.5 else None,
+            )
+        )  # fmt: skip
+    alone = [dataclasses.replace(step, own=step.own.copy()) for step in steps]
+    expected = [team_step([step], rule=rule, revision=7)[0] for step in alone]
+    with ThreadPoolExecutor(3) as threads:
+        found = team_step(steps, rule=rule, revision=7, threads=threads if with_threads else None)
+    assert found == expected
+    for step, other in zip(steps, alone, strict=True):
+        assert cells_of(step.own) == cells_of(other.own)
+        revisions = dict(zip(step.own.codes.tolist(), step.own.revisions.tolist(), strict=True))
+        assert revisions == dict(zip(other.own.codes.tolist(), other.own.revisions.tolist(), strict=True))
+
+
 def test_neighbours_and_evidence_are_not_changed():
     own, other, log_q, last = (octree_of(cube((i, 0, 0), 9, [i - 1.0, -i])) for i in range(4))
     before = [cells_of(octree) for octree in (other, log_q, last)]
@@ -216,7 +254,7 @@ def test_uniform_free_space_stays_uniform():
     own, other = (octree_of(cube((0, 0, 0), 16, [value, value])) for value in (-5.0, -3.0))
     for rule in ("gradient", "natural", "bayes"):
         consensus_step(own, [other], [0.5], own.copy(), rule=rule, gamma=0.5, revision=1)
-        assert (own.bricks.tiers[: own.num_bricks] == storage.UNIFORM).all()
+        assert (own.bricks.blocks[: own.num_bricks] == -1).all()
         assert len(own.leaves()) == 1
 
 

@@ -122,7 +122,7 @@ def test_merging_stays_within_its_bound(seed, tolerance):
         if rng.random() < 0.97:
             cells[key] = (rng.integers(0, 3) + 0.1 * rng.random(2)).astype(np.float32)
     octree = octree_of(cells)
-    merged = octree_from_streams(octree.streams(tolerance=tolerance), RESOLUTION)
+    merged = octree_from_streams(octree.streams(tolerance=tolerance), RESOLUTION, 2)
     after = cells_of(merged)
     assert after.keys() == cells.keys()
     for key, value in after.items():
@@ -140,7 +140,7 @@ def test_merging_stays_within_its_bound(seed, tolerance):
 def test_leaves_that_merge_to_equal_classes_are_scalars():
     cells = cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [0.0, 1.0]}
     merged = octree_of(cells).streams(tolerance=1.0)
-    assert (merged.scalars.tolist(), merged.vectors.size) == ([0.5], 0)
+    assert (merged.values.tolist(), merged.masks.size) == ([0.5], 0)
 
 
 @settings(max_examples=40, deadline=None)
@@ -159,7 +159,7 @@ def test_without_pruning_every_known_cell_is_a_leaf():
     octree = octree_of(cube((0, 0, 0), 16, [-5.0, -5.0]) | {(40, 1, 1): [1.0, 0.0]})
     streams = octree.streams(prune=False)
     assert streams.num_leaves == octree.num_cells == 16**3 + 1
-    assert cells_of(octree_from_streams(streams, RESOLUTION)) == cells_of(octree)
+    assert cells_of(octree_from_streams(streams, RESOLUTION, 2)) == cells_of(octree)
     assert octree.streams().num_leaves == 2
 
 
@@ -167,10 +167,10 @@ def test_equal_siblings_that_are_not_all_known_stay_apart():
     cells = cube((0, 0, 0), 8, [-5.0, -5.0])
     del cells[7, 7, 7]
     octree = octree_of(cells)
-    assert sorted(octree.bricks.tiers[: octree.num_bricks].tolist()) == [storage.UNIFORM] * 7 + [storage.SCALAR]
+    assert np.count_nonzero(octree.bricks.blocks[: octree.num_bricks] < 0) == 7
     assert len(octree.leaves()) == 7 + 7 + 7
     whole = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
-    assert whole.bricks.tiers[: whole.num_bricks].tolist() == [storage.UNIFORM] * 8
+    assert (whole.bricks.blocks[: whole.num_bricks] < 0).all()
     assert len(whole.leaves()) == 1
 
 

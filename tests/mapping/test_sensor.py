@@ -424,6 +424,6 @@ def test_saturated_free_space_becomes_uniform_and_stays_unchanged():
     frame = CloudFrame("r", 0, points, np.zeros(len(points), np.uint8), pose)
     octree = _sums([frame] * 20, clamped_increments(SENSOR))
     centre = octree.find(np.array([storage.key_to_code(0, 0, 0) >> storage.CELL_BITS]))[0]
-    assert octree.bricks.tiers[centre] == storage.UNIFORM
+    assert octree.bricks.blocks[centre] == -1
     assert octree.bricks.values[centre] == -5.0
     assert octree.revisions[centre] < 19

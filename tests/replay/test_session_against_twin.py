@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from octoreplay.config import PRESETS
-from octoreplay.mapping import consensus, sensor
-from octoreplay.mapping.kernels import storage
+from octoreplay.mapping import sensor
+from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.replay import robot as robot_module
 from octoreplay.replay import session as session_module
 from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
+from octree_factory import class_rows
 from reference import rules
 from reference.comparison import compare_map
 from reference.hand_made import cloud, ray, team_config
@@ -393,18 +394,18 @@ def test_threads_do_not_change_a_byte(rule, mode):
 def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
     scenario = _scenario(1, SMALL)
     config = scenario.config(rule=rule, topology=topology, settle=3)
-    step, since_of_steps = robot_module.consensus_step, []
+    right, since_of_steps = session_module.team_step, []
 
-    def recorded(*args, since, **kwargs):
-        since_of_steps.append(since)
-        return step(*args, since=since, **kwargs)
+    def recorded(steps, **kwargs):
+        since_of_steps.extend(step.since for step in steps)
+        return right(steps, **kwargs)
 
-    def whole(*args, since, **kwargs):
-        return step(*args, since=None, **kwargs)
+    def whole(steps, **kwargs):
+        return right([dataclasses.replace(step, since=None) for step in steps], **kwargs)
 
     runs = []
     for function in (recorded, whole):
-        monkeypatch.setattr(robot_module, "consensus_step", function)
+        monkeypatch.setattr(session_module, "team_step", function)
         session = Session(config, _sources(config, scenario.frames))
         packets = [[published and published.packet for published in tick.published] for tick in session.ticks()]
         runs.append(packets)
@@ -415,20 +416,28 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
 # --- faults that the comparison must see -----------------------------------------------------------------------------
 
 
+def _change_steps(monkeypatch, change):
+    """Every robot's iterations are done as ``change`` describes them."""
+    right = session_module.team_step
+
+    def wrong(steps, *, rule, **kwargs):
+        # The step over copies of the maps measures the change over a tick; it is no iteration.
+        measures = rule == "local"
+        return right([step if measures else change(step) for step in steps], rule=rule, **kwargs)
+
+    for module in (robot_module, session_module):
+        monkeypatch.setattr(module, "team_step", wrong)
+
+
 def _wrong_sign(monkeypatch):
-    right = robot_module.consensus_step
-
-    def wrong(own, neighbours, step_weights, *args, **kwargs):
-        return right(own, neighbours, [-0.1 * weight for weight in step_weights], *args, **kwargs)
-
-    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+    _change_steps(
+        monkeypatch,
+        lambda step: dataclasses.replace(step, step_weights=[-0.1 * weight for weight in step.step_weights]),
+    )
 
 
 def _wrong_gradient_sign(monkeypatch):
-    right = robot_module.consensus_step
-    monkeypatch.setattr(
-        robot_module, "consensus_step", lambda *args, gamma, **kwargs: right(*args, gamma=-0.1 * gamma, **kwargs)
-    )
+    _change_steps(monkeypatch, lambda step: dataclasses.replace(step, gamma=-0.1 * step.gamma))
 
 
 def _current_maps_in_place_of_published_ones(monkeypatch):
@@ -460,19 +469,23 @@ def _maps_of_the_tick_before(monkeypatch):
 
 def _free_is_not_reset(monkeypatch):
     """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
-    right = robot_module.consensus_step
+    right = session_module.team_step
 
-    def wrong(own, neighbours, step_weights, log_likelihood, *, gamma, **kwargs):
-        mixed = own.copy()
-        right(mixed, neighbours, step_weights, log_likelihood, gamma=0.0, **kwargs)
-        change = right(own, neighbours, step_weights, log_likelihood, gamma=gamma, **kwargs)
-        codes = own.codes[own.bricks.tiers[: own.num_bricks] == storage.VECTOR]
-        after = own.bricks.vector[own.bricks.rows[own.find(codes)]]
-        before = mixed.bricks.vector[mixed.bricks.rows[mixed.find(codes)]]
-        own.bricks.vector[own.bricks.rows[own.find(codes)]] = after + (after - before).sum(axis=1, keepdims=True)
-        return change
+    def wrong(steps, *, rule, **kwargs):
+        if rule == "local":
+            return right(steps, rule=rule, **kwargs)
+        mixed = [dataclasses.replace(step, own=step.own.copy(), gamma=0.0) for step in steps]
+        right(mixed, rule=rule, **kwargs)
+        changes = right(steps, rule=rule, **kwargs)
+        for own, without in ((step.own, other.own) for step, other in zip(steps, mixed, strict=True)):
+            codes = own.codes[own.bricks.masks[: own.num_bricks].any(axis=1)]
+            rows = class_rows(own, own.find(codes))
+            after, before = own.bricks.rows[rows], without.bricks.rows[class_rows(without, without.find(codes))]
+            own.bricks.rows[rows] = after + (after - before).sum(axis=1, keepdims=True)
+        return changes
 
-    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+    for module in (robot_module, session_module):
+        monkeypatch.setattr(module, "team_step", wrong)
 
 
 def _free_is_not_reset_in_the_twin(monkeypatch):
@@ -480,13 +493,10 @@ def _free_is_not_reset_in_the_twin(monkeypatch):
 
 
 def _evidence_of_the_last_iteration_is_forgotten(monkeypatch):
-    right = robot_module.consensus_step
+    def forget(step):
+        return dataclasses.replace(step, last_log_likelihood=type(step.own)(step.own.resolution, step.own.num_classes))
 
-    def wrong(own, neighbours, step_weights, log_likelihood, *, last_log_likelihood, **kwargs):
-        nothing = type(own)(own.resolution, own.num_classes)
-        return right(own, neighbours, step_weights, log_likelihood, last_log_likelihood=nothing, **kwargs)
-
-    monkeypatch.setattr(robot_module, "consensus_step", wrong)
+    _change_steps(monkeypatch, forget)
 
 
 def _scans_of_the_tick_come_late(monkeypatch):
@@ -511,12 +521,13 @@ def _half_a_step(monkeypatch):
 
 
 def _neighbours_cells_are_not_taken(monkeypatch):
-    right = consensus._take_known
+    right = consensus_kernels.join_columns
 
-    def wrong(own, sources):
-        return right(own, sources[:1])
+    def wrong(table, columns, is_awake, known, has_block, layout):
+        right(table, columns, is_awake, known, has_block, layout)
+        known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
 
-    monkeypatch.setattr(consensus, "_take_known", wrong)
+    monkeypatch.setattr(consensus_kernels, "join_columns", wrong)
 
 
 LOG_ODDS_DIFFER = "log-odds differ"

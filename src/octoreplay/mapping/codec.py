@@ -12,11 +12,11 @@ import numpy.typing as npt
 import zstandard
 
 from octoreplay.errors import PacketError
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
 from octoreplay.records import Int64Array
 
 MAGIC = b"OCTM"
-VERSION = 1
+VERSION = 2
 FULL, DELTA = 0, 1
 CONTENT_FLOAT32 = 0
 NO_COMPRESSION, ZSTD = 0, 1
@@ -25,8 +25,9 @@ MAX_ZSTD_RATIO = 1 << 15
 """A zstd block of at least 4 bytes holds at most 2^17."""
 MAX_CLASSES = 254
 
-_HEADER = struct.Struct("<4sBBBBHHdIIIII")
-"""magic, version, kind, content, compression, classes, 0, resolution, words, scalars, vectors, payload bytes, CRC."""
+_HEADER = struct.Struct("<4sBBBBHHdIIIIII")
+"""magic, version, kind, content, compression, classes, 0, resolution, words, leaves, masks, own values, payload
+bytes, CRC."""
 
 HEADER_BYTES = _HEADER.size
 
@@ -40,14 +41,16 @@ class PacketHeader:
     num_classes: int
     resolution: float
     num_words: int
-    num_scalars: int
+    num_leaves: int
     num_vectors: int
+    num_own_values: int
     payload_bytes: int
 
     @property
     def raw_bytes(self) -> int:
         """Size of the uncompressed octree."""
-        return 2 * self.num_words + 4 * self.num_scalars + 4 * self.num_vectors * self.num_classes
+        num_values = self.num_leaves + self.num_own_values
+        return 2 * self.num_words + 4 * num_values + self.num_vectors * mask_bytes(self.num_classes)
 
 
 def encode_packet(
@@ -57,23 +60,23 @@ def encode_packet(
 
     Sibling leaves that differ by at most ``tolerance`` are merged (0: lossless); without ``prune`` none are.
     """
-    return pack(octree.streams(prune=prune, tolerance=tolerance), octree.resolution, FULL, compress=compress)
+    return pack(octree, octree.streams(prune=prune, tolerance=tolerance), FULL, compress=compress)
 
 
 def encode_delta(octree: SemanticOctree, indices: Int64Array, *, compress: bool = True) -> bytes:
     """A packet with the bricks ``indices`` (n,) int64 of a map, whole and lossless."""
-    return pack(octree.streams(indices), octree.resolution, DELTA, compress=compress)
+    return pack(octree, octree.streams(indices), DELTA, compress=compress)
 
 
-def pack(streams: TreeStreams, resolution: float, kind: int, *, compress: bool) -> bytes:
-    """The packet of an octree's streams."""
+def pack(octree: SemanticOctree, streams: TreeStreams, kind: int, *, compress: bool) -> bytes:
+    """The packet of the streams of an octree."""
     little_endian = (np.ascontiguousarray(array, array.dtype.newbyteorder("<")) for array in streams)
     parts: list[bytes | memoryview] = [array.data for array in little_endian]
     if compress:
         parts = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(b"".join(parts))]
     fields = (
-        MAGIC, VERSION, kind, CONTENT_FLOAT32, ZSTD if compress else NO_COMPRESSION, streams.vectors.shape[1], 0,
-        resolution, streams.words.size, streams.scalars.size, streams.vectors.shape[0],
+        MAGIC, VERSION, kind, CONTENT_FLOAT32, ZSTD if compress else NO_COMPRESSION, octree.num_classes, 0,
+        octree.resolution, streams.words.size, streams.num_leaves, len(streams.masks), streams.own_values.size,
         len(parts[0]) if compress else streams.num_bytes,
     )  # fmt: skip
     checksum = zlib.crc32(_HEADER.pack(*fields, 0))
@@ -90,8 +93,8 @@ def read_header(data: bytes) -> PacketHeader:
     if version != VERSION:
         raise PacketError(f"map packet of format version {version}, this octoreplay reads version {VERSION}")
     payload = memoryview(data)[HEADER_BYTES:]
-    if len(payload) != sizes[3]:
-        raise PacketError(f"map packet cut: {len(payload)} bytes of payload, its header says {sizes[3]}")
+    if len(payload) != sizes[-1]:
+        raise PacketError(f"map packet cut: {len(payload)} bytes of payload, its header says {sizes[-1]}")
     if zlib.crc32(payload, zlib.crc32(data[: HEADER_BYTES - 4] + bytes(4))) != checksum:
         raise PacketError("map packet damaged: its checksum does not match")
     known = kind in (FULL, DELTA) and content == CONTENT_FLOAT32 and compression in (NO_COMPRESSION, ZSTD)
@@ -127,14 +130,16 @@ def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
     if len(payload) != header.raw_bytes:
         raise PacketError("map packet damaged: its size does not match its counts")
     words_end = 2 * header.num_words
-    scalars_end = words_end + 4 * header.num_scalars
+    values_end = words_end + 4 * header.num_leaves
+    masks_end = values_end + header.num_vectors * mask_bytes(header.num_classes)
     streams = TreeStreams(
         _array(payload[:words_end], np.uint16),
-        _array(payload[words_end:scalars_end], np.float32),
-        _array(payload[scalars_end:], np.float32).reshape(-1, header.num_classes),
+        _array(payload[words_end:values_end], np.float32),
+        _array(payload[values_end:masks_end], np.uint8).reshape(-1, mask_bytes(header.num_classes)),
+        _array(payload[masks_end:], np.float32),
     )
     try:
-        return octree_from_streams(streams, header.resolution)
+        return octree_from_streams(streams, header.resolution, header.num_classes)
     except ValueError as error:
         raise PacketError(f"map packet damaged: {error}") from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from octoreplay.config import ConsensusConfig
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.kernels.consensus import OWN
-from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import Float32Array, Int64Array, UInt8Array
+from octoreplay.mapping.kernels.consensus import FIRST_NEIGHBOUR, OWN
+from octoreplay.mapping.kernels.storage import BrickTable
+from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
+from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
 _RULES = {
     "gradient": consensus_kernels.GRADIENT,
@@ -36,124 +38,146 @@ def gamma_at(consensus: ConsensusConfig, iteration: int) -> float:
     return float(consensus.gamma / (1.0 + iteration / consensus.gamma_decay) ** consensus.gamma_power)
 
 
-def consensus_step(
-    own: SemanticOctree,
-    neighbours: Sequence[SemanticOctree],
-    step_weights: Sequence[float],
-    log_likelihood: SemanticOctree,
-    *,
-    rule: str,
-    gamma: float,
-    revision: int,
-    base: SemanticOctree | None = None,
-    last_log_likelihood: SemanticOctree | None = None,
-    since: int | None = None,
-) -> float:
-    """One iteration, in place in ``own``; returns the largest change of a log-odds.
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One robot's iteration: its map, which is changed in place, and what it is changed by.
 
-    h~ = h_i + sum_j w_ij (h_j - b_i) over the ``neighbours`` (published maps h_j) with ``step_weights`` w_ij =
-    2 epsilon A_ij; ``base`` b_i is the robot's own published map (default: ``own`` itself). Then, with log q_i =
-    ``log_likelihood``:
+    ``neighbours`` are the published maps h_j that arrived, ``step_weights`` their w_ij = 2 epsilon A_ij; ``base`` b_i
+    is the robot's own published map (default: ``own`` itself), ``log_likelihood`` log q_i, and ``last_log_likelihood``
+    the same at the last iteration.
+
+    With ``since``, the revision of an earlier step with the same rule, gamma, weights and neighbours, the bricks at
+    rest are skipped: those that no map has given a revision from ``since`` on. That step changed nothing in them, so
+    this one would not either. All maps' revisions must then be right, the decoded ones' included.
+    """
+
+    own: SemanticOctree
+    neighbours: Sequence[SemanticOctree]
+    step_weights: Sequence[float]
+    log_likelihood: SemanticOctree
+    gamma: float
+    base: SemanticOctree | None = None
+    last_log_likelihood: SemanticOctree | None = None
+    since: int | None = None
+
+
+NUM_PARTS = 16
+"""Parts that a step in threads is cut into."""
+
+
+def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Executor | None = None) -> list[float]:
+    """One iteration at each of several robots, in place; returns each one's largest change of a log-odds.
+
+    h~ = h_i + sum_j w_ij (h_j - b_i) over the neighbours. Then
 
     - ``gradient`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
       sigma = softmax(h~);
     - ``natural``: h_i = h~ + gamma (log q_i - h~);
-    - ``bayes``: h_i = h~ + log q_i - ``last_log_likelihood`` (log q_i at the last iteration);
+    - ``bayes``: h_i = h~ + log q_i - log q_i at the last iteration;
     - ``local``: h_i = log q_i.
 
-    h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same step done cell by cell.
-
-    With ``since``, the ``revision`` of an earlier step with the same rule, gamma, weights and neighbours, the bricks
-    at rest are skipped: those that no map has given a revision from ``since`` on. That step changed nothing in them,
-    so this one would not either. All maps' revisions must then be right, the decoded ones' included.
+    h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same steps done cell by cell, robot
+    by robot, and does not depend on ``threads``; no robot's ``own`` may be a neighbour's map of another.
     """
-    columns = [own, own if base is None else base, log_likelihood]
-    columns += [log_likelihood if last_log_likelihood is None else last_log_likelihood, *neighbours]
-    known_changed = _take_known(own, [(octree, _changed(octree, since)) for octree in (log_likelihood, *neighbours)])
-    rows = _changed_rows(own, columns, since)
-    codes = own.codes[rows]
-    addresses, tiers = address_table(columns, codes)
-    needed = _needed_tiers(tiers)
-    if (needed > tiers[:, OWN]).any():
-        all_needed = own.bricks.tiers[: own.num_bricks].copy()
-        all_needed[rows] = needed
-        own.raise_tiers(all_needed)
-        for column, octree in enumerate(columns):
-            if octree is own:
-                addresses[:, column], tiers[:, column] = own.addresses(rows)
-    changes = np.empty(rows.size, np.float32)
-    consensus_kernels.consensus_step(
-        addresses,
-        tiers,
-        np.asarray(step_weights, np.float32),
-        _RULES[rule],
-        np.float32(gamma),
-        own.num_classes,
-        scratch_rows(5 * own.num_classes + 3),
-        changes,
-    )
-    all_changes = np.zeros(own.num_bricks, np.float32)
-    all_changes[rows] = changes
-    consensus_kernels.finish_step(own.bricks, all_changes, known_changed, revision)
-    return float(changes.max(initial=0.0))
+    if not steps:
+        return []
+    run: Run = map if threads is None else threads.map
+    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
+    column_of = {id(octree): column for column, octree in enumerate(octrees)}
+    all_since = [step.since for step in steps if step.since is not None]
+    since = min(all_since, default=0)
+    codes = _codes(octrees, since if len(all_since) == len(steps) else None)
+    table = brick_table(octrees, codes, since, run)
+    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
+    shape = (len(steps), codes.size)
+    is_awake, known_changed, is_even = np.zeros((3, *shape), np.bool_)
+    changes = np.zeros(shape, np.float32)
+    indices = np.empty(shape, np.int64)
+    layouts = np.empty((*shape, table.masks.shape[2]), np.uint64)
+
+    def prepare(n: int) -> None:
+        own = steps[n].own
+        is_awake[n] = steps[n].since is None
+        indices[n], layouts[n], known_changed[n] = _raise_to_columns(own, codes, table, columns[n], is_awake[n])
+        storage.fill_table(own.bricks, indices[n], since, table, columns[n][OWN])
+
+    list(run(prepare, range(len(steps))))
+    all_columns = np.concatenate(columns)
+    first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
+    weights = np.concatenate([[0.0] * FIRST_NEIGHBOUR + list(step.step_weights) for step in steps]).astype(np.float32)
+    gammas = np.array([step.gamma for step in steps], np.float32)
+    num_classes = steps[0].own.num_classes
+
+    def work(part: Int64Array) -> None:
+        consensus_kernels.team_step(
+            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, _RULES[rule], num_classes,
+            layouts.reshape(-1, layouts.shape[2]), is_awake, *_scratch(num_classes, np.diff(first_columns).max()),
+            changes, is_even,
+        )  # fmt: skip
+
+    parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
+    list(run(work, [part for part in parts if part.size]))
+
+    def finish(n: int) -> float:
+        return float(
+            consensus_kernels.finish_step(
+                steps[n].own.bricks,
+                indices[n],
+                table,
+                columns[n][OWN],
+                changes[n],
+                is_even[n],
+                known_changed[n],
+                revision,
+            )
+        )
+
+    return list(run(finish, range(len(steps))))
 
 
-def _take_known(own: SemanticOctree, sources: Sequence[tuple[SemanticOctree, Int64Array | slice]]) -> UInt8Array:
-    """Add the cells of the sources' chosen bricks to the robot's map; a flag (n,) for each brick that this changed."""
-    places = [own.find_or_add(source.codes[chosen]) for source, chosen in sources]
-    known_changed = np.zeros(own.num_bricks, np.uint8)
-    for (source, chosen), indices in zip(sources, places, strict=True):
-        known_changed[indices] |= storage.merge_known(own.bricks.known, indices, source.known[chosen])
-    return known_changed
+def _octrees(step: Step) -> list[SemanticOctree]:
+    """The octrees of a step in the order of the kernel's columns."""
+    base = step.own if step.base is None else step.base
+    last = step.log_likelihood if step.last_log_likelihood is None else step.last_log_likelihood
+    return [step.own, base, step.log_likelihood, last, *step.neighbours]
 
 
-def _changed_rows(own: SemanticOctree, octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
-    """The robot's own bricks (n,) that changed in any of the octrees ``since`` then; None: all of them."""
-    if since is None:
-        return np.arange(own.num_bricks)
-    changed = np.zeros(own.num_bricks, np.bool_)
+def _codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
+    """Sorted codes (n,) of the bricks of any of the octrees; with ``since`` of those that changed from there on."""
+    union = SemanticOctree(1.0, 1)
     for octree in octrees:
-        indices = own.find(octree.codes[_changed(octree, since)])
-        changed[indices[indices >= 0]] = True
-    return np.flatnonzero(changed)
+        union.find_or_add(octree.codes if since is None else octree.codes[octree.revisions >= since])
+    return np.sort(union.codes)
 
 
-def _changed(octree: SemanticOctree, since: int | None) -> Int64Array | slice:
-    """The octree's bricks that changed ``since`` then; None: all of them."""
-    return slice(None) if since is None else np.flatnonzero(octree.revisions >= since)
+def _raise_to_columns(
+    octree: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array, is_awake: BoolArray
+) -> tuple[Int64Array, UInt64Array, BoolArray]:
+    """Give an octree the cells, blocks and rows that it takes to hold the awake bricks ``codes`` (n,) of the columns.
 
-
-def _needed_tiers(tiers: UInt8Array) -> UInt8Array:
-    """The highest tier (n,) that is present in each row of ``tiers`` (n, columns)."""
-    needed = np.empty(len(tiers), np.uint8)
-    consensus_kernels.needed_tiers(tiers, needed)
-    return needed
-
-
-def scratch_rows(num_rows: int) -> Float32Array:
-    """Rows (num_rows, BRICK_CELLS) for a kernel's own use, not set; they start at a cache line.
-
-    A vector instruction that crosses two lines takes twice as long: without this kernels take a third longer.
+    Bricks that changed are awake, those without a known cell are not. Returns the indices (n,), -1 for the others, the
+    masks (n, W), and where known cells were added (n,).
     """
-    line = 64 // 4
-    room = np.empty(num_rows * storage.BRICK_CELLS + line, np.float32)
-    start = -(room.ctypes.data // 4) % line
-    return room[start : start + num_rows * storage.BRICK_CELLS].reshape(num_rows, storage.BRICK_CELLS)
+    known, has_block = np.zeros(codes.size, np.uint64), np.zeros(codes.size, np.bool_)
+    masks = np.zeros((codes.size, table.masks.shape[2]), np.uint64)
+    consensus_kernels.join_columns(table, columns, is_awake, known, has_block, masks)
+    indices = np.full(codes.size, -1)
+    indices[is_awake] = octree.find_or_add(codes[is_awake])
+    known_changed = np.empty(codes.size, np.bool_)
+    storage.merge_known(octree.bricks.known, indices, known, known_changed)
+    has_block &= is_awake
+    octree.raise_bricks(indices[has_block], masks[has_block])
+    masks[is_awake] = octree.bricks.masks[indices[is_awake]]
+    return indices, masks, known_changed
 
 
-def address_table(octrees: Sequence[SemanticOctree], codes: Int64Array) -> tuple[Int64Array, UInt8Array]:
-    """Memory addresses and tiers (n, len(octrees)) of the bricks ``codes`` (n,); valid until an octree grows."""
-    addresses = np.empty((codes.size, len(octrees)), np.int64)
-    tiers = np.empty((codes.size, len(octrees)), np.uint8)
-    first: dict[int, int] = {}
-    for column, octree in enumerate(octrees):
-        # An octree may be there twice; its second column is a copy.
-        same = first.setdefault(id(octree), column)
-        if same < column:
-            addresses[:, column], tiers[:, column] = addresses[:, same], tiers[:, same]
-        else:
-            addresses[:, column], tiers[:, column] = octree.addresses(octree.find(codes))
-    return addresses, tiers
+def _scratch(num_classes: int, num_columns: int) -> tuple[Float32Array, Int64Array]:
+    """What the kernels work in: blocks with a row for every class in every octet, and numbers for rows and columns."""
+    blocks = (consensus_kernels.NUM_SCRATCH_BLOCKS + num_columns) * (num_classes + 1) + 3
+    return (
+        cache_aligned((blocks, storage.BRICK_CELLS), np.float32),
+        np.empty((2, max(storage.OCTETS * (num_classes + 1), num_columns)), np.int64),
+    )
 
 
 def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes: Int64Array, revision: int) -> None:
@@ -161,21 +185,18 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
 
     All robots read their evidence the same way. Bricks that are written get ``revision``.
     """
-    indices = target.find_or_add(codes)
     octrees = [entry.octree for entry in evidence]
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
-    addresses, tiers = address_table([*octrees, *counts], codes)
-    needed = _needed_tiers(tiers)
-    all_needed = target.bricks.tiers[: target.num_bricks].copy()
-    all_needed[indices] = np.maximum(all_needed[indices], needed)
-    target.raise_tiers(all_needed)
-    for octree in octrees:
-        found = octree.find(codes)
-        present = found >= 0
-        storage.merge_known(target.bricks.known, indices[present], octree.known[found[present]])
-    target_addresses, target_tiers = target.addresses(indices)
+    table, count_table = brick_table(octrees, codes), brick_table(counts, codes)
+    columns = np.arange(len(octrees))
+    indices, masks, _ = _raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
+    written = indices >= 0
+    differ = indices[written & (count_table.addresses != 0).any(axis=0)]
+    target.raise_bricks(differ, target.bricks.masks[differ])
     scales: Float32Array = np.array([entry.scale for entry in evidence], np.float32)
+    scratch, int_scratch = _scratch(target.num_classes, 0)
     consensus_kernels.sum_evidence(
-        addresses, tiers, len(octrees) if counts else -1, scales, target.num_classes, target_addresses, target_tiers
-    )
-    target.bricks.revisions[indices] = revision
+        target.bricks, indices, table, masks, count_table, scales, target.num_classes, scratch,
+        int_scratch[0], np.zeros((1, 1), np.uint64),
+    )  # fmt: skip
+    target.bricks.revisions[indices[written]] = revision

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.mapping.consensus import address_table, scratch_rows
 from octoreplay.mapping.kernels import metrics as metrics_kernels
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.kernels.storage import BRICK_CELLS
+from octoreplay.mapping.octree import SemanticOctree, brick_table, cache_aligned
 from octoreplay.records import Float64Array, Int32Array, Int64Array
 
 
@@ -85,20 +85,14 @@ class MapComparer:
     ) -> None:
         """Compare the bricks ``rows`` (n,) anew."""
         codes = self._bricks.codes[rows]
-        addresses, tiers = address_table([*maps, oracle], codes)
-        known = np.zeros((rows.size, len(maps)), np.uint64)
-        for robot, octree in enumerate(maps):
-            indices = octree.find(codes)
-            known[indices >= 0, robot] = octree.known[indices[indices >= 0]]
+        table = brick_table([*maps, oracle], codes)
         metrics_kernels.compare_maps(
-            addresses,
-            tiers,
-            known,
+            table,
             link_ends,
             np.float32(self._prior),
             maps[0].num_classes,
-            scratch_rows((len(maps) + 1) * maps[0].num_classes + 5),
-            scratch_rows(5).view(np.int32),
+            cache_aligned(((len(maps) + 1) * maps[0].num_classes + 5, BRICK_CELLS), np.float32),
+            cache_aligned((5, BRICK_CELLS), np.int32),
             rows,
             self._distances,
             self._counts,

@@ -5,13 +5,15 @@ Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. S
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from octoreplay.mapping.kernels import packets, storage
-from octoreplay.mapping.kernels.storage import Bricks
+from octoreplay.mapping.kernels.storage import Bricks, BrickTable
 from octoreplay.records import (
     BoolArray,
     Float32Array,
@@ -23,23 +25,34 @@ from octoreplay.records import (
     UInt64Array,
 )
 
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Calls a function with each of some items: ``map``, or an executor's."""
+
+CACHE_LINE = 64
+"""Bytes of a cache line."""
+
 
 class TreeStreams(NamedTuple):
-    """A depth-first octree: ``words`` (W,) uint16, ``scalars`` (S,) and ``vectors`` (V, C) float32."""
+    """A depth-first octree: ``words`` (W,) uint16, ``values`` (L,) float32, one for each leaf.
+
+    Leaves whose classes differ (V of them) have ``masks`` (V, ceil(C / 8)) uint8 of the classes with another value,
+    class c is bit c % 8 of byte c // 8, and these values in ``own_values`` (M,) float32.
+    """
 
     words: npt.NDArray[np.uint16]
-    scalars: Float32Array
-    vectors: Float32Array
+    values: Float32Array
+    masks: npt.NDArray[np.uint8]
+    own_values: Float32Array
 
     @property
     def num_leaves(self) -> int:
         """Number of leaves."""
-        return int(self.scalars.size + self.vectors.shape[0])
+        return self.values.size
 
     @property
     def num_bytes(self) -> int:
-        """Size of the three arrays."""
-        return self.words.nbytes + self.scalars.nbytes + self.vectors.nbytes
+        """Size of the four arrays."""
+        return sum(array.nbytes for array in self)
 
 
 class SemanticOctree:
@@ -51,12 +64,13 @@ class SemanticOctree:
     def __init__(self, resolution: float, num_classes: int) -> None:
         self.resolution = resolution
         self.num_classes = num_classes
+        num_words = mask_bytes(num_classes)
         self.bricks = Bricks(
-            codes=np.empty(0, np.int64), tiers=np.empty(0, np.uint8), rows=np.empty(0, np.int32),
-            values=np.empty(0, np.float32), known=np.empty(0, np.uint64), revisions=np.empty(0, np.int64),
-            table=np.full(64, -1, np.int32), counters=np.zeros(4, np.int64), free_scalar=np.empty(0, np.int32),
-            scalar=np.empty((0, storage.BRICK_CELLS), np.float32),
-            vector=np.empty((0, num_classes, storage.BRICK_CELLS), np.float32),
+            codes=np.empty(0, np.int64), blocks=np.empty(0, np.int32), values=np.empty(0, np.float32),
+            masks=np.empty((0, num_words), np.uint64), known=np.empty(0, np.uint64), revisions=np.empty(0, np.int64),
+            table=np.full(64, -1, np.int32), counters=np.zeros(3, np.int64),
+            free=np.full(num_classes * storage.OCTETS // storage.GROWTH + 1, -1, np.int32),
+            rows=np.empty((0, storage.OCTETS), np.float32),
         )  # fmt: skip
 
     @property
@@ -88,32 +102,21 @@ class SemanticOctree:
     def memory_bytes(self) -> int:
         """Bytes allocated for the bricks in use: their values, masks and bookkeeping."""
         counters = self.bricks.counters
-        rows = counters[storage.NUM_SCALAR] - counters[storage.NUM_FREE_SCALAR]
-        per_brick = sum(array.itemsize for array in self.bricks[:6])
-        return int(
-            self.num_bricks * per_brick
-            + self.bricks.table.nbytes
-            + rows * storage.BRICK_CELLS * 4
-            + counters[storage.NUM_VECTOR] * storage.BRICK_CELLS * 4 * self.num_classes
-        )
+        num_rows = counters[storage.NUM_ROWS] - counters[storage.NUM_FREE_ROWS]
+        per_brick = storage.BRICK_BYTES + self.bricks.masks.itemsize * self.bricks.masks.shape[1]
+        return int(self.num_bricks * per_brick + self.bricks.table.nbytes + num_rows * storage.ROW_BYTES)
 
-    def reserve(self, bricks: int = 0, scalar: int = 0, vector: int = 0) -> None:
+    def reserve(self, bricks: int = 0, rows: int = 0) -> None:
         """Make room for so many more bricks and rows of values."""
         old = self.bricks
-        counters = old.counters
         num = self.num_bricks
         changes: dict[str, Any] = {}
         if num + bricks > old.codes.size:
-            for name in ("codes", "tiers", "rows", "values", "known", "revisions"):
+            for name in ("codes", "blocks", "values", "masks", "known", "revisions"):
                 changes[name] = _grown(getattr(old, name), num, num + bricks)
-        free = int(counters[storage.NUM_FREE_SCALAR])
-        used = int(counters[storage.NUM_SCALAR])
-        if used + scalar - free > old.scalar.shape[0]:
-            changes["scalar"] = _grown(old.scalar, used, used + scalar - free)
-            changes["free_scalar"] = _grown(old.free_scalar, free, changes["scalar"].shape[0])
-        used = int(counters[storage.NUM_VECTOR])
-        if used + vector > old.vector.shape[0]:
-            changes["vector"] = _grown(old.vector, used, used + vector)
+        used = int(old.counters[storage.NUM_ROWS])
+        if used + rows > len(old.rows):
+            changes["rows"] = _grown(old.rows, used, used + rows)
         size = old.table.size
         while size < 2 * (num + bricks):
             size *= 2
@@ -137,32 +140,18 @@ class SemanticOctree:
         storage.find_or_add(self.bricks, codes, indices)
         return indices
 
-    def raise_tiers(self, tiers: UInt8Array) -> None:
-        """Raise brick i to at least tier ``tiers[i]``, for all bricks (n,)."""
-        present = self.bricks.tiers[: self.num_bricks]
-        self.reserve(
-            scalar=int(np.count_nonzero((tiers == storage.SCALAR) & (present == storage.UNIFORM))),
-            vector=int(np.count_nonzero((tiers == storage.VECTOR) & (present != storage.VECTOR))),
-        )
-        storage.make_tiers(self.bricks, tiers)
-
-    def addresses(self, indices: Int64Array) -> tuple[Int64Array, UInt8Array]:
-        """Memory addresses and tiers (n,) of the bricks ``indices`` (n,); valid until this octree grows."""
-        addresses = np.empty(indices.size, np.int64)
-        tiers = np.empty(indices.size, np.uint8)
-        storage.brick_addresses(
-            self.bricks, indices, self.bricks.scalar.ctypes.data, self.bricks.vector.ctypes.data,
-            self.bricks.values.ctypes.data, addresses, tiers,
-        )  # fmt: skip
-        return addresses, tiers
+    def raise_bricks(self, indices: Int64Array, masks: UInt64Array) -> None:
+        """Give the bricks ``indices`` (n,) blocks that have at least the rows of ``masks`` (n, W)."""
+        self.reserve(rows=storage.rows_to_raise(self.bricks, indices, masks))
+        storage.raise_bricks(self.bricks, indices, masks, self.num_classes)
 
     def overwrite(self, source: SemanticOctree, indices: Int64Array, revision: int = 0) -> None:
         """Replace the bricks that ``indices`` (n,) name in ``source`` by its values."""
         own = self.find_or_add(source.codes[indices])
-        tiers = self.bricks.tiers[: self.num_bricks].copy()
-        tiers[own] = np.maximum(tiers[own], source.bricks.tiers[indices])
-        self.raise_tiers(tiers)
-        storage.copy_bricks(source.bricks, indices, self.bricks, own)
+        table = brick_table([source], source.codes[indices])
+        has_block = table.addresses[0] != 0
+        self.raise_bricks(own[has_block], table.masks[0, has_block])
+        storage.store_bricks(self.bricks, own, source.known[indices], table, self.num_classes)
         self.bricks.revisions[own] = revision
 
     def copy(self) -> Self:
@@ -178,16 +167,25 @@ class SemanticOctree:
         finest cell is a leaf.
         """
         order = _code_order(self, indices)
-        tiers = self.bricks.tiers[order]
-        num_cells = np.bitwise_count(self.bricks.known[order])
-        num_uniform = np.count_nonzero((tiers == storage.UNIFORM) & (num_cells == storage.BRICK_CELLS)) if prune else 0
-        num_leaves = int(num_cells.sum()) - num_uniform * (storage.BRICK_CELLS - 1)
-        words = np.empty(order.size * (storage.BRICK_DEPTH + 9) + 1, np.uint16)
-        scalars = np.empty(num_leaves + 1, np.float32)
-        vectors = np.empty((int(num_cells[tiers == storage.VECTOR].sum()), self.num_classes), np.float32)
-        totals = np.zeros(3, np.int64)
-        packets.encode_bricks(self.bricks, order, prune, np.float32(tolerance), words, scalars, vectors, totals)
-        return TreeStreams(words[: totals[0]], scalars[: totals[1]], vectors[: totals[2]])
+        bricks = self.bricks
+        # At most so many of each: every known cell a leaf, and every class with a row different in all its cells.
+        num_cells = np.bitwise_count(bricks.known[order])
+        has_rows = bricks.masks[order].any(axis=1)
+        one_leaf = (bricks.blocks[order] < 0) & (num_cells == storage.BRICK_CELLS) if prune else np.False_
+        num_leaves = int(np.where(one_leaf, 1, num_cells).sum())
+        num_masks = int(num_cells[has_rows].sum())
+        num_own = int(np.bitwise_count(bricks.masks[order]).sum()) * storage.OCTETS
+        streams = TreeStreams(
+            np.empty(order.size * (storage.BRICK_DEPTH + 9) + 1, np.uint16),
+            np.empty(num_leaves + 1, np.float32),
+            np.empty((num_masks + 1, mask_bytes(self.num_classes)), np.uint8),
+            np.empty(num_own + self.num_classes, np.float32),
+        )
+        totals = np.zeros(4, np.int64)
+        scratch = _encoder_scratch(self.num_classes, is_lossy=prune and tolerance > 0)
+        packets.encode_bricks(bricks, order, self.num_classes, prune, np.float32(tolerance), scratch, *streams, totals)
+        words, values, masks, own_values = streams
+        return TreeStreams(words[: totals[0]], values[: totals[1]], masks[: totals[2]], own_values[: totals[3]])
 
     def leaves(self, prior: float = 0.0, *, occupied_only: bool = False) -> LeafTable:
         """All leaves in Morton order, or those that are more likely occupied by some class than free.
@@ -197,17 +195,21 @@ class SemanticOctree:
         streams = self.streams()
         codes, depths, is_vector = leaf_list(streams)
         if occupied_only:
-            scalars = streams.scalars + np.float32(prior) > 0
-            vectors = (streams.vectors + np.float32(prior) > 0).any(axis=1)
-            chosen = np.empty(codes.size, np.bool_)
-            chosen[is_vector], chosen[~is_vector] = vectors, scalars
+            num_own = np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)
+            occupied_own = np.repeat(np.arange(num_own.size), num_own)[streams.own_values + np.float32(prior) > 0]
+            chosen = streams.values + np.float32(prior) > 0
+            chosen[np.flatnonzero(is_vector)[occupied_own]] = True
+            chosen_vectors = chosen[is_vector]
+            streams = TreeStreams(
+                streams.words, streams.values[chosen], streams.masks[chosen_vectors],
+                streams.own_values[np.repeat(chosen_vectors, num_own)],
+            )  # fmt: skip
             codes, depths, is_vector = codes[chosen], depths[chosen], is_vector[chosen]
-            streams = TreeStreams(streams.words, streams.scalars[scalars], streams.vectors[vectors])
         sizes = np.exp2(storage.KEY_BITS - depths.astype(np.float64)) * self.resolution
         keys = np.empty((codes.size, 3), np.int64)
         storage.codes_to_keys(codes, keys)
         centers = keys * self.resolution + sizes[:, None] / 2
-        return LeafTable(centers, sizes, leaf_values(streams, is_vector) + np.float32(prior))
+        return LeafTable(centers, sizes, leaf_values(streams, is_vector, self.num_classes) + np.float32(prior))
 
     def lookup(self, coords: Float64Array) -> tuple[Float32Array, BoolArray, Float64Array]:
         """What is at each coordinate (P, 3) [m]: deviations (P, C) float32, known (P,), size of the leaf (P,) [m].
@@ -227,17 +229,50 @@ class SemanticOctree:
         known = inside & (leaf >= 0)
         known[known] = cell_codes[known] < (codes + spans)[leaf[known]]
         log_odds = np.zeros((len(keys), self.num_classes), np.float32)
-        log_odds[known] = leaf_values(streams, is_vector)[leaf[known]]
+        log_odds[known] = leaf_values(streams, is_vector, self.num_classes)[leaf[known]]
         sizes = np.zeros(len(keys))
         sizes[known] = np.exp2(storage.KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
         return log_odds, known, sizes
 
 
+def mask_bytes(num_classes: int) -> int:
+    """Bytes of a mask with one bit for each class."""
+    return -(-num_classes // 8)
+
+
 def _grown(array: npt.NDArray[Any], used: int, wanted: int) -> npt.NDArray[Any]:
     """A copy of the first ``used`` rows with room for at least ``wanted``; rows never touched take no memory."""
-    larger = np.empty((max(wanted, 2 * array.shape[0], 64), *array.shape[1:]), array.dtype)
+    larger = cache_aligned((max(wanted, 2 * array.shape[0], 64), *array.shape[1:]), array.dtype)
     larger[:used] = array[:used]
     return larger
+
+
+def cache_aligned(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """An array, not set, that starts at a cache line: a vector instruction that crosses two takes twice as long."""
+    num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    room = np.empty(num_bytes + CACHE_LINE, np.uint8)
+    start = -room.ctypes.data % CACHE_LINE
+    return room[start : start + num_bytes].view(dtype).reshape(shape)
+
+
+def brick_table(octrees: Sequence[SemanticOctree], codes: Int64Array, since: int = 0, run: Run = map) -> BrickTable:
+    """Where the bricks ``codes`` (n,) of each octree are, and which have a revision from ``since`` on.
+
+    ``run`` does the octrees' columns, like ``map`` or in threads.
+    """
+    shape = (len(octrees), codes.size)
+    num_words = max((mask_bytes(octree.num_classes) for octree in octrees), default=1)
+    table = BrickTable(
+        addresses=np.empty(shape, np.int64), values=np.empty(shape, np.float32),
+        masks=np.empty((*shape, num_words), np.uint64), known=np.empty(shape, np.uint64),
+        is_changed=np.empty(shape, np.bool_),
+    )  # fmt: skip
+
+    def fill(column: int) -> None:
+        storage.fill_table(octrees[column].bricks, octrees[column].find(codes), since, table, column)
+
+    list(run(fill, range(len(octrees))))
+    return table
 
 
 def _code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int64Array:
@@ -248,21 +283,23 @@ def _code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> In
     return order
 
 
-def unpruned_bytes(octree: SemanticOctree) -> int:
-    """Size of the octree's streams without pruning, counted without writing them."""
-    order = _code_order(octree)
-    if order.size == 0:
-        return 0
-    codes, known = octree.bricks.codes[order], octree.bricks.known[order]
-    # A brick opens as many nodes above it as the digits of its code that differ from the last one's, without the last.
-    num_bits = np.frexp((codes[1:] ^ codes[:-1]).astype(np.float64))[1]
-    num_nodes = storage.BRICK_DEPTH + int(((num_bits - 1) // 3).sum())
-    num_words = num_nodes + order.size + np.count_nonzero(known.view(np.uint8))
-    masks = np.empty(order.size, np.uint64)
-    packets.vector_masks(octree.bricks, order, masks)
-    num_vectors = int(np.bitwise_count(masks).sum())
-    num_scalars = int(np.bitwise_count(known).sum()) - num_vectors
-    return int(2 * num_words + 4 * num_scalars + 4 * num_vectors * octree.num_classes)
+def _encoder_scratch(num_classes: int, *, is_lossy: bool) -> packets.EncoderScratch:
+    """What the encoder works in."""
+    most_rows = storage.OCTETS * (num_classes + 1)
+    low = np.empty((storage.BRICK_DEPTH + 1, 8, num_classes), np.float32)
+    return packets.EncoderScratch(
+        block=np.empty((most_rows, storage.OCTETS), np.float32),
+        octets=np.arange(most_rows),
+        classes=np.zeros(most_rows, np.int64),
+        flags=np.empty((2, storage.BRICK_CELLS), np.uint8),
+        octet_rows=np.empty((storage.OCTETS, num_classes), np.int64),
+        num_rows=np.empty(storage.OCTETS, np.int64),
+        class_values=np.empty(num_classes, np.float32),
+        before=np.empty((storage.BRICK_DEPTH + 1, 4), np.int64),
+        states=np.empty((storage.BRICK_DEPTH, 8), np.uint8),
+        low=low,
+        high=np.empty_like(low) if is_lossy else low,
+    )
 
 
 def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -295,11 +332,12 @@ def _brick_masks(streams: TreeStreams) -> BrickMasks:
     """The bricks of a stream. Raises ValueError when the words are no octree with so many leaves."""
     size = min(streams.num_leaves, 8 * streams.words.size)
     arrays = (*np.empty((2, size), np.int64), *np.empty((3, size), np.uint64))
-    found = packets.read_words(_read_only(streams.words), *arrays)
+    path = np.empty((3, storage.BRICK_DEPTH), np.int64)
+    found = packets.read_words(_read_only(streams.words), path, *arrays)
     masks = BrickMasks(*(array[: max(found, 0)] for array in arrays))
+    num_leaves = np.bitwise_count(masks.starts).sum()
     num_vectors = np.bitwise_count(masks.vector).sum()
-    num_scalars = np.bitwise_count(masks.starts).sum() - num_vectors
-    if found < 0 or (num_scalars, num_vectors) != (streams.scalars.size, streams.vectors.shape[0]):
+    if found < 0 or (num_leaves, num_vectors) != (streams.num_leaves, len(streams.masks)):
         raise ValueError("the words are no octree with that many leaves")
     return masks
 
@@ -326,12 +364,18 @@ def leaf_list(streams: TreeStreams) -> tuple[Int64Array, Int32Array, BoolArray]:
     return codes, depths, _cells(masks.vector)[first_cells]
 
 
-def leaf_values(streams: TreeStreams, is_vector: BoolArray) -> Float32Array:
+def leaf_values(streams: TreeStreams, is_vector: BoolArray, num_classes: int) -> Float32Array:
     """Values (L, C) float32 of the leaves in order."""
-    values = np.empty((is_vector.size, streams.vectors.shape[1]), np.float32)
-    values[is_vector] = streams.vectors
-    values[~is_vector] = streams.scalars[:, None]
+    values = np.repeat(streams.values[:, None], num_classes, axis=1)
+    has_own = np.zeros(values.shape, np.bool_)
+    has_own[is_vector] = _class_bits(streams.masks)[:, :num_classes]
+    values[has_own] = streams.own_values
     return values
+
+
+def _class_bits(masks: UInt8Array) -> BoolArray:
+    """Whether each class has a value of its own, (V, 8 B) of masks (V, B)."""
+    return np.unpackbits(masks, axis=1, bitorder="little").view(np.bool_)
 
 
 MAX_BRICKS = 1 << 24
@@ -340,18 +384,23 @@ MAX_BYTES = 1 << 32
 """Most memory for the values of one octree that is built from leaves."""
 
 
-def octree_from_streams(streams: TreeStreams, resolution: float) -> SemanticOctree:
+def octree_from_streams(streams: TreeStreams, resolution: float, num_classes: int) -> SemanticOctree:
     """The octree of a depth-first stream. Raises ValueError when the stream is no octree, or too large a one."""
-    masks = _brick_masks(streams)
-    octree = SemanticOctree(resolution, streams.vectors.shape[1])
-    num_bricks = int(masks.spans.sum())
+    bricks = _brick_masks(streams)
+    num_own = int(np.bitwise_count(streams.masks).sum())
+    if num_own != streams.own_values.size or _class_bits(streams.masks)[:, num_classes:].any():
+        raise ValueError("the masks are not those of that many values of that many classes")
+    octree = SemanticOctree(resolution, num_classes)
+    num_bricks = int(bricks.spans.sum())
     if num_bricks > MAX_BRICKS:
         raise ValueError("the stream holds more space than an octree may")
-    is_vector = masks.vector != 0
-    num_vector = int(masks.spans[is_vector].sum())
-    num_scalar = int(np.count_nonzero(~is_vector & ~masks.is_leaf))
-    if (num_scalar + num_vector * octree.num_classes) * storage.BRICK_CELLS * 4 > MAX_BYTES:
+    class_masks = np.zeros((bricks.codes.size, mask_bytes(num_classes)), np.uint64)
+    num_rows = packets.read_class_masks(bricks, _read_only(streams.masks), class_masks)
+    if num_rows * storage.ROW_BYTES > MAX_BYTES:
         raise ValueError("the stream holds more values than an octree may")
-    octree.reserve(bricks=num_bricks, scalar=num_scalar, vector=num_vector)
-    packets.fill_bricks(octree.bricks, *masks, _read_only(streams.scalars), _read_only(streams.vectors))
+    octree.reserve(bricks=num_bricks, rows=num_rows)
+    packets.fill_bricks(
+        octree.bricks, bricks, class_masks, num_classes, _read_only(streams.values), _read_only(streams.masks),
+        _read_only(streams.own_values),
+    )  # fmt: skip
     return octree

@@ -64,7 +64,6 @@ class TouchedCells:
     codes: Int64Array
     marks: UInt8Array
     touched: Int64Array
-    num_hit_bricks: int
 
 
 class ScanCaster:
@@ -76,8 +75,8 @@ class ScanCaster:
         self._num_classes = num_classes
         self._low, self._high = np.array(map_config.box).reshape(2, 3)
         self._is_bounded = bool(np.isfinite(map_config.box).any())
-        self._invalid = np.array(sensor.invalid_depth, np.float64)
-        self._no_return = np.array(sensor.no_return_depth, np.float64)
+        self._special = np.array(sensor.invalid_depth + sensor.no_return_depth, np.float64)
+        self._meanings = np.repeat([0.0, np.inf], [len(sensor.invalid_depth), len(sensor.no_return_depth)])
         self._marks = np.zeros(0, np.uint8)
         self._flags = np.zeros(0, np.uint8)
         self._runs = _Runs(0, num_classes, sensor.rays)
@@ -95,14 +94,16 @@ class ScanCaster:
         num_ends = runs.reduce(low, high, self._num_classes)
         end_keys = runs.end_keys[:num_ends]
         corner, num_blocks, marks, flags = self._grid(low, high)
-        casting.mark_free(origin, *runs.rays(num_ends), self._resolution, corner, num_blocks, marks, flags)
-        casting.mark_hits(end_keys, runs.end_marks[:num_ends], corner, num_blocks, marks, flags)
+        start = self._start(origin, corner)
+        tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
+        casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
+        casting.mark_hits(end_keys, runs.end_marks[:num_ends], corner, tables, marks, flags)
         if self._is_bounded:
             casting.clear_outside(*self._mapped(corner, num_blocks), num_blocks, marks, flags)
         most = np.count_nonzero(flags) * casting.BRICKS_PER_BLOCK
         touched, codes = np.empty(most, np.int64), np.empty(most, np.int64)
-        count, num_hit = casting.touched_bricks(marks.view(np.uint64), flags, corner, num_blocks, touched, codes)
-        return TouchedCells(codes[:count], marks, touched[:count], num_hit)
+        count = casting.touched_bricks(marks.view(np.uint64), flags, corner, num_blocks, touched, codes)
+        return TouchedCells(codes[:count], marks, touched[:count])
 
     def _find_runs(self, frame: Frame) -> None:
         """Put the ends of the scan's rays into the runs."""
@@ -127,11 +128,11 @@ class ScanCaster:
         classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
         # A float image stores a value such as 2.1 as its nearest float32, and that is what it is to be compared with.
         stored = np.float32 if kind is np.float32 else np.float64
-        invalid, no_return = (a.astype(stored).astype(np.float64) for a in (self._invalid, self._no_return))
+        special = self._special.astype(stored).astype(np.float64)
         ends.depth_to_runs(
             np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-            self._sensor.max_range, largest, invalid, no_return, *self._runs.outputs,
+            self._sensor.max_range, largest, special, self._meanings, *self._runs.outputs,
         )  # fmt: skip
 
     def _find_cloud_runs(self, frame: CloudFrame, pose: Float64Array) -> None:
@@ -180,6 +181,13 @@ class ScanCaster:
             self._flags = np.zeros(size, np.uint8)
         marks = self._marks[: size * casting.BLOCK_CELLS]
         return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
+
+    def _start(self, origin: Float64Array, corner: Int64Array) -> Float64Array:
+        """Where rays begin, in cells of a scratch grid and without what is finer than casting.FRACTION."""
+        coords = origin / self._resolution
+        keys = np.floor(coords)
+        inside = np.minimum(np.rint((coords - keys) / casting.FRACTION) * casting.FRACTION, 1.0 - casting.FRACTION)
+        return np.asarray(keys - corner + inside)
 
     def _mapped(self, corner: Int64Array, num_blocks: Int64Array) -> tuple[Int64Array, Int64Array]:
         """The cells [low, high) (3,) of a scratch grid whose centres lie within the bounds."""
@@ -243,9 +251,17 @@ class _Runs:
 def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
     """Add one scan's increments to an octree; changed bricks get ``revision``."""
     indices = octree.find_or_add(cells.codes)
-    octree.reserve(scalar=cells.codes.size, vector=cells.num_hit_bricks if octree.num_classes > 1 else 0)
+    words = cells.marks.view(np.uint64)
+    miss, least, most = np.float32(increments.miss), np.float32(increments.least), np.float32(increments.most)
+    wanted = np.zeros((indices.size, octree.bricks.masks.shape[1]), np.uint64)
+    changes = np.empty(indices.size, np.bool_)
+    evidence.wanted_rows(
+        octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, changes
+    )
+    indices = indices[changes]
+    octree.raise_bricks(indices, wanted[changes])
     evidence.apply_marks(
-        octree.bricks, indices, cells.touched, cells.marks, cells.marks.view(np.uint64), np.float32(increments.hit),
-        np.float32(increments.miss), np.float32(increments.hit_other), np.float32(increments.least),
-        np.float32(increments.most), revision,
+        octree.bricks, indices, cells.touched[changes], words, octree.num_classes, np.float32(increments.hit), miss,
+        np.float32(increments.hit_other), least, most, revision,
+        np.empty((2, storage.OCTETS * (octree.num_classes + 1)), np.uint64),
     )  # fmt: skip

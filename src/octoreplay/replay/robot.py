@@ -10,8 +10,8 @@ import numpy as np
 
 from octoreplay.config import RunConfig
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Evidence, consensus_step, gamma_at, sum_of_evidence
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, octree_from_streams, unpruned_bytes
+from octoreplay.mapping.consensus import Evidence, Step, gamma_at, sum_of_evidence, team_step
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams, octree_from_streams
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -113,74 +113,77 @@ class Robot:
         The sizes without pruning are 0 unless ``with_unpruned``: they take as long as the packet itself.
         """
         compress = self._config.network.packet_compression == "zstd"
-        resolution = self.map.resolution
-        packet = codec.pack(self.streams, resolution, codec.FULL, compress=compress)
+        packet = codec.pack(self.map, self.streams, codec.FULL, compress=compress)
         # What decoding the packet gives, without undoing the compression.
-        received = octree_from_streams(self.streams, resolution)
+        received = octree_from_streams(self.streams, self.map.resolution, self.map.num_classes)
         received.revisions[:] = self.map.revisions[self.map.find(received.codes)]
+        unpruned = self.map.streams(prune=False) if with_unpruned else None
         return PublishedMap(
             packet=packet,
             octree=received,
             octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
             grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + unpruned_bytes(self.map) if with_unpruned else 0,
-            unpruned_compressed_bytes=len(codec.encode_packet(self.map, prune=False)) if with_unpruned else 0,
+            unpruned_bytes=codec.HEADER_BYTES + unpruned.num_bytes if unpruned else 0,
+            unpruned_compressed_bytes=len(codec.pack(self.map, unpruned, codec.FULL, compress=True)) if unpruned else 0,
         )
 
-    def iterate(self, own: PublishedMap | None, arrived: Sequence[Arrival], factor: float, tick: int) -> float:
-        """All iterations of one tick with the neighbours' maps that ``arrived``.
+    def iterate_on_arrival(
+        self, own: PublishedMap | None, arrived: Sequence[Arrival], factor: float, tick: int
+    ) -> float:
+        """One iteration for each of the neighbours' maps that ``arrived``, in their order.
 
         ``factor`` scales gamma (settling ramps it to 0). Returns the largest change of a log-odds.
         """
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
-        if consensus.mode == "sync" or not arrived:
-            lossy = self._config.map.prune_tolerance > 0
-            gamma = factor * gamma_at(consensus, self.num_iterations)
-            conditions = (gamma, *((sender, weight) for sender, _, weight in arrived))
-            since = self._last_step_tick if conditions == self._last_conditions and not lossy else None
-            change = self._step(own.octree if own and lossy else None, arrived, gamma, tick, since)
-            self._last_conditions, self._last_step_tick = conditions, tick
-        else:
-            # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
-            base = own.octree if own is not None and consensus.rule == "bayes" else None
-            share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
-            before = self.map.copy()
-            for arrival in arrived:
-                self._step(base, [arrival], share * gamma_at(consensus, self.num_iterations), tick)
-            # What one arrival changes another may undo; what counts is the change over the tick.
-            change = consensus_step(before, (), (), self.map, rule="local", gamma=0.0, revision=tick)
-        self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
-        return change
+        # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
+        base = own.octree if own is not None and consensus.rule == "bayes" else None
+        share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
+        before = self.map.copy()
+        for arrival in arrived:
+            step = self._step([arrival], share * gamma_at(consensus, self.num_iterations), base)
+            team_step([step], rule=consensus.rule, revision=tick)
+            self._finish_step(tick)
+        self._prune()
+        # What one arrival changes another may undo; what counts is the change over the tick.
+        return team_step([Step(before, (), (), self.map, 0.0)], rule="local", revision=tick)[0]
+
+    def next_step(self, own: PublishedMap | None, arrived: Sequence[Arrival], factor: float, tick: int) -> Step:
+        """The one iteration of a tick with all the maps that ``arrived``; ``end_step`` must follow."""
+        consensus = self._config.consensus
+        self._update_log_likelihood(tick)
+        lossy = self._config.map.prune_tolerance > 0
+        gamma = factor * gamma_at(consensus, self.num_iterations)
+        conditions = (gamma, *((sender, weight) for sender, _, weight in arrived))
+        since = self._last_step_tick if conditions == self._last_conditions and not lossy else None
+        self._last_conditions, self._last_step_tick = conditions, tick
+        return self._step(arrived, gamma, own.octree if own and lossy else None, since)
+
+    def end_step(self, tick: int) -> None:
+        """Take note of the iteration that ``next_step`` described."""
+        self._finish_step(tick)
+        self._prune()
 
     def _step(
-        self,
-        base: SemanticOctree | None,
-        arrived: Sequence[Arrival],
-        gamma: float,
-        tick: int,
-        since: int | None = None,
-    ) -> float:
-        """One iteration of the rule; bricks at rest ``since`` the last one are skipped."""
-        consensus = self._config.consensus
-        change = consensus_step(
-            self.map,
-            [arrival.octree for arrival in arrived],
-            [arrival.weight for arrival in arrived],
-            self._log_likelihood,
-            rule=consensus.rule,
-            gamma=gamma,
-            revision=tick,
-            base=base,
-            last_log_likelihood=self._last_log_likelihood,
-            since=since,
-        )
+        self, arrived: Sequence[Arrival], gamma: float, base: SemanticOctree | None, since: int | None = None
+    ) -> Step:
+        """An iteration with some neighbours' maps; bricks at rest ``since`` the last one are skipped."""
+        return Step(
+            self.map, [arrival.octree for arrival in arrived], [arrival.weight for arrival in arrived],
+            self._log_likelihood, gamma, base, self._last_log_likelihood, since,
+        )  # fmt: skip
+
+    def _finish_step(self, tick: int) -> None:
+        """Count an iteration, and keep the evidence that it used."""
         self.num_iterations += 1
-        if consensus.rule == "bayes":
+        if self._config.consensus.rule == "bayes":
             changed = np.flatnonzero(self._log_likelihood.revisions > self._likelihood_tick)
             self._last_log_likelihood.overwrite(self._log_likelihood, changed, tick)
             self._likelihood_tick = tick
-        return change
+
+    def _prune(self) -> None:
+        """The map's streams, with its leaves merged."""
+        self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
 
     def _update_log_likelihood(self, tick: int) -> None:
         """Bring log q_i up to the scans of this tick; for ``sum`` it is the evidence itself."""

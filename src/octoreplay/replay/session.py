@@ -18,7 +18,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.discover import resolve
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.io.robot_log import RobotLog
-from octoreplay.mapping.consensus import sum_of_evidence
+from octoreplay.mapping.consensus import sum_of_evidence, team_step
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
@@ -169,17 +169,25 @@ class Session:
         self, graph: CommunicationGraph, published: Sequence[PublishedMap | None], factor: float, number: int
     ) -> list[float]:
         """Every active robot's iterations with the maps that its neighbours published; the largest changes."""
-        epsilon = step_size(graph, self.config.consensus)
-
-        def iterate(index: int) -> float:
-            arrived = [
+        consensus = self.config.consensus
+        epsilon = step_size(graph, consensus)
+        arrived = {
+            index: [
                 Arrival(sender, packet.octree, 2.0 * epsilon * float(graph.weights[index, sender]))
                 for sender in graph.neighbours(index)
                 if (packet := published[sender]) is not None
             ]
-            return self._robots[index].iterate(published[index], arrived, factor, number)
-
-        return self._each(iterate, graph.active)
+            for index in graph.active
+        }
+        # One iteration with all maps, also where none arrived; the others make one for each map.
+        together = [index for index in graph.active if consensus.mode == "sync" or not arrived[index]]
+        alone = [index for index in graph.active if index not in together]
+        robots = self._robots
+        steps = self._each(lambda i: robots[i].next_step(published[i], arrived[i], factor, number), together)
+        changes = team_step(steps, rule=consensus.rule, revision=number, threads=self._threads)
+        self._each(lambda i: robots[i].end_step(number), together)
+        changes += self._each(lambda i: robots[i].iterate_on_arrival(published[i], arrived[i], factor, number), alone)
+        return changes
 
     def _measure(
         self,

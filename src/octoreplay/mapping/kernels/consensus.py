@@ -7,18 +7,20 @@ reduced over lanes: the order of a floating point sum is part of the result.
 from __future__ import annotations
 
 import numpy as np
-from numba import carray
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.intrinsics import float_pointer, fma, prefetch_line, same_bits
-from octoreplay.mapping.kernels.storage import (
-    ABSENT,
-    BRICK_CELLS,
-    SCALAR,
-    UNIFORM,
-    VECTOR,
-    collapse,
+from octoreplay.mapping.kernels.intrinsics import (
+    add_octet,
+    copy_octet,
+    count_ones,
+    float_array,
+    fma,
+    lowest_one,
+    prefetch_line,
+    raise_octet,
+    same_bits,
 )
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, collapse, load
 
 GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
@@ -38,212 +40,290 @@ def exp_negative(x):
     return same_bits(same_bits(p) + (same_bits(shifted) << np.int32(23)))
 
 
-@kernel
-def prefetch(address, tier, num_classes):
-    """Ask for a brick's data ahead of its use: bricks lie in another order in every octree."""
-    if tier == ABSENT:
-        return
-    size = 4 if tier == UNIFORM else BRICK_CELLS * 4
-    if tier == VECTOR:
-        size *= num_classes
-    for offset in range(0, size, 64):
-        prefetch_line(address + offset)
+@inline_kernel
+def prefetch(table, n, column):
+    """Ask for a brick's block ahead of its use: bricks lie in another order in every octree."""
+    if table.addresses[column, n] != 0:
+        # Most maps have one word to a mask.
+        rows = OCTETS + count_ones(table.masks[column, n, 0])
+        for w in range(1, table.masks.shape[2]):
+            rows += count_ones(table.masks[column, n, w])
+        for offset in range(0, rows * ROW_BYTES, 64):
+            prefetch_line(table.addresses[column, n] + offset)
 
 
-@kernel
-def load(target, address, tier, width):
-    """Target (width x 64,) = the brick at ``address``, repeated over the classes; 0 where there is none."""
-    if tier == VECTOR or (tier == SCALAR and width == 1):
-        source = carray(float_pointer(address), target.shape)
-        for i in range(target.size):
-            target[i] = source[i]
-    elif tier == SCALAR:
-        cells = carray(float_pointer(address), (BRICK_CELLS,))
-        rows = target.reshape((width, BRICK_CELLS))
-        for c in range(width):
-            for i in range(BRICK_CELLS):
-                rows[c, i] = cells[i]
-    else:
-        value = carray(float_pointer(address), (1,))[0] if tier == UNIFORM else np.float32(0.0)
-        for i in range(target.size):
-            target[i] = value
+@inline_kernel
+def _rows_at(table, n, column, layout, m, scratch_at, num_classes):
+    """Where a brick's values lie with the rows of the mask ``layout[m]``: in its block, or copied to ``scratch_at``."""
+    place = table.addresses[column, n]
+    other = np.uint64(place == 0) | (table.masks[column, n, 0] ^ layout[m, 0])
+    for w in range(1, layout.shape[1]):
+        other |= table.masks[column, n, w] ^ layout[m, w]
+    if other != 0:
+        load(scratch_at, table, n, column, layout, m, num_classes)
+        place = scratch_at
+    return place
 
 
-@kernel
-def _add_difference(target, base, address, tier, width, weight):
-    """Target (width x 64,) += weight x (the brick at ``address`` - base)."""
-    if tier == VECTOR or (tier == SCALAR and width == 1):
-        source = carray(float_pointer(address), target.shape)
-        for i in range(target.size):
-            target[i] = fma(source[i] - base[i], weight, target[i])
-    elif tier == SCALAR:
-        cells = carray(float_pointer(address), (BRICK_CELLS,))
-        rows = target.reshape((width, BRICK_CELLS))
-        base_rows = base.reshape((width, BRICK_CELLS))
-        for c in range(width):
-            for i in range(BRICK_CELLS):
-                rows[c, i] = fma(cells[i] - base_rows[c, i], weight, rows[c, i])
-    else:
-        value = carray(float_pointer(address), (1,))[0] if tier == UNIFORM else np.float32(0.0)
-        for i in range(target.size):
-            target[i] = fma(value - base[i], weight, target[i])
+OWN, BASE, EVIDENCE, OLD_EVIDENCE, FIRST_NEIGHBOUR = 0, 1, 2, 3, 4
+"""A robot's columns of the table: its own map, the map that it published (the base of the differences), its evidence
+log q, its evidence at the last iteration, then its neighbours' maps."""
+
+NUM_SCRATCH_BLOCKS = 5
+"""Blocks that a step works in: the mixed map, its distance to the evidence, and three for the gradient."""
 
 
-OWN, BASE, EVIDENCE, OLD_EVIDENCE, NEIGHBOURS = 0, 1, 2, 3, 4
-"""Columns of the address table of a consensus step: the robot's own map, the map that it published (the base of the
-differences), its evidence log q, its evidence at the last iteration, then the neighbours' maps."""
-
-
-PREFETCH_AHEAD = 6
+PREFETCH_AHEAD = 4
 """Bricks between the one that is asked for and the one in work: a few microseconds."""
 
 
 @kernel
-def _add_gradient(mixed_at, delta_at, sigma_at, top_at, width, terms, gamma):
-    """Mixed (width, 64) += gamma x the gradient, with ``delta`` (width, 64) = h~ - log q; all given by address.
+def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, rows, num_classes, gamma):
+    """Mixed (rows, 8) += gamma x the gradient, with ``delta`` (rows, 8) = h~ - log q; all given by address.
 
-    Every row stands for ``terms`` equal classes. ``sigma`` (width, 64) and ``top`` (3, 64) are scratch.
+    The first eight rows stand for all the classes of their octet that have no row; ``octets`` (rows,) are the octets of
+    the others. ``scratch_at`` has place for three arrays of ``room`` bytes and four rows of a brick's cells.
     """
-    mixed = carray(float_pointer(mixed_at), (width, BRICK_CELLS))
-    delta = carray(float_pointer(delta_at), (width, BRICK_CELLS))
-    sigma = carray(float_pointer(sigma_at), (width, BRICK_CELLS))
-    top = carray(float_pointer(top_at), (BRICK_CELLS,))
-    total = carray(float_pointer(top_at + BRICK_CELLS * 4), (BRICK_CELLS,))
-    dot = carray(float_pointer(top_at + BRICK_CELLS * 8), (BRICK_CELLS,))
+    size = rows * OCTETS
+    mixed = float_array(mixed_at, (size,))
+    delta = float_array(delta_at, (size,))
+    sigma_at, spread_at, other_at = scratch_at, scratch_at + room, scratch_at + 2 * room
+    sigma = float_array(sigma_at, (size,))
+    spread = float_array(spread_at, (size,))
+    other = float_array(other_at, (size,))
+    terms_at = scratch_at + 3 * room
+    total_at, dot_at = terms_at + BRICK_CELLS * 4, terms_at + BRICK_CELLS * 8
+    terms = float_array(terms_at, (BRICK_CELLS,))
+    total = float_array(total_at, (BRICK_CELLS,))
+    dot = float_array(dot_at, (BRICK_CELLS,))
     for i in range(BRICK_CELLS):
-        top[i] = np.float32(0.0)
-        total[i] = np.float32(0.0)
-        dot[i] = np.float32(0.0)
-    for c in range(width):
-        for i in range(BRICK_CELLS):
-            top[i] = max(top[i], mixed[c, i])
-    for c in range(width):
-        for i in range(BRICK_CELLS):
-            share = exp_negative(mixed[c, i] - top[i])
-            sigma[c, i] = share
-            total[i] += share
-            dot[i] = fma(share, delta[c, i], dot[i])
+        terms[i] = np.float32(num_classes)
+        spread[i] = max(mixed[i], np.float32(0.0))
+    for r in range(OCTETS, rows):
+        first = octets[r] * OCTETS
+        for k in range(OCTETS):
+            terms[first + k] -= np.float32(1.0)
+        raise_octet(spread_at + octets[r] * ROW_BYTES, mixed_at + r * ROW_BYTES)
+    for r in range(OCTETS, rows):
+        copy_octet(spread_at + r * ROW_BYTES, spread_at + octets[r] * ROW_BYTES)
+    for i in range(size):
+        share = exp_negative(mixed[i] - spread[i])
+        sigma[i] = share
+        other[i] = share * delta[i]
     for i in range(BRICK_CELLS):
-        share = np.float32(1.0) / fma(terms, total[i], exp_negative(-top[i]))
-        dot[i] *= terms * share
-        total[i] = gamma * share
-    for c in range(width):
-        for i in range(BRICK_CELLS):
-            mixed[c, i] = fma(sigma[c, i] * total[i], dot[i] - delta[c, i], mixed[c, i])
+        total[i] = terms[i] * sigma[i]
+        dot[i] = terms[i] * other[i]
+    for r in range(OCTETS, rows):
+        add_octet(total_at + octets[r] * ROW_BYTES, sigma_at + r * ROW_BYTES)
+        add_octet(dot_at + octets[r] * ROW_BYTES, other_at + r * ROW_BYTES)
+    for i in range(BRICK_CELLS):
+        share = np.float32(1.0) / (total[i] + exp_negative(-spread[i]))
+        spread[i] = gamma * share
+        other[i] = dot[i] * share
+    for r in range(OCTETS, rows):
+        copy_octet(spread_at + r * ROW_BYTES, spread_at + octets[r] * ROW_BYTES)
+        copy_octet(other_at + r * ROW_BYTES, other_at + octets[r] * ROW_BYTES)
+    for i in range(size):
+        mixed[i] = fma(sigma[i] * spread[i], other[i] - delta[i], mixed[i])
 
 
 @kernel
-def consensus_step(addresses, tiers, weights, rule, gamma, num_classes, scratch, changes):
-    """One iteration of a rule at one robot, brick by brick, in place in the robot's own map (column OWN).
+def _row_octets(layout, b, octets):
+    """The octet of every row from the ninth on, by the mask ``layout[b]``; returns the number of rows."""
+    rows = np.int64(OCTETS)
+    for w in range(layout.shape[1]):
+        bits = layout[b, w]
+        while bits:
+            octets[rows] = lowest_one(bits) >> 3
+            rows += 1
+            bits &= bits - np.uint64(1)
+    return rows
 
-    ``addresses`` and ``tiers`` (n, NEIGHBOURS + J) say where each brick lies; the own brick has at least the tier of
-    all others. ``weights`` (J,) float32 are 2 epsilon A_ij. ``scratch`` float32 has room for 5 bricks of all classes
-    and 3 of one. ``changes`` (n,) gets each brick's largest change.
-    All classes of a brick that is not VECTOR are equal; the sums over classes then are ``num_classes`` times one term.
+
+@kernel
+def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_weight, size):
+    """Mixed (size,) += the sum of weight x (source - base) of three sources; all given by address."""
+    mixed, base = float_array(mixed_at, (size,)), float_array(base_at, (size,))
+    a, b, c = float_array(a_at, (size,)), float_array(b_at, (size,)), float_array(c_at, (size,))
+    for i in range(size):
+        term = fma(a[i] - base[i], a_weight, mixed[i])
+        term = fma(b[i] - base[i], b_weight, term)
+        mixed[i] = fma(c[i] - base[i], c_weight, term)
+
+
+@kernel
+def team_step(
+    start,
+    end,
+    table,
+    columns,
+    first_columns,
+    weights,
+    gammas,
+    rule,
+    num_classes,
+    layouts,
+    is_awake,
+    scratch,
+    int_scratch,
+    changes,
+    is_even,
+):
+    """One iteration of a rule at R robots, brick by brick for all of them, in place in their own maps.
+
+    ``table`` says where the bricks ``start`` to ``end`` of all maps lie. Robot r's ``columns`` of it are those from
+    ``first_columns[r]`` to ``first_columns[r + 1]``: OWN, BASE, EVIDENCE, OLD_EVIDENCE, then its neighbours', with
+    their ``weights`` 2 epsilon A_ij at the same places. ``layouts`` (R n, W) are the masks of the own bricks, which
+    hold those of all the robot's columns; an own brick is one value only where all others are. Only bricks that are
+    awake (R, n) are worked on. ``changes`` (R, n) get their largest changes, ``is_even`` (R, n) where all values are
+    equal then; what is one value is left in the table.
+
+    ``scratch`` float32 has room for NUM_SCRATCH_BLOCKS blocks with every row, one more for each of a robot's columns,
+    and 3 x 64 values; ``int_scratch`` int64 for two numbers for each row of a block and each of a robot's columns.
     """
-    own_at, room = np.int64(scratch.ctypes.data), num_classes * BRICK_CELLS * 4
-    mixed_at, delta_at, sigma_at, top_at = own_at + room, own_at + 2 * room, own_at + 3 * room, own_at + 5 * room
-    last = addresses.shape[0] - 1
-    for b in range(addresses.shape[0]):
-        ahead = min(b + PREFETCH_AHEAD, last)
-        tier = tiers[b, OWN]
-        width = num_classes if tier == VECTOR else 1
-        terms = np.float32(1.0) if tier == VECTOR else np.float32(num_classes)
-        size = width * BRICK_CELLS
-        own = carray(float_pointer(own_at), (size,))
-        mixed = carray(float_pointer(mixed_at), (size,))
-        delta = carray(float_pointer(delta_at), (size,))
-        prefetch(addresses[ahead, OWN], tiers[ahead, OWN], num_classes)
-        load(own, addresses[b, OWN], tier, width)
-        base = own
-        if addresses[b, BASE] != addresses[b, OWN]:
-            base = carray(float_pointer(own_at + 4 * room), (size,))
-            load(base, addresses[b, BASE], tiers[b, BASE], width)
-        # The sum of the differences comes first: it is exactly 0 where all maps agree.
-        for i in range(size):
-            mixed[i] = np.float32(0.0)
-        for j in range(weights.size):
-            column = NEIGHBOURS + j
-            prefetch(addresses[ahead, column], tiers[ahead, column], num_classes)
-            _add_difference(mixed, base, addresses[b, column], tiers[b, column], width, weights[j])
-        prefetch(addresses[ahead, EVIDENCE], tiers[ahead, EVIDENCE], num_classes)
-        load(delta, addresses[b, EVIDENCE], tiers[b, EVIDENCE], width)
-        if rule == LOCAL:
+    robots = gammas.size
+    room = (num_classes + 1) * BRICK_CELLS * 4
+    mixed_at = np.int64(scratch.ctypes.data)
+    delta_at, gradient_at = mixed_at + room, mixed_at + 2 * room
+    spare_at = mixed_at + NUM_SCRATCH_BLOCKS * room + 3 * BRICK_CELLS * 4
+    octets, places = int_scratch[0], int_scratch[1]
+    for b in range(start, end):
+        for column in range(table.addresses.shape[0]):
+            prefetch(table, min(b + PREFETCH_AHEAD, end - 1), column)
+        for robot in range(robots):
+            if not is_awake[robot, b]:
+                continue
+            m = robot * is_awake.shape[1] + b
+            rows = _row_octets(layouts, m, octets)
+            size = rows * OCTETS
+            first = first_columns[robot]
+            num_columns = first_columns[robot + 1] - first
+            for k in range(num_columns):
+                if k == OLD_EVIDENCE and rule != BAYES:
+                    continue
+                places[k] = _rows_at(table, b, columns[first + k], layouts, m, spare_at + k * room, num_classes)
+            own_at, base_at = places[OWN], places[BASE]
+            own = float_array(own_at, (size,))
+            mixed = float_array(mixed_at, (size,))
+            delta = float_array(delta_at, (size,))
+            # The sum of the differences comes first: it is exactly 0 where all maps agree.
             for i in range(size):
-                mixed[i] = delta[i]
-        elif rule == BAYES:
-            old = carray(float_pointer(sigma_at), (size,))
-            load(old, addresses[b, OLD_EVIDENCE], tiers[b, OLD_EVIDENCE], width)
-            for i in range(size):
-                mixed[i] += own[i] + (delta[i] - old[i])
-        else:
-            for i in range(size):
-                mixed[i] += own[i]
-                delta[i] = mixed[i] - delta[i]
-            if rule == NATURAL:
+                mixed[i] = np.float32(0.0)
+            for k in range(FIRST_NEIGHBOUR, num_columns, 3):
+                b_at, b_weight, c_at, c_weight = base_at, np.float32(0.0), base_at, np.float32(0.0)
+                if k + 1 < num_columns:
+                    b_at, b_weight = places[k + 1], weights[first + k + 1]
+                if k + 2 < num_columns:
+                    c_at, c_weight = places[k + 2], weights[first + k + 2]
+                _add_differences(mixed_at, base_at, places[k], b_at, c_at, weights[first + k], b_weight, c_weight, size)
+            evidence = float_array(places[EVIDENCE], (size,))
+            if rule == LOCAL:
                 for i in range(size):
-                    mixed[i] -= gamma * delta[i]
-            elif gamma != np.float32(0.0):
-                _add_gradient(mixed_at, delta_at, sigma_at, top_at, width, terms, gamma)
-        # Numbers that are not negative are in the order of their bits.
-        largest = np.int32(0)
-        for i in range(size):
-            largest = max(largest, same_bits(abs(mixed[i] - own[i])))
-        changes[b] = same_bits(largest)
-        if largest > 0:
-            target = carray(float_pointer(addresses[b, OWN]), (size,))
-            for i in range(1 if tier == UNIFORM else size):
-                target[i] = mixed[i]
+                    mixed[i] = evidence[i]
+            elif rule == BAYES:
+                old = float_array(places[OLD_EVIDENCE], (size,))
+                for i in range(size):
+                    mixed[i] += own[i] + (evidence[i] - old[i])
+            else:
+                for i in range(size):
+                    mixed[i] += own[i]
+                    delta[i] = mixed[i] - evidence[i]
+                if rule == NATURAL:
+                    for i in range(size):
+                        mixed[i] -= gammas[robot] * delta[i]
+                elif gammas[robot] != np.float32(0.0):
+                    _add_gradient(mixed_at, delta_at, gradient_at, room, octets, rows, num_classes, gammas[robot])
+            # Numbers that are not negative are in the order of their bits.
+            largest = np.int32(0)
+            for i in range(size):
+                largest = max(largest, same_bits(abs(mixed[i] - own[i])))
+            changes[robot, b] = same_bits(largest)
+            if largest > 0:
+                column = columns[first + OWN]
+                table.values[column, b] = mixed[0]
+                different = np.int32(rows > OCTETS)
+                for i in range(BRICK_CELLS):
+                    different = np.int32(different | np.int32(mixed[i] != mixed[0]))
+                is_even[robot, b] = different == 0
+                if table.addresses[column, b] != 0:
+                    for i in range(size):
+                        own[i] = mixed[i]
 
 
 @kernel
-def finish_step(bricks, changes, known_changed, revision):
-    """Set the revision of every brick that changed and prune those that became uniform."""
-    for index in range(changes.size):
-        if changes[index] > 0.0 or known_changed[index]:
-            bricks.revisions[index] = revision
-            collapse(bricks, index)
+def finish_step(bricks, indices, table, column, changes, is_even, known_changed, revision):
+    """Store what is one value, set the revision of the bricks ``indices`` (n,) that changed, and prune them.
 
-
-@kernel
-def needed_tiers(tiers, needed):
-    """The tier (n,) that each own brick must have to hold the result: the highest that is present in its row."""
-    for b in range(tiers.shape[0]):
-        highest = UNIFORM
-        for j in range(tiers.shape[1]):
-            if tiers[b, j] != ABSENT and tiers[b, j] > highest:
-                highest = tiers[b, j]
-        needed[b] = highest
-
-
-@kernel
-def sum_evidence(addresses, tiers, count_tiers_offset, scales, num_classes, targets, target_tiers):
-    """The sum over robots of log q for each brick, written to ``targets`` (n,) addresses: the oracle.
-
-    ``addresses`` and ``tiers`` (n, N) are the robots' evidence; columns N.. hold the scan counts where
-    ``count_tiers_offset`` is N, and -1 means that the evidence is multiplied by ``scales`` (N,).
+    Only those that are even, or whose known cells were added (``known_changed``), can have become one value. Returns
+    the largest of the ``changes`` (n,).
     """
-    robots = scales.size
-    all_terms = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
-    all_counts = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
-    all_totals = np.empty(num_classes * BRICK_CELLS, dtype=np.float32)
-    for b in range(addresses.shape[0]):
-        width = num_classes if target_tiers[b] == VECTOR else 1
-        size = width * BRICK_CELLS
-        term, count, total = all_terms[:size], all_counts[:size], all_totals[:size]
+    largest = np.float32(0.0)
+    for b in range(indices.size):
+        index = indices[b]
+        if index < 0 or not (changes[b] > 0.0 or known_changed[b]):
+            continue
+        largest = max(largest, changes[b])
+        bricks.revisions[index] = revision
+        if bricks.blocks[index] < 0:
+            bricks.values[index] = table.values[column, b]
+        elif is_even[b] or known_changed[b]:
+            collapse(bricks, index)
+    return largest
+
+
+@kernel
+def join_columns(table, columns, is_awake, known, has_block, layout):
+    """What a robot's bricks need to hold those of the ``columns``: known cells (n,), a block, and rows (n, W).
+
+    All are joined to what the arrays hold. ``is_awake`` (n,) gains the bricks that changed, and loses those that have
+    no known cell.
+    """
+    for column in columns:
+        for b in range(known.size):
+            is_awake[b] |= table.is_changed[column, b]
+            known[b] |= table.known[column, b]
+            has_block[b] |= table.addresses[column, b] != 0
+        for w in range(layout.shape[1]):
+            for b in range(known.size):
+                layout[b, w] |= table.masks[column, b, w]
+    for b in range(known.size):
+        is_awake[b] &= known[b] != 0
+
+
+@kernel
+def sum_evidence(bricks, indices, table, layout, counts, scales, num_classes, scratch, octets, no_rows):
+    """The sum over robots of log q, written to the bricks ``indices`` (n,), whose masks are ``layout`` (n, W).
+
+    Index -1 is left out. ``table`` says where the robots' evidence lies. It is divided by each cell's scans where the
+    table ``counts`` has columns, and otherwise multiplied by ``scales`` (N,). ``scratch`` float32 has room for 3 blocks
+    with every row, ``octets`` int64 for a number for each row of a block, and ``no_rows`` (1, 1) is an empty mask.
+    """
+    term_at = np.int64(scratch.ctypes.data)
+    room = (num_classes + 1) * BRICK_CELLS * 4
+    count_at, total_at = term_at + room, term_at + 2 * room
+    for b in range(indices.size):
+        index = indices[b]
+        if index < 0:
+            continue
+        rows = _row_octets(layout, b, octets)
+        size = rows * OCTETS
+        term = float_array(term_at, (size,))
+        count = float_array(count_at, (size,))
+        total = float_array(total_at, (size,))
         for i in range(size):
             total[i] = np.float32(0.0)
-        for r in range(robots):
-            load(term, addresses[b, r], tiers[b, r], width)
-            for i in range(size):
-                count[i] = np.float32(1.0)
-            if count_tiers_offset >= 0:
-                # Counts are an octree of one class: its VECTOR bricks have one row, like the SCALAR ones.
-                column = count_tiers_offset + r
-                count_tier = SCALAR if tiers[b, column] == VECTOR else tiers[b, column]
-                load(count, addresses[b, column], count_tier, width)
+            count[i] = np.float32(1.0)
+        for r in range(table.addresses.shape[0]):
+            load(term_at, table, b, r, layout, b, num_classes)
+            if counts.addresses.shape[0] > 0:
+                load(count_at, counts, b, r, no_rows, 0, 1)
+                for own in range(OCTETS, rows):
+                    copy_octet(count_at + own * ROW_BYTES, count_at + octets[own] * ROW_BYTES)
             for i in range(size):
                 total[i] += term[i] * scales[r] / max(count[i], np.float32(1.0))
-        out = carray(float_pointer(targets[b]), (size,))
-        for i in range(1 if target_tiers[b] == UNIFORM else size):
-            out[i] = total[i]
+        block = np.int64(bricks.blocks[index])
+        if block < 0:
+            bricks.values[index] = total[0]
+        else:
+            for row in range(rows):
+                copy_octet(np.int64(bricks.rows.ctypes.data) + (block + row) * ROW_BYTES, total_at + row * ROW_BYTES)

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
+from octoreplay.mapping.kernels.compiler import allocating_kernel, inline_kernel, kernel
 
-CUT = 255
+_CUT = np.int16(255)
 """Kind of a ray that was cut at max_range, above every class_id; other kinds are class ids, 0 for an ignored label."""
+
+_UNLABELLED = np.int16(1)
+"""Kind of a point without a label."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
 
-_NONE = -1
+_NONE = np.int16(-1)
 """Kind of a point that carries no information."""
 
 _FARTHEST_KEY = float(1 << 20)
@@ -27,24 +30,15 @@ _CLOSE = 1e-8
 _BLOCK = 1024
 
 
-@inline_kernel
-def _in_list(value, numbers):
-    """True when ``value`` is one of ``numbers``; NaN equals NaN."""
-    found = False
-    for i in range(numbers.size):
-        if value == numbers[i] or (value != value and numbers[i] != numbers[i]):
-            found = True
-    return found
-
-
-@kernel
+@allocating_kernel
 def depth_to_runs(
-    depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, invalid, no_return,
+    depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, special, meanings,
     keys, kinds, lengths, ends, end_keys, counters,
 ):  # fmt: skip
     """Runs of a depth image's end cells: ``keys`` (m, 3), ``kinds`` (m,) and ``lengths`` (m,), m = counters[NUM_RUNS].
 
     ``camera`` is (fx, fy, cx, cy), ``pose`` (4, 4); a class_image of size 0 means that every point is class 1.
+    Depths that equal one of ``special`` (s,), NaN included, become ``meanings`` (s,) [m], the last that applies.
     ``ends`` (n, 3), where it is not empty, gets the end point [m] of every ray and ``end_keys`` (n, 3) its key,
     n = counters[NUM_POINTS].
     """
@@ -52,55 +46,48 @@ def depth_to_runs(
     labelled = class_image.size > 0
     least, most = min_range * min_range, max_range * max_range
     ratios = np.empty(width)
-    across = np.empty((3, width))
     for u in range(width):
         ratios[u] = (u - camera[2]) / camera[0]
-        for axis in range(3):
-            across[axis, u] = pose[axis, 0] * ratios[u] + pose[axis, 2]
     z = np.empty(width)
-    squares = np.empty(width)
     world = np.empty((3, width))
     row_kinds = np.empty(width, np.int16)
     row_keys = np.empty((3, width), np.int32)
     starts = np.empty(width + 1, np.int32)
     for v in range(height):
         ratio = (v - camera[3]) / camera[1]
-        raw = depth_image[v]
         for u in range(width):
-            value = raw[u] * depth_unit
-            z[u] = value if (value > 0.0) & (value < np.inf) & (raw[u] != largest) else 0.0
-        if no_return.size > 0 or invalid.size > 0:
+            raw = depth_image[v, u]
+            value = raw * depth_unit
+            z[u] = value if (value > 0.0) & (value < np.inf) & (raw != largest) else 0.0
+        for k in range(special.size):
             for u in range(width):
-                if _in_list(raw[u], no_return):
-                    z[u] = np.inf
-                elif _in_list(raw[u], invalid):
-                    z[u] = 0.0
+                raw = depth_image[v, u]
+                is_special = (raw == special[k]) | ((raw != raw) & (special[k] != special[k]))
+                z[u] = meanings[k] if is_special else z[u]
         num_cut = 0
         plus = ratio * ratio + 1.0
         for u in range(width):
-            square = ratios[u] * ratios[u] + plus
-            squares[u] = square
-            distance = z[u] * z[u] * square
-            kind = np.int16(1) if (z[u] > 0.0) & (distance >= least) else np.int16(_NONE)
-            kind = np.int16(CUT) if distance > most else kind
-            row_kinds[u] = kind
-            num_cut += kind == CUT
+            distance = z[u] * z[u] * (ratios[u] * ratios[u] + plus)
+            kind = _UNLABELLED if (z[u] > 0.0) & (distance >= least) else _NONE
+            row_kinds[u] = _CUT if distance > most else kind
+            num_cut += distance > most
         if labelled:
-            labels = class_image[v]
             for u in range(width):
-                row_kinds[u] = np.int16(labels[u]) if row_kinds[u] == 1 else row_kinds[u]
+                row_kinds[u] = class_image[v, u] if row_kinds[u] == _UNLABELLED else row_kinds[u]
         if num_cut > 0:
             for u in range(width):
-                z[u] = max_range / np.sqrt(squares[u]) if row_kinds[u] == CUT else z[u]
-        for axis in range(3):
-            down, shift = pose[axis, 1] * ratio, pose[axis, 3]
-            directions, out = across[axis], world[axis]
+                square = ratios[u] * ratios[u] + plus
+                z[u] = max_range / np.sqrt(square) if row_kinds[u] == _CUT else z[u]
+        # A loop over a number that is written down would be unrolled: three times as much to compile, and no faster.
+        for axis in range(keys.shape[1]):
+            along, down = pose[axis, 0], pose[axis, 1] * ratio
+            ahead, shift = pose[axis, 2], pose[axis, 3]
             for u in range(width):
-                out[u] = z[u] * (directions[u] + down) + shift
+                world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
         _add_runs(world, row_kinds, width, resolution, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
 
 
-@kernel
+@allocating_kernel
 def points_to_runs(
     points, class_ids, pose, resolution, min_range, max_range, keys, kinds, lengths, ends, end_keys, counters
 ):
@@ -108,7 +95,7 @@ def points_to_runs(
     labelled = class_ids.size > 0
     least, most = min_range * min_range, max_range * max_range
     sensor = np.empty((3, _BLOCK))
-    scales = np.empty(_BLOCK)
+    squares = np.empty(_BLOCK)
     world = np.empty((3, _BLOCK))
     block_kinds = np.empty(_BLOCK, np.int16)
     block_keys = np.empty((3, _BLOCK), np.int32)
@@ -124,43 +111,44 @@ def points_to_runs(
             )
             distance = x * x + y * y + z * z
             valid = (distance > 0.0) & (distance < np.inf) & (distance >= least)
-            kind = np.int16(1) if valid else np.int16(_NONE)
-            kind = np.int16(CUT) if valid & (distance > most) else kind
+            kind = _UNLABELLED if valid else _NONE
+            is_cut = valid & (distance > most)
             sensor[0, i] = x if valid else 0.0
             sensor[1, i] = y if valid else 0.0
             sensor[2, i] = z if valid else 0.0
-            scales[i] = distance
-            block_kinds[i] = kind
-            num_cut += kind == CUT
+            squares[i] = distance
+            block_kinds[i] = _CUT if is_cut else kind
+            num_cut += is_cut
         if labelled:
             for i in range(size):
-                block_kinds[i] = np.int16(class_ids[first + i]) if block_kinds[i] == 1 else block_kinds[i]
+                block_kinds[i] = class_ids[first + i] if block_kinds[i] == _UNLABELLED else block_kinds[i]
         if num_cut > 0:
             for i in range(size):
-                scale = max_range / np.sqrt(scales[i]) if block_kinds[i] == CUT else 1.0
+                scale = max_range / np.sqrt(squares[i]) if block_kinds[i] == _CUT else 1.0
                 sensor[0, i] *= scale
                 sensor[1, i] *= scale
                 sensor[2, i] *= scale
-        for axis in range(3):
+        for axis in range(keys.shape[1]):
             along_x, along_y, along_z, shift = pose[axis, 0], pose[axis, 1], pose[axis, 2], pose[axis, 3]
-            xs, ys, zs, out = sensor[0], sensor[1], sensor[2], world[axis]
             for i in range(size):
-                out[i] = along_x * xs[i] + along_y * ys[i] + along_z * zs[i] + shift
+                world[axis, i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
         _add_runs(
             world, block_kinds, size, resolution, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters
         )
 
 
-@kernel
+@allocating_kernel
 def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
     """Append the runs of ``size`` points, given in the world."""
-    for axis in range(3):
-        _coords_to_keys(world[axis], size, resolution, point_keys[axis])
-    kx, ky, kz = point_keys[0], point_keys[1], point_keys[2]
-    is_start = np.ones(size + 1, np.uint8)
+    _coords_to_keys(world, size, resolution, point_keys)
+    is_start = np.empty(size + 1, np.uint8)
+    is_start[0] = 1
     for i in range(1, size):
         is_start[i] = (
-            (kx[i] != kx[i - 1]) | (ky[i] != ky[i - 1]) | (kz[i] != kz[i - 1]) | (point_kinds[i] != point_kinds[i - 1])
+            (point_keys[0, i] != point_keys[0, i - 1])
+            | (point_keys[1, i] != point_keys[1, i - 1])
+            | (point_keys[2, i] != point_keys[2, i - 1])
+            | (point_kinds[i] != point_kinds[i - 1])
         )
     num_starts = 0
     for i in range(size):
@@ -170,7 +158,8 @@ def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, ki
     place = counters[NUM_RUNS]
     for run in range(num_starts):
         i = starts[run]
-        keys[place, 0], keys[place, 1], keys[place, 2] = kx[i], ky[i], kz[i]
+        for axis in range(3):
+            keys[place, axis] = point_keys[axis, i]
         kinds[place] = np.uint8(point_kinds[i])
         lengths[place] = starts[run + 1] - i
         place += point_kinds[i] != _NONE
@@ -185,18 +174,20 @@ def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, ki
         counters[NUM_POINTS] = place
 
 
-@kernel
+@inline_kernel
 def _coords_to_keys(coords, size, resolution, keys):
-    """Keys = floor(coords / resolution), by multiplication where that cannot make a difference."""
+    """Keys = floor(coords / resolution) (3, size), by multiplication where that cannot make a difference."""
     inverse = 1.0 / resolution
-    num_close = 0
-    for i in range(size):
-        quotient = min(max(coords[i] * inverse, -_FARTHEST_KEY), _FARTHEST_KEY)
-        keys[i] = np.int32(np.floor(quotient))
-        num_close += abs(quotient - np.rint(quotient)) < _CLOSE
-    if num_close > 0:
+    for axis in range(keys.shape[0]):
+        num_close = 0
         for i in range(size):
-            keys[i] = np.int32(np.floor(min(max(coords[i] / resolution, -_FARTHEST_KEY), _FARTHEST_KEY)))
+            quotient = min(max(coords[axis, i] * inverse, -_FARTHEST_KEY), _FARTHEST_KEY)
+            keys[axis, i] = np.int32(np.floor(quotient))
+            num_close += abs(quotient - np.rint(quotient)) < _CLOSE
+        if num_close > 0:
+            for i in range(size):
+                quotient = min(max(coords[axis, i] / resolution, -_FARTHEST_KEY), _FARTHEST_KEY)
+                keys[axis, i] = np.int32(np.floor(quotient))
 
 
 @kernel

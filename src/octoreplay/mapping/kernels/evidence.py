@@ -5,67 +5,92 @@ from __future__ import annotations
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
-from octoreplay.mapping.kernels.storage import (
-    ALL_CELLS,
-    BRICK_CELLS,
-    SCALAR,
-    UNIFORM,
-    collapse,
-    make_scalar,
-    make_vector,
-)
+from octoreplay.mapping.kernels.intrinsics import lowest_one
+from octoreplay.mapping.kernels.storage import ALL_CELLS, OCTETS, collapse, share_first_class
+
+EVERY_BYTE = np.uint64(0x0101010101010101)
+LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 
 
 @kernel
-def _mask(words, brick):
-    """The mask of the cells of a brick that have a mark; ``words`` are the marks, eight to a word."""
-    mask = np.uint64(0)
-    low_bits = np.uint64(0x7F7F7F7F7F7F7F7F)
-    for k in range(BRICK_CELLS // 8):
-        word = words[brick * (BRICK_CELLS // 8) + k]
-        # The top bit of each byte that is not zero; the product gathers the eight bits in the top byte.
-        tops = (((word & low_bits) + low_bits) | word) & ~low_bits
-        byte = ((tops >> np.uint64(7)) * np.uint64(0x0102040810204080)) >> np.uint64(56)
-        mask |= byte << np.uint64(8 * k)
-    return mask
+def _marked(marks):
+    """The bytes of eight marks that are not 0, as eight bits."""
+    tops = (((marks & LOW_BITS) + LOW_BITS) | marks) & ~LOW_BITS
+    # The product gathers the eight top bits in the top byte.
+    return ((tops >> np.uint64(7)) * np.uint64(0x0102040810204080)) >> np.uint64(56)
 
 
 @kernel
-def apply_marks(bricks, indices, touched, marks, words, hit, miss, hit_other, clamp_min, clamp_max, revision):
-    """Add one scan's log-odds to the bricks ``indices`` (n,) whose marks are the scratch bricks ``touched`` (n,).
+def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, changes):
+    """Which classes the marks of a scan hit in each octet of the bricks ``indices`` (n,), as masks ``wanted`` (n, W).
+
+    ``touched`` (n,) are the scratch bricks of the marks, ``words`` the marks, eight to a word: 0 for no mark, 1 for a
+    free cell, c + 2 for a hit of class c. ``changes`` (n,) says which bricks change at all: one that is free and
+    clamped does not. A map of one class has no rows of single classes, and takes every hit as its own.
+    """
+    for t in range(indices.size):
+        any_hit = np.uint64(0)
+        for e in range(OCTETS):
+            marks = words[touched[t] * OCTETS + e]
+            # Bits above the lowest of a byte say that a cell was hit.
+            hits = marks & ~EVERY_BYTE
+            any_hit |= hits
+            if num_classes == 1:
+                continue
+            while hits:
+                shift = np.uint64(lowest_one(hits)) & np.uint64(0x38)
+                c = ((marks >> shift) & np.uint64(0xFF)) - np.uint64(2)
+                wanted[t, c >> np.uint64(3)] |= np.uint64(1) << (np.uint64(8 * e) + (c & np.uint64(7)))
+                hits &= ~(np.uint64(0xFF) << shift)
+        index = indices[t]
+        changes[t] = True
+        if not any_hit and bricks.blocks[index] < 0 and bricks.known[index] == ALL_CELLS:
+            value = bricks.values[index]
+            changes[t] = min(max(value + miss, clamp_min), clamp_max) != value
+
+
+@kernel
+def apply_marks(
+    bricks, indices, touched, words, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision, scratch
+):
+    """Add one scan's log-odds to the bricks ``indices`` (n,), raised beforehand.
 
     A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped. ``words`` are the marks, eight to a word. Room for the rows that may be needed must be there.
+    are clamped. The marks are those of ``wanted_rows``. ``scratch`` (2, 8 + 8 C) uint64 is set.
     """
-    num_classes = bricks.vector.shape[1]
+    # The marks, and the mark that says a row's own class was hit, of every value of a block.
+    row_marks, row_hits = scratch[0], scratch[1]
+    all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)
+    flat = bricks.rows.reshape(bricks.rows.size)
+    if num_classes == 1:
+        hit_other = hit
     for t in range(indices.size):
         index = indices[t]
-        cells = marks[touched[t] * BRICK_CELLS : (touched[t] + 1) * BRICK_CELLS]
-        hits = 0
-        for i in range(BRICK_CELLS):
-            hits += cells[i] > 1
-        if bricks.tiers[index] == UNIFORM and hits == 0:
-            value = bricks.values[index]
-            if min(max(value + miss, clamp_min), clamp_max) == value and bricks.known[index] == ALL_CELLS:
-                continue
+        known = np.uint64(0)
+        for e in range(OCTETS):
+            marks = words[touched[t] * OCTETS + e]
+            known |= _marked(marks) << np.uint64(8 * e)
+            row_marks[e] = marks
+            row_hits[e] = 0
+        rows = OCTETS
+        for w in range(bricks.masks.shape[1]):
+            bits = bricks.masks[index, w]
+            while bits:
+                bit = lowest_one(bits)
+                row_marks[rows] = row_marks[bit >> 3]
+                row_hits[rows] = np.uint64(8 * w + (bit & 7) + 2) * EVERY_BYTE
+                rows += 1
+                bits &= bits - np.uint64(1)
         bricks.revisions[index] = revision
-        bricks.known[index] |= _mask(words, touched[t])
-        if hits > 0 and num_classes > 1:
-            make_vector(bricks, index)
+        bricks.known[index] |= known
+        block = np.int64(bricks.blocks[index])
+        first = block * OCTETS
+        for i in range(rows * OCTETS):
+            mark = all_marks[i]
+            step = miss if mark == 1 else (hit if mark == all_hits[i] else hit_other)
+            changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
+            flat[first + i] = changed if mark > 0 else flat[first + i]
+        if rows > OCTETS:
+            share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
         else:
-            make_scalar(bricks, index)
-        if bricks.tiers[index] == SCALAR:
-            data = bricks.scalar[bricks.rows[index]]
-            for i in range(BRICK_CELLS):
-                step = hit if cells[i] > 1 else miss
-                changed = min(max(data[i] + step, clamp_min), clamp_max)
-                data[i] = changed if cells[i] > 0 else data[i]
             collapse(bricks, index)
-            continue
-        for c in range(num_classes):
-            row = bricks.vector[bricks.rows[index], c]
-            for i in range(BRICK_CELLS):
-                mark = cells[i]
-                step = miss if mark == 1 else (hit if mark == c + 2 else hit_other)
-                changed = min(max(row[i] + step, clamp_min), clamp_max)
-                row[i] = changed if mark > 0 else row[i]

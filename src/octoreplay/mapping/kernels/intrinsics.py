@@ -10,17 +10,31 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numba.np import arrayobj
 
 
 @intrinsic
-def float_pointer(typing_context: Any, address: Any) -> Any:
-    """The float32 pointer of an integer address."""
-    pointer = types.CPointer(types.float32)
+def float_array(typing_context: Any, address: Any, shape: Any) -> Any:
+    """The float32 array of a shape (a tuple) at an integer address, which owns no memory."""
+    result = types.Array(types.float32, len(shape), "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(pointer))
+        array = context.make_array(result)(context, builder)
+        size = context.get_value_type(types.intp)
+        sizes = [
+            context.cast(builder, builder.extract_value(arguments[1], n), axis, types.intp)
+            for n, axis in enumerate(signature.args[1])
+        ]
+        strides = [size(result.dtype.bitwidth // 8)]
+        for length in sizes[:0:-1]:
+            strides.insert(0, builder.mul(strides[0], length))
+        arrayobj.populate_array(
+            array, builder.inttoptr(arguments[0], array.data.type), sizes, strides, strides[-1], meminfo=None
+        )
+        # numba's own name for the finished structure.
+        return array._getvalue()  # noqa: SLF001
 
-    return pointer(types.int64), generate
+    return result(types.int64, shape), generate
 
 
 @intrinsic
@@ -45,6 +59,69 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
         return builder.fma(*arguments)
 
     return types.float32(types.float32, types.float32, types.float32), generate
+
+
+@intrinsic
+def count_ones(typing_context: Any, mask: Any) -> Any:
+    """Number of ones in a uint64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.uint64), generate
+
+
+@intrinsic
+def lowest_one(typing_context: Any, mask: Any) -> Any:
+    """Place of the lowest one in a uint64 that is not 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.IntType(1)(1))
+
+    return types.int64(types.uint64), generate
+
+
+def _octets(builder: Any, addresses: Any) -> list[Any]:
+    """Pointers to eight float32 each. A loop over eight values would be unrolled into single ones."""
+    return [builder.inttoptr(address, ir.VectorType(ir.FloatType(), 8).as_pointer()) for address in addresses]
+
+
+@intrinsic
+def copy_octet(typing_context: Any, target: Any, source: Any) -> Any:
+    """Copy eight float32 from one integer address to another."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        target, source = _octets(builder, arguments)
+        builder.store(builder.load(source, align=4), target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64), generate
+
+
+@intrinsic
+def raise_octet(typing_context: Any, target: Any, source: Any) -> Any:
+    """Raise eight float32 at an integer address to those at another where these are higher."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        target, source = _octets(builder, arguments)
+        old, new = builder.load(target, align=4), builder.load(source, align=4)
+        builder.store(builder.select(builder.fcmp_ordered(">", new, old), new, old), target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64), generate
+
+
+@intrinsic
+def add_octet(typing_context: Any, target: Any, source: Any) -> Any:
+    """Add the eight float32 at an integer address to those at another, the target."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        target, source = _octets(builder, arguments)
+        total = builder.fadd(builder.load(target, align=4), builder.load(source, align=4))
+        builder.store(total, target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64), generate
 
 
 @intrinsic

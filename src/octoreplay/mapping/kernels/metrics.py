@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import carray
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, load, prefetch
-from octoreplay.mapping.kernels.intrinsics import float_pointer, fma, same_bits
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, VECTOR
+from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, prefetch
+from octoreplay.mapping.kernels.intrinsics import copy_octet, count_ones, float_array, fma, lowest_one, same_bits
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES
 
 
 @inline_kernel
@@ -30,12 +29,29 @@ def _log(x):
 
 
 @kernel
-def _count_bits(mask):
-    """Number of ones in a uint64."""
-    x = mask - (mask >> np.uint64(1) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + (x >> np.uint64(2) & np.uint64(0x3333333333333333))
-    x = x + (x >> np.uint64(4)) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64(x * np.uint64(0x0101010101010101) >> np.uint64(56))
+def _load_classes(target_at, table, n, column, width):
+    """Write the brick ``n`` of a table's column to an address, 64 values for each of ``width`` classes (1 or all)."""
+    target = float_array(target_at, (width, BRICK_CELLS))
+    address = table.addresses[column, n]
+    if address == 0:
+        value = table.values[column, n]
+        for c in range(width):
+            for i in range(BRICK_CELLS):
+                target[c, i] = value
+        return
+    shared = float_array(address, (BRICK_CELLS,))
+    for c in range(width):
+        for i in range(BRICK_CELLS):
+            target[c, i] = shared[i]
+    row_at = address + OCTETS * ROW_BYTES
+    for w in range(table.masks.shape[2]):
+        bits = table.masks[column, n, w]
+        while bits:
+            bit = lowest_one(bits)
+            c = 8 * w + (bit & 7)
+            copy_octet(target_at + (c * OCTETS + (bit >> 3)) * ROW_BYTES, row_at)
+            row_at += ROW_BYTES
+            bits &= bits - np.uint64(1)
 
 
 @kernel
@@ -129,44 +145,42 @@ def _link_distance(bricks, link_ends, square):
 
 
 @kernel
-def compare_maps(
-    addresses, tiers, known, link_ends, prior, num_classes, scratch, int_scratch, places, distances, counts, entropies
-):
-    """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``addresses``) and the oracle (column N).
+def compare_maps(table, link_ends, prior, num_classes, scratch, int_scratch, places, distances, counts, entropies):
+    """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``table``) and the oracle (column N).
 
-    ``known`` (n, N) are the robots' masks and ``link_ends`` (L, 2) the links' robots; ``scratch`` float32 has room for
+    ``link_ends`` (L, 2) the links' robots; ``scratch`` float32 has room for
     N + 1 bricks of all classes and 5 of one, ``int_scratch`` int32 for 5. Outputs, in the row ``places`` (n,) of each
     brick: ``distances`` (m, 2): sum of squared differences over the links, and over all pairs of robots;
     ``counts`` (m, 4 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
     labels, cells known to either end of each link; then per robot known cells, agreeing cells, agreeing cells that the
     oracle calls occupied; ``entropies`` (m, N): sum over the robot's known cells in nats.
     """
-    robots = known.shape[1]
+    robots = table.known.shape[0] - 1
     is_complete = link_ends.shape[0] == robots * (robots - 1) // 2
     cells_at = np.int64(scratch.ctypes.data)
     bricks_at = cells_at + 5 * BRICK_CELLS * 4
     # Arrays made of addresses, because those that own memory are counted at every use.
-    cells = carray(float_pointer(cells_at), (5, BRICK_CELLS))
+    cells = float_array(cells_at, (5, BRICK_CELLS))
     best, oracle_best, oracle_there, total, weighted = cells[0], cells[1], cells[2], cells[3], cells[4]
     labels, first, differs = int_scratch[0], int_scratch[1], int_scratch[2]
     occupied, seen = int_scratch[3], int_scratch[4]
-    for b in range(addresses.shape[0]):
+    for b in range(places.size):
         place = places[b]
         width = 1
         anyone = np.uint64(0)
         for r in range(robots + 1):
-            width = num_classes if tiers[b, r] == VECTOR else width
-            anyone |= known[b, r] if r < robots else np.uint64(0)
+            for w in range(table.masks.shape[2]):
+                width = num_classes if table.masks[r, b, w] else width
+            anyone |= table.known[r, b] if r < robots else np.uint64(0)
         terms = np.float32(num_classes) if width == 1 else np.float32(1.0)
-        bricks = carray(float_pointer(bricks_at), (robots + 1, width, BRICK_CELLS))
-        rows = carray(float_pointer(bricks_at), (robots + 1, width * BRICK_CELLS))
-        ahead = min(b + PREFETCH_AHEAD, addresses.shape[0] - 1)
+        bricks = float_array(bricks_at, (robots + 1, width, BRICK_CELLS))
+        ahead = min(b + PREFETCH_AHEAD, places.size - 1)
         for r in range(robots + 1):
-            prefetch(addresses[ahead, r], tiers[ahead, r], num_classes)
-            load(rows[r], addresses[b, r], tiers[b, r], width)
+            prefetch(table, ahead, r)
+            _load_classes(bricks_at + r * width * BRICK_CELLS * 4, table, b, r, width)
         link_cells = 0
         for k in range(link_ends.shape[0]):
-            link_cells += _count_bits(known[b, link_ends[k, 0]] | known[b, link_ends[k, 1]])
+            link_cells += count_ones(table.known[link_ends[k, 0], b] | table.known[link_ends[k, 1], b])
         oracle = bricks[robots]
         _label_cells(oracle, oracle, prior, labels, oracle_best, oracle_there)
         num_occupied = np.int32(0)
@@ -176,8 +190,8 @@ def compare_maps(
             num_occupied = np.int32(num_occupied + occupied[i])
             differs[i] = np.int32(0)
         for r in range(robots):
-            mask = known[b, r]
-            if r == 0 or mask != known[b, r - 1]:
+            mask = table.known[r, b]
+            if r == 0 or mask != table.known[r - 1, b]:
                 for i in range(BRICK_CELLS):
                     seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
             _label_cells(bricks[r], oracle, prior, labels, best, oracle_there)
@@ -192,13 +206,13 @@ def compare_maps(
                 label = labels[i] if seen[i] > 0 else np.int32(-1)
                 first[i] = label if r == 0 else first[i]
                 differs[i] |= label ^ first[i]
-            counts[place, 4 + 3 * r] = _count_bits(mask)
+            counts[place, 4 + 3 * r] = count_ones(mask)
             counts[place, 5 + 3 * r] = agreeing
             counts[place, 6 + 3 * r] = agreeing_occupied
         num_differing = np.int32(0)
         for i in range(BRICK_CELLS):
             num_differing = np.int32(num_differing + (np.int32(1) if differs[i] != 0 else np.int32(0)))
-        counts[place, 0] = _count_bits(anyone)
+        counts[place, 0] = count_ones(anyone)
         counts[place, 1] = num_occupied
         counts[place, 2] = num_differing
         counts[place, 3] = link_cells

@@ -1,26 +1,33 @@
 """Octrees as depth-first streams, and back.
 
 Inside a brick three masks of 64 bits say everything but the values: which cells are ``known``, at which cells a leaf
-``starts`` (each leaf's first cell), and which of those leaves are ``vector`` leaves. A brick of which all cells are
-known and only cell 0 starts a leaf is that one leaf.
+``starts`` (each leaf's first cell), and which of those leaves are ``vector`` leaves, whose classes differ. A brick of
+which all cells are known and only cell 0 starts a leaf is that one leaf.
+
+A vector leaf is one value and a mask of the classes with another one. The value is the one that most classes have (the
+lowest such class's where several have as many), so that equal maps are equal streams, however they are stored.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
+from octoreplay.mapping.kernels.intrinsics import count_ones, lowest_one, same_bits
 from octoreplay.mapping.kernels.storage import (
     ALL_CELLS,
     BRICK_CELLS,
     BRICK_DEPTH,
-    NUM_SCALAR,
-    NUM_VECTOR,
-    SCALAR,
-    UNIFORM,
-    VECTOR,
+    OCTETS,
     add_brick,
+    block_rows,
+    new_block,
+    num_own_rows,
+    share_first_class,
 )
+from octoreplay.records import Float32Array, Int64Array, UInt8Array
 
 CHILD_UNKNOWN, CHILD_INNER, CHILD_SCALAR, CHILD_VECTOR = 0, 1, 2, 3
 ALL_LEAVES = 0xAAAA
@@ -28,43 +35,77 @@ ALL_LEAVES = 0xAAAA
 
 ZERO, ONE = np.uint64(0), np.uint64(1)
 EIGHT_CELLS = np.uint64(0xFF)
-"""Eight sibling cells: a byte of a brick's mask."""
+"""An octet: a byte of a brick's mask."""
 FIRST_CELLS = np.uint64(0x0101010101010101)
-"""The first of each eight sibling cells."""
+"""The first cell of each octet."""
 LAST_CELLS = np.uint64(0x8080808080808080)
-"""The last of each eight sibling cells."""
+"""The last cell of each octet."""
 NO_SIGN = np.float32(0.0)
 """Added to a value it makes 0 of -0, so that equal maps are equal bytes."""
 
 
-@kernel
-def _brick_values(bricks, index, spare):
-    """A brick's values: (C, 64) if it is a VECTOR brick, else (1, 64); a UNIFORM one is spelt out in ``spare``."""
-    row = bricks.rows[index]
-    if bricks.tiers[index] == VECTOR:
-        return bricks.vector[row]
-    if bricks.tiers[index] == SCALAR:
-        return bricks.scalar[row : row + 1]
-    for i in range(BRICK_CELLS):
-        spare[0, i] = bricks.values[index]
-    return spare[:1]
+class EncoderScratch(NamedTuple):
+    """What encode_bricks works in.
 
-
-@kernel
-def _compare_cells(values, is_vector, changes):
-    """Masks of the cells whose classes (C, 64) differ, and of those that differ from the next cell.
-
-    ``is_vector`` and ``changes`` (64,) are scratch: comparing them cell by cell lets the loops run as vectors.
+    The block of one brick: its values (8 + 8 C, 8), and the octet and class of each row; flags (2, 64) of its cells;
+    the rows of each octet (8, C) and their number (8,); the values of one leaf (C,). Then the open nodes from the root
+    down to the brick: what was written before each (BRICK_DEPTH + 1, 4), its children's states (BRICK_DEPTH, 8), and
+    the bounds ``low`` and ``high`` (BRICK_DEPTH + 1, 8, C) of their values; without a tolerance the bounds are equal,
+    and one array serves as both.
     """
+
+    block: Float32Array
+    octets: Int64Array
+    classes: Int64Array
+    flags: UInt8Array
+    octet_rows: Int64Array
+    num_rows: Int64Array
+    class_values: Float32Array
+    before: Int64Array
+    states: UInt8Array
+    low: Float32Array
+    high: Float32Array
+
+
+@kernel
+def _copy_block(bricks, index, block, octets, classes):
+    """Copy a brick's rows to ``block`` (8 + 8 C, 8); one value is spelt out. Returns the number of rows.
+
+    Row r >= 8 holds the values of class ``classes[r]`` in octet ``octets[r]``.
+    """
+    rows = OCTETS
+    for w in range(bricks.masks.shape[1]):
+        bits = bricks.masks[index, w]
+        while bits:
+            bit = lowest_one(bits)
+            octets[rows] = bit >> 3
+            classes[rows] = 8 * w + (bit & 7)
+            rows += 1
+            bits &= bits - ONE
+    first = np.int64(bricks.blocks[index])
+    for r in range(rows):
+        for k in range(OCTETS):
+            block[r, k] = (bricks.rows[first + r, k] if first >= 0 else bricks.values[index]) + NO_SIGN
+    return rows
+
+
+@kernel
+def _compare_cells(block, rows, octets, is_vector, changes):
+    """Masks of the cells whose classes differ, and of those that differ from the next cell of their octet.
+
+    ``block`` (8 + 8 C, 8) int32 are the bits of its values: what is no number equals itself. ``is_vector`` and
+    ``changes`` (64,) are scratch: comparing them cell by cell lets the loops run as vectors.
+    """
+    shared = block.reshape(block.size)
     for i in range(BRICK_CELLS):
         is_vector[i] = 0
-        changes[i] = 0
-    for c in range(1, values.shape[0]):
-        for i in range(BRICK_CELLS):
-            is_vector[i] |= values[c, i] != values[0, i]
-    for c in range(values.shape[0]):
-        for i in range(BRICK_CELLS - 1):
-            changes[i] |= values[c, i] != values[c, i + 1]
+        changes[i] = shared[i] != shared[i + 1]
+    for r in range(OCTETS, rows):
+        first = np.int64(octets[r]) * OCTETS
+        for k in range(OCTETS):
+            is_vector[first + k] |= block[r, k] != shared[first + k]
+        for k in range(OCTETS - 1):
+            changes[first + k] |= block[r, k] != block[r, k + 1]
     vector, change = ZERO, ZERO
     for i in range(BRICK_CELLS):
         vector |= np.uint64(is_vector[i]) << np.uint64(i)
@@ -81,51 +122,83 @@ def _whole_eights(mask):
 
 
 @kernel
-def vector_masks(bricks, order, masks):
-    """Mask (n,) of the known cells with one value per class of each brick ``order`` (n,)."""
-    flags = np.empty((2, BRICK_CELLS), dtype=np.uint8)
-    for n in range(order.size):
-        index = order[n]
-        masks[n] = 0
-        if bricks.tiers[index] == VECTOR:
-            vector, _ = _compare_cells(bricks.vector[bricks.rows[index]], flags[0], flags[1])
-            masks[n] = vector & bricks.known[index]
-
-
-@kernel
 def _middle(low, high):
     """The middle of a range, exact where its ends are equal, and never -0."""
     return low + (high - low) / np.float32(2.0) if high > low else low + NO_SIGN
 
 
 @kernel
-def _smooth_eights(values, known, tolerance, smooth, low, high):
-    """A copy of values (1 or C, 64) in which eight known cells within the tolerance have the middle of their range.
-
-    ``low`` and ``high`` (8, C) get the bounds of each eight cells.
-    """
-    width = values.shape[0]
-    for e in range(8):
-        apart = np.int64((known >> np.uint64(8 * e)) & EIGHT_CELLS != EIGHT_CELLS)
-        for c in range(low.shape[1]):
-            least = most = values[min(c, width - 1), 8 * e]
-            for i in range(8 * e + 1, 8 * e + 8):
-                least = min(least, values[min(c, width - 1), i])
-                most = max(most, values[min(c, width - 1), i])
-            low[e, c], high[e, c] = least, most
-            apart += not most - least <= tolerance
-        for c in range(width):
-            for i in range(8 * e, 8 * e + 8):
-                smooth[c, i] = values[c, i] if apart else _middle(low[e, c], high[e, c])
-    return smooth[:width]
+def _row_bounds(block, r):
+    """The lowest and the highest value of a row."""
+    least = most = block[r, 0]
+    for k in range(1, OCTETS):
+        least = min(least, block[r, k])
+        most = max(most, block[r, k])
+    return least, most
 
 
 @kernel
-def _merge(depth, place, tolerance, before, low, high, scalars, vectors, totals):
-    """Make the node at ``depth``, child ``place`` of its parent, one leaf if its bounds allow; returns its state."""
-    num_classes = low.shape[2]
-    different = 0
+def _class_bounds(block, rows, octets, classes, low, high):
+    """Bounds ``low`` and ``high`` (8, C) of each octet's values, class by class."""
+    for r in range(rows):
+        least, most = _row_bounds(block, r)
+        if r < OCTETS:
+            for c in range(low.shape[1]):
+                low[r, c], high[r, c] = least, most
+        else:
+            low[octets[r], classes[r]], high[octets[r], classes[r]] = least, most
+
+
+@kernel
+def _smooth_octets(block, rows, octets, known, tolerance):
+    """Set the rows of each octet that is known and within the tolerance in all of them to the middle of their range."""
+    apart = ZERO
+    for r in range(rows):
+        least, most = _row_bounds(block, r)
+        e = np.uint64(octets[r])
+        is_known = (known >> (np.uint64(8) * e)) & EIGHT_CELLS == EIGHT_CELLS
+        apart |= np.uint64(not (is_known and most - least <= tolerance)) << e
+    for r in range(rows):
+        if not (apart >> np.uint64(octets[r])) & ONE:
+            least, most = _row_bounds(block, r)
+            for k in range(OCTETS):
+                block[r, k] = _middle(least, most)
+
+
+@kernel
+def _write_leaf(class_values, place, values, masks, own_values, totals):
+    """Write the values (C,) of a leaf: the one that most classes have at ``place``; then mask and other values.
+
+    They are compared bit by bit, so that what is no number equals itself. Returns how many have a value of their own.
+    """
+    num_classes = class_values.size
+    best, most = 0, 0
     for c in range(num_classes):
+        equal = 0
+        for other in range(num_classes):
+            equal += same_bits(class_values[other]) == same_bits(class_values[c])
+        if equal > most:
+            best, most = c, equal
+    values[place] = class_values[best]
+    if most == num_classes:
+        return 0
+    for b in range(masks.shape[1]):
+        masks[totals[2], b] = 0
+    num_own = 0
+    for c in range(num_classes):
+        own_values[totals[3] + num_own] = class_values[c]
+        is_own = same_bits(class_values[c]) != same_bits(class_values[best])
+        masks[totals[2], c >> 3] |= np.uint8(is_own) << np.uint8(c & 7)
+        num_own += is_own
+    totals[2] += 1
+    totals[3] += num_own
+    return num_own
+
+
+@kernel
+def _merge(depth, place, tolerance, before, low, high, class_values, values, masks, own_values, totals):
+    """Make the node at ``depth``, child ``place`` of its parent, one leaf if its bounds allow; returns its state."""
+    for c in range(class_values.size):
         least, most = low[depth, 0, c], high[depth, 0, c]
         for k in range(1, 8):
             least = min(least, low[depth, k, c])
@@ -133,19 +206,12 @@ def _merge(depth, place, tolerance, before, low, high, scalars, vectors, totals)
         if most - least > tolerance:
             return CHILD_INNER
         low[depth - 1, place, c], high[depth - 1, place, c] = least, most
-        # Not a number is no difference: there is room for vectors only where a brick below is a VECTOR brick.
-        first_least, first_most = low[depth - 1, place, 0], high[depth - 1, place, 0]
-        different += (least < first_least) | (least > first_least) | (most < first_most) | (most > first_most)
-    for i in range(3):
+        class_values[c] = _middle(least, most)
+    for i in range(4):
         totals[i] = before[depth, i]
-    if different == 0:
-        scalars[totals[1]] = _middle(low[depth - 1, place, 0], high[depth - 1, place, 0])
-        totals[1] += 1
-        return CHILD_SCALAR
-    for c in range(num_classes):
-        vectors[totals[2], c] = _middle(low[depth - 1, place, c], high[depth - 1, place, c])
-    totals[2] += 1
-    return CHILD_VECTOR
+    num_own = _write_leaf(class_values, totals[1], values, masks, own_values, totals)
+    totals[1] += 1
+    return CHILD_VECTOR if num_own > 0 else CHILD_SCALAR
 
 
 @kernel
@@ -159,10 +225,10 @@ def _interleave(low, high):
 
 
 @kernel
-def _write_brick(values, known, starts, vector, words, scalars, vectors, totals, cells):
-    """Append the words and leaves of one brick that is not a leaf. ``cells`` (64,) is scratch.
+def _write_words(known, starts, vector, words, totals):
+    """Append the words of one brick that is not a leaf.
 
-    No branches: what is no word or no leaf is overwritten by the next. Unsigned places need no check of their sign.
+    No branches: what is no word is overwritten by the next. Unsigned places need no check of their sign.
     """
     word = ZERO
     place = np.uint64(totals[0] + 1)
@@ -177,21 +243,50 @@ def _write_brick(values, known, starts, vector, words, scalars, vectors, totals,
         word |= (is_inner | (is_leaf << ONE) | (is_leaf & is_vector)) << np.uint64(2 * e)
     words[totals[0]] = np.uint16(word)
     totals[0] = np.int64(place)
-    scalar = starts & ~vector
-    place = np.uint64(totals[1])
-    for i in range(BRICK_CELLS):
-        scalars[place] = values[0, i] + NO_SIGN
-        place += (scalar >> np.uint64(i)) & ONE
-    totals[1] = np.int64(place)
-    if vector:
-        place = ZERO
-        for i in range(BRICK_CELLS):
-            cells[place] = i
-            place += (vector >> np.uint64(i)) & ONE
-        for n in range(place):
-            for c in range(vectors.shape[1]):
-                vectors[totals[2], c] = values[c, cells[n]] + NO_SIGN
+
+
+@kernel
+def _write_vectors(
+    block, rows, octets, classes, octet_rows, num_rows, class_values, starts, vector, values, masks, own_values, totals
+):
+    """Append the masks and other values of a brick's vector leaves, the first of which stands at ``totals[1]``.
+
+    ``octet_rows``, ``num_rows`` and ``class_values`` are set.
+    """
+    num_classes = class_values.size
+    for e in range(OCTETS):
+        num_rows[e] = 0
+    for r in range(OCTETS, rows):
+        e = octets[r]
+        octet_rows[e, num_rows[e]] = r
+        num_rows[e] += 1
+    left = vector
+    while left:
+        i = lowest_one(left)
+        left &= left - ONE
+        e, k = i >> 3, i & 7
+        shared = block[e, k]
+        for b in range(masks.shape[1]):
+            masks[totals[2], b] = 0
+        num_own = 0
+        for j in range(num_rows[e]):
+            r = octet_rows[e, j]
+            own_values[totals[3] + num_own] = block[r, k]
+            is_own = same_bits(block[r, k]) != same_bits(shared)
+            masks[totals[2], classes[r] >> 3] |= np.uint8(is_own) << np.uint8(classes[r] & 7)
+            num_own += is_own
+        if 2 * num_own < num_classes:
             totals[2] += 1
+            totals[3] += num_own
+            continue
+        # The shared value may not be the one that most classes have.
+        for c in range(num_classes):
+            class_values[c] = shared
+        for j in range(num_rows[e]):
+            r = octet_rows[e, j]
+            class_values[classes[r]] = block[r, k]
+        place = totals[1] + count_ones(starts & ((ONE << np.uint64(i)) - ONE))
+        _write_leaf(class_values, place, values, masks, own_values, totals)
 
 
 @kernel
@@ -215,60 +310,67 @@ def _word(states):
 
 
 @kernel
-def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors, totals):
+def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, values, masks, own_values, totals):
     """Write the octree over the bricks ``order`` (n,), sorted by code, each with a known cell, depth-first.
 
-    ``words`` gets 16 bits per inner node, two for each child; ``scalars`` and ``vectors`` (m, C) the leaves' values;
-    words and scalars have room for one more. Eight leaves that differ by at most ``tolerance`` are one leaf; nothing is
-    merged without ``prune``. ``totals`` (3,) counts what is written of each, from 0.
+    ``words`` gets 16 bits per inner node, two for each child; ``values``, ``masks`` and ``own_values`` the leaves.
+    There is room for more than is needed: one word, one leaf, one mask, and C values. Eight leaves that differ by at
+    most ``tolerance`` are one leaf; nothing is merged without ``prune``. ``totals`` (4,) counts what is written of
+    each, from 0. ``scratch`` is an EncoderScratch whose first octets are 0 to 7.
     """
-    num_classes = bricks.vector.shape[1]
     lossy = prune and tolerance > 0
-    spare = np.empty((num_classes, BRICK_CELLS), dtype=np.float32)
-    flags = np.empty((2, BRICK_CELLS), dtype=np.uint8)
-    cells = np.empty(BRICK_CELLS, dtype=np.uint8)
-    # The open nodes from the root down to the brick: what was written before each, its children's states and bounds.
-    # Without a tolerance the bounds are equal, and one array serves as both.
-    before = np.empty((BRICK_DEPTH + 1, 3), dtype=np.int64)
-    states = np.empty((BRICK_DEPTH, 8), dtype=np.uint8)
-    low = np.empty((BRICK_DEPTH + 1, 8, num_classes), dtype=np.float32)
-    high = np.empty((BRICK_DEPTH + 1, 8, num_classes), dtype=np.float32) if lossy else low
+    block, octets, classes, flags, octet_rows, num_rows, class_values, before, states, low, high = scratch
     shared = 0
     for n in range(order.size):
         index = order[n]
         code = bricks.codes[index]
         known = bricks.known[index]
         for depth in range(shared, BRICK_DEPTH):
-            for i in range(3):
+            for i in range(4):
                 before[depth, i] = totals[i]
             for k in range(8):
                 states[depth, k] = CHILD_UNKNOWN
             totals[0] += 1
         place = code & 7
         state = CHILD_INNER
-        if prune and known == ALL_CELLS and bricks.tiers[index] == UNIFORM:
+        if prune and known == ALL_CELLS and bricks.blocks[index] < 0:
+            value = bricks.values[index] + NO_SIGN
             for c in range(num_classes):
-                low[BRICK_DEPTH - 1, place, c] = high[BRICK_DEPTH - 1, place, c] = bricks.values[index]
-            scalars[totals[1]] = bricks.values[index] + NO_SIGN
+                low[BRICK_DEPTH - 1, place, c] = high[BRICK_DEPTH - 1, place, c] = value
+            values[totals[1]] = value
             totals[1] += 1
             state = CHILD_SCALAR
         else:
-            values = _brick_values(bricks, index, spare)
+            rows = _copy_block(bricks, index, block, octets, classes)
             if lossy:
-                values = _smooth_eights(values, known, tolerance, spare, low[BRICK_DEPTH], high[BRICK_DEPTH])
-            vector, change = _compare_cells(values, flags[0], flags[1])
+                _class_bounds(block, rows, octets, classes, low[BRICK_DEPTH], high[BRICK_DEPTH])
+                _smooth_octets(block, rows, octets, known, tolerance)
+            vector, change = _compare_cells(block.view(np.int32), rows, octets, flags[0], flags[1])
             merged = _whole_eights(known & (~change | LAST_CELLS)) if prune else ZERO
             if merged == FIRST_CELLS:
                 if not lossy:
-                    for e in range(8):
-                        for c in range(num_classes):
-                            low[BRICK_DEPTH, e, c] = values[min(c, values.shape[0] - 1), 8 * e]
-                for i in range(3):
+                    _class_bounds(block, rows, octets, classes, low[BRICK_DEPTH], high[BRICK_DEPTH])
+                for i in range(4):
                     before[BRICK_DEPTH, i] = totals[i]
-                state = _merge(np.int64(BRICK_DEPTH), place, tolerance, before, low, high, scalars, vectors, totals)
+                state = _merge(
+                    np.int64(BRICK_DEPTH), place, tolerance, before, low, high, class_values, values, masks,
+                    own_values, totals,
+                )  # fmt: skip
             if state == CHILD_INNER:
                 starts = known & ~(merged * (EIGHT_CELLS - ONE))
-                _write_brick(values, known, starts, vector & starts, words, scalars, vectors, totals, cells)
+                vector &= starts
+                _write_words(known, starts, vector, words, totals)
+                last = np.uint64(totals[1])
+                for e in range(OCTETS):
+                    for k in range(OCTETS):
+                        values[last] = block[e, k]
+                        last += (starts >> np.uint64(8 * e + k)) & ONE
+                if vector:
+                    _write_vectors(
+                        block, rows, octets, classes, octet_rows, num_rows, class_values, starts, vector, values, masks,
+                        own_values, totals,
+                    )  # fmt: skip
+                totals[1] = np.int64(last)
         states[BRICK_DEPTH - 1, place] = state
         # The nodes that the next brick is not in are complete; the root always stays a node.
         shared = 1
@@ -279,7 +381,9 @@ def encode_bricks(bricks, order, prune, tolerance, words, scalars, vectors, tota
             place = (code >> (3 * (BRICK_DEPTH - depth))) & 7
             state = CHILD_INNER
             if word & ALL_LEAVES == ALL_LEAVES:
-                state = _merge(depth, place, tolerance, before, low, high, scalars, vectors, totals)
+                state = _merge(
+                    depth, place, tolerance, before, low, high, class_values, values, masks, own_values, totals
+                )
             if state == CHILD_INNER:
                 words[before[depth, 0]] = word
             states[depth - 1, place] = state
@@ -325,18 +429,16 @@ def _read_brick(words, used):
 
 
 @kernel
-def read_words(words, codes, spans, known, starts, vector):
+def read_words(words, path, codes, spans, known, starts, vector):
     """The bricks of a depth-first octree: code, number of bricks from there on, and the three masks, (L,) each.
 
     Only a leaf is larger than a brick. Returns the number of entries, or -1 when the words are no octree with at most
-    L leaves.
+    L leaves. ``path`` (3, BRICK_DEPTH) int64 is set.
     """
     if words.size == 0:
         return 0
     # The open nodes from the root down: word, next child, and code of the first brick.
-    path_word = np.empty(BRICK_DEPTH, dtype=np.int64)
-    path_child = np.empty(BRICK_DEPTH, dtype=np.int64)
-    path_code = np.empty(BRICK_DEPTH, dtype=np.int64)
+    path_word, path_child, path_code = path[0], path[1], path[2]
     path_word[0], path_child[0], path_code[0] = words[0], 0, 0
     depth = 0
     count = 0
@@ -379,65 +481,105 @@ def read_words(words, codes, spans, known, starts, vector):
 
 
 @kernel
-def _fill_brick(values, known, starts, vector, scalars, first_scalar, vectors, first_vector, cells, rows):
-    """Write a brick's values (C or 1, 64) from its leaves, the first of which are named; returns how many there are.
+def read_class_masks(entries, masks, class_masks):
+    """Which classes have values of their own in each octet of the bricks that ``read_words`` gave: ``class_masks``.
 
-    ``cells`` and ``rows`` (64,) are scratch.
+    They are (n, W), from 0; ``masks`` (V, W) are those of the vector leaves. Returns the rows that the bricks take.
     """
-    scalar = starts & ~vector
-    num_scalars = ZERO
-    if scalar:
-        for i in range(BRICK_CELLS):
-            num_scalars += (scalar >> np.uint64(i)) & ONE
-            # The last scalar leaf that started; what vector cells get from it is overwritten below.
-            value = scalars[first_scalar + max(num_scalars, ONE) - ONE]
-            values[0, i] = value if (known >> np.uint64(i)) & ONE else np.float32(0.0)
-    else:
-        for i in range(BRICK_CELLS):
-            values[0, i] = 0.0
-    num_vectors = ZERO
-    if vector:
-        for c in range(1, values.shape[0]):
-            for i in range(BRICK_CELLS):
-                values[c, i] = values[0, i]
-        count = ZERO
-        in_vector = ZERO
-        for i in range(BRICK_CELLS):
-            bit = np.uint64(i)
-            num_vectors += (vector >> bit) & ONE
-            in_vector = (vector >> bit) & ONE if (starts >> bit) & ONE else in_vector
-            cells[count] = i
-            rows[count] = first_vector + num_vectors - ONE
-            count += (known >> bit) & in_vector
-        for n in range(count):
-            for c in range(values.shape[0]):
-                values[c, cells[n]] = vectors[rows[n], c]
-    return num_scalars, num_vectors
+    leaf = 0
+    num_rows = 0
+    for n in range(entries.codes.size):
+        is_leaf = entries.known[n] == ALL_CELLS and entries.starts[n] == ONE
+        vector = entries.vector[n]
+        while vector:
+            octets = FIRST_CELLS if is_leaf else ONE << (np.uint64(lowest_one(vector)) & ~np.uint64(7))
+            vector &= vector - ONE
+            for w in range(masks.shape[1]):
+                class_masks[n, w] |= np.uint64(masks[leaf, w]) * octets
+            leaf += 1
+        if entries.vector[n] or not is_leaf:
+            num_rows += entries.spans[n] * block_rows(num_own_rows(class_masks, n))
+    return num_rows
 
 
 @kernel
-def fill_bricks(bricks, codes, spans, known, starts, vector, scalars, vectors):
-    """Write the bricks that ``read_words`` gave (n,) into an octree without bricks. Room must be there."""
-    first_scalar, first_vector = ZERO, ZERO
-    cells = np.empty(BRICK_CELLS, dtype=np.uint8)
-    rows = np.empty(BRICK_CELLS, dtype=np.uint64)
-    for n in range(codes.size):
-        is_leaf = known[n] == ALL_CELLS and starts[n] == ONE
-        num_scalars, num_vectors = ONE, ZERO
-        for k in range(spans[n]):
-            index = add_brick(bricks, codes[n] + k)
-            bricks.known[index] = known[n]
-            if is_leaf and not vector[n]:
-                bricks.values[index] = scalars[first_scalar]
+def _fill_shared(bricks, block, known, starts, values, first):
+    """Write the shared values of a block from its leaves' values, from ``first`` on; returns the number of leaves."""
+    count = ZERO
+    for i in range(BRICK_CELLS):
+        count += (starts >> np.uint64(i)) & ONE
+        # The last leaf that started.
+        value = values[first + max(count, ONE) - ONE]
+        bricks.rows[block + (i >> 3), i & 7] = value if (known >> np.uint64(i)) & ONE else np.float32(0.0)
+    return count
+
+
+@kernel
+def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
+    """Write the rows of single classes of a brick from its vector leaves, from ``leaf`` and value ``first`` on.
+
+    Returns the next leaf and value.
+    """
+    block = np.int64(bricks.blocks[index])
+    row = block + OCTETS
+    for w in range(masks.shape[1]):
+        bits = bricks.masks[index, w]
+        while bits:
+            octet = block + (lowest_one(bits) >> 3)
+            for k in range(OCTETS):
+                bricks.rows[row, k] = bricks.rows[octet, k]
+            row += 1
+            bits &= bits - ONE
+    known, starts, vector = entries.known[n], entries.starts[n], entries.vector[n]
+    is_leaf = known == ALL_CELLS and starts == ONE
+    while vector:
+        i = np.uint64(lowest_one(vector))
+        vector &= vector - ONE
+        # The leaf is the whole brick, an octet or a cell.
+        shift = i & ~np.uint64(7)
+        is_octet = (starts >> shift) & EIGHT_CELLS == ONE and (known >> shift) & EIGHT_CELLS == EIGHT_CELLS
+        first_bit, end_bit = (ZERO, np.uint64(64)) if is_leaf else (shift, shift + ONE)
+        first_cell, end_cell = (0, OCTETS) if is_octet else (np.int64(i & np.uint64(7)), np.int64(i & np.uint64(7)) + 1)
+        before = 0
+        for w in range(masks.shape[1]):
+            of_brick = bricks.masks[index, w]
+            classes = np.uint64(masks[leaf, w])
+            while classes:
+                c = np.uint64(lowest_one(classes))
+                classes &= classes - ONE
+                for bit in range(first_bit + c, end_bit + c, 8):
+                    row = block + OCTETS + before + count_ones(of_brick & ((ONE << np.uint64(bit)) - ONE))
+                    for k in range(first_cell, end_cell):
+                        bricks.rows[row, k] = own_values[first]
+                first += 1
+            before += count_ones(of_brick)
+        leaf += 1
+    return leaf, first
+
+
+@kernel
+def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_values):
+    """Write the bricks that ``read_words`` gave (n,) into an octree without bricks. Room must be there.
+
+    ``class_masks`` (n, W) are those of ``read_class_masks``.
+    """
+    first_value, first_leaf, first_own = ZERO, 0, 0
+    for n in range(entries.codes.size):
+        is_value = entries.known[n] == ALL_CELLS and entries.starts[n] == ONE and not entries.vector[n]
+        num_leaves, next_leaf, next_own = ONE, first_leaf, first_own
+        for k in range(entries.spans[n]):
+            index = add_brick(bricks, entries.codes[n] + k)
+            bricks.known[index] = entries.known[n]
+            if is_value:
+                bricks.values[index] = values[first_value]
                 continue
-            counter = NUM_VECTOR if vector[n] else NUM_SCALAR
-            row = bricks.counters[counter]
-            bricks.counters[counter] = row + 1
-            bricks.tiers[index] = VECTOR if vector[n] else SCALAR
-            bricks.rows[index] = row
-            values = bricks.vector[row] if vector[n] else bricks.scalar[row : row + 1]
-            num_scalars, num_vectors = _fill_brick(
-                values, known[n], starts[n], vector[n], scalars, first_scalar, vectors, first_vector, cells, rows
-            )
-        first_scalar += num_scalars
-        first_vector += num_vectors
+            block = new_block(bricks, num_own_rows(class_masks, n))
+            bricks.blocks[index] = block
+            num_leaves = _fill_shared(bricks, block, entries.known[n], entries.starts[n], values, first_value)
+            if entries.vector[n]:
+                for w in range(class_masks.shape[1]):
+                    bricks.masks[index, w] = class_masks[n, w]
+                next_leaf, next_own = _fill_own(bricks, index, entries, n, masks, first_leaf, own_values, first_own)
+                share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
+        first_value += num_leaves
+        first_leaf, first_own = next_leaf, next_own

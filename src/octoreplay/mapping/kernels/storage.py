@@ -1,8 +1,13 @@
 """Where the cells of an octree are stored: bricks, their hash table, Morton codes.
 
-A *brick* is a cube of 4 x 4 x 4 finest cells, stored in Morton order (bit 0 of the index is x, bit 1 y, bit 2 z).
-Its tier says how much is stored: UNIFORM one value for all its cells and classes, SCALAR one value per cell (equal over
-the classes: no cell was ever hit), VECTOR one value per class and cell.
+A *brick* is a cube of 4 x 4 x 4 finest cells in Morton order (bit 0 of the index is x, bit 1 y, bit 2 z). Eight sibling
+cells are an *octet*; a brick has eight. Most classes have the same value in a cell, because none of them was ever hit
+there, so a brick holds what its classes share and, octet by octet, the classes with values of their own.
+
+A brick is one value for all its cells and classes, or a *block* of rows of 8 values: one row for each octet with the
+shared values, then one for each octet and class with values of its own. ``masks`` says which those are: bit
+8 e + c % 8 of word c // 8 stands for class c in octet e, and the rows are in the order of the bits. Where every class
+of an octet has a row of its own, the shared one repeats that of class 0.
 """
 
 from __future__ import annotations
@@ -12,10 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
-from octoreplay.records import Float32Array, Int32Array, Int64Array, UInt8Array, UInt64Array
-
-UNIFORM, SCALAR, VECTOR = 0, 1, 2
-ABSENT = 255
+from octoreplay.mapping.kernels.intrinsics import copy_octet, count_ones, float_array, lowest_one, same_bits
+from octoreplay.records import BoolArray, Float32Array, Int32Array, Int64Array, UInt64Array
 
 BRICK_BITS = 2
 BRICK_EDGE = 1 << BRICK_BITS
@@ -24,29 +27,39 @@ CELL_BITS = 3 * BRICK_BITS
 BRICK_CELLS = 1 << CELL_BITS
 ALL_CELLS = np.uint64(0xFFFFFFFFFFFFFFFF)
 """The mask of a brick with all its cells known: bit i stands for cell i."""
+OCTETS = 8
+"""Octets of a brick, and cells of an octet."""
+ROW_BYTES = 4 * OCTETS
+BRICK_BYTES = 32
+"""Bytes that are kept of every brick beside its rows, mask and place in the hash table."""
+GROWTH = 4
+"""Blocks have room for a multiple of so many rows."""
 KEY_BITS = 19
 """A key's three coordinates lie in [-2^18, 2^18)."""
 KEY_OFFSET = 1 << (KEY_BITS - 1)
 BRICK_DEPTH = KEY_BITS - BRICK_BITS
 """Depth of a brick's cube in the octree; the root is depth 0, the finest cells are at depth KEY_BITS."""
 
-NUM_BRICKS, NUM_SCALAR, NUM_VECTOR, NUM_FREE_SCALAR = 0, 1, 2, 3
+NUM_BRICKS, NUM_ROWS, NUM_FREE_ROWS = 0, 1, 2
 
 
 class Bricks(NamedTuple):
-    """The arrays of one octree. ``counters`` holds NUM_BRICKS, NUM_SCALAR, NUM_VECTOR and NUM_FREE_SCALAR."""
+    """The arrays of one octree. ``counters`` holds NUM_BRICKS, NUM_ROWS and NUM_FREE_ROWS.
+
+    ``blocks`` is the first row of each brick's block, -1 where the brick is the one value in ``values``. ``free`` is
+    the first of the unused blocks of each size, -1 for none; each holds the next one's number in its first value.
+    """
 
     codes: Int64Array
-    tiers: UInt8Array
-    rows: Int32Array
+    blocks: Int32Array
     values: Float32Array
+    masks: UInt64Array
     known: UInt64Array
     revisions: Int64Array
     table: Int32Array
     counters: Int64Array
-    free_scalar: Int32Array
-    scalar: Float32Array
-    vector: Float32Array
+    free: Int32Array
+    rows: Float32Array
 
 
 @kernel
@@ -128,15 +141,16 @@ def rebuild_table(bricks):
 
 @kernel
 def add_brick(bricks, code):
-    """A new brick, all of it unknown: a UNIFORM brick of value 0 without a known cell."""
+    """A new brick, all of it unknown: the one value 0 without a known cell."""
     index = bricks.counters[NUM_BRICKS]
     bricks.counters[NUM_BRICKS] = index + 1
     bricks.codes[index] = code
-    bricks.tiers[index] = UNIFORM
-    bricks.rows[index] = -1
+    bricks.blocks[index] = -1
     bricks.values[index] = 0.0
     bricks.revisions[index] = 0
     bricks.known[index] = 0
+    for w in range(bricks.masks.shape[1]):
+        bricks.masks[index, w] = 0
     _enter(bricks, index)
     return index
 
@@ -159,144 +173,241 @@ def find_all(bricks, codes, indices):
 
 
 @kernel
-def _fill(row, value):
-    """Set a row of values to one value. Loops, because numba compiles assignments to slices slowly."""
-    for i in range(BRICK_CELLS):
-        row[i] = value
+def block_rows(num_own):
+    """Rows of a block that holds so many rows of single classes."""
+    return OCTETS + (num_own + GROWTH - 1) // GROWTH * GROWTH
 
 
 @kernel
-def _copy(row, source):
-    """Copy a row of values."""
-    for i in range(BRICK_CELLS):
-        row[i] = source[i]
+def num_own_rows(masks, n):
+    """How many octets and classes have values of their own by the mask ``masks[n]``."""
+    total = 0
+    for w in range(masks.shape[1]):
+        total += count_ones(masks[n, w])
+    return total
 
 
 @kernel
-def make_scalar(bricks, index):
-    """Raise a UNIFORM brick to SCALAR. Room for one row must be there."""
-    if bricks.tiers[index] != UNIFORM:
-        return
-    free = bricks.counters[NUM_FREE_SCALAR]
-    if free > 0:
-        row = np.int64(bricks.free_scalar[free - 1])
-        bricks.counters[NUM_FREE_SCALAR] = free - 1
+def new_block(bricks, num_own):
+    """First row of a block with room for so many rows of single classes. The room must be there."""
+    rows = block_rows(num_own)
+    size = (rows - OCTETS) // GROWTH
+    block = np.int64(bricks.free[size])
+    if block >= 0:
+        bricks.free[size] = same_bits(bricks.rows[block, 0])
+        bricks.counters[NUM_FREE_ROWS] -= rows
     else:
-        row = bricks.counters[NUM_SCALAR]
-        bricks.counters[NUM_SCALAR] = row + 1
-    _fill(bricks.scalar[row], bricks.values[index])
-    bricks.tiers[index] = SCALAR
-    bricks.rows[index] = row
+        block = bricks.counters[NUM_ROWS]
+        bricks.counters[NUM_ROWS] = block + rows
+    return block
 
 
 @kernel
-def _release_scalar(bricks, index):
-    """Give a SCALAR brick's row back."""
-    free = bricks.counters[NUM_FREE_SCALAR]
-    bricks.free_scalar[free] = bricks.rows[index]
-    bricks.counters[NUM_FREE_SCALAR] = free + 1
+def _release(bricks, block, num_own):
+    """Give a block back."""
+    rows = block_rows(num_own)
+    size = (rows - OCTETS) // GROWTH
+    bricks.rows[block, 0] = same_bits(bricks.free[size])
+    bricks.free[size] = block
+    bricks.counters[NUM_FREE_ROWS] += rows
 
 
 @kernel
-def make_vector(bricks, index):
-    """Raise a brick to VECTOR. Room for one row must be there."""
-    if bricks.tiers[index] == VECTOR:
-        return
-    row = bricks.counters[NUM_VECTOR]
-    bricks.counters[NUM_VECTOR] = row + 1
-    if bricks.tiers[index] == UNIFORM:
-        for c in range(bricks.vector.shape[1]):
-            _fill(bricks.vector[row, c], bricks.values[index])
-    else:
-        source = bricks.scalar[bricks.rows[index]]
-        for c in range(bricks.vector.shape[1]):
-            _copy(bricks.vector[row, c], source)
-        _release_scalar(bricks, index)
-    bricks.tiers[index] = VECTOR
-    bricks.rows[index] = row
+def _copy_row(rows, target, source):
+    """Copy one row. A loop, because numba compiles assignments to slices slowly."""
+    for i in range(OCTETS):
+        rows[target, i] = rows[source, i]
 
 
 @kernel
-def make_tiers(bricks, tiers):
-    """Raise each brick (n,) to at least the tier (n,) that is asked for. Room must be there."""
-    for index in range(tiers.size):
-        # Asked here, because a call copies the whole record of arrays.
-        if tiers[index] == VECTOR and bricks.tiers[index] != VECTOR:
-            make_vector(bricks, index)
-        elif tiers[index] == SCALAR and bricks.tiers[index] == UNIFORM:
-            make_scalar(bricks, index)
+def full_octets(masks, n, num_classes):
+    """The octets, one bit each at 8 e, in which every class has values of its own by the mask ``masks[n]``."""
+    full = np.uint64(0x0101010101010101)
+    for c in range(num_classes):
+        full &= masks[n, c >> 3] >> np.uint64(c & 7)
+    return full
+
+
+@kernel
+def share_first_class(rows, block, masks, n, num_classes):
+    """Repeat the values of class 0 as the shared ones of the octets in which every class has values of its own."""
+    full = full_octets(masks, n, num_classes)
+    while full:
+        bit = lowest_one(full)
+        own = count_ones(masks[n, 0] & ((np.uint64(1) << np.uint64(bit)) - np.uint64(1)))
+        _copy_row(rows, block + (bit >> 3), block + OCTETS + own)
+        full &= full - np.uint64(1)
+
+
+@kernel
+def rows_to_raise(bricks, indices, wanted):
+    """At most how many new rows it takes to raise the bricks ``indices`` (n,) to the masks ``wanted`` (n, W)."""
+    total = 0
+    for i in range(indices.size):
+        index = indices[i]
+        own = 0
+        for w in range(wanted.shape[1]):
+            own += count_ones(bricks.masks[index, w] | wanted[i, w])
+        if bricks.blocks[index] < 0 or block_rows(own) != block_rows(num_own_rows(bricks.masks, index)):
+            total += block_rows(own)
+    return total
+
+
+@kernel
+def raise_bricks(bricks, indices, wanted, num_classes):
+    """Give the bricks ``indices`` (n,) blocks with at least the rows of the masks ``wanted`` (n, W)."""
+    words = wanted.shape[1]
+    for i in range(indices.size):
+        index = indices[i]
+        old_own = num_own_rows(bricks.masks, index)
+        new_own = 0
+        for w in range(words):
+            new_own += count_ones(bricks.masks[index, w] | wanted[i, w])
+        old_block = np.int64(bricks.blocks[index])
+        if old_block >= 0 and new_own == old_own:
+            continue
+        block = old_block
+        if old_block < 0 or block_rows(new_own) != block_rows(old_own):
+            block = new_block(bricks, new_own)
+            for e in range(OCTETS):
+                if old_block >= 0:
+                    _copy_row(bricks.rows, block + e, old_block + e)
+                else:
+                    for k in range(OCTETS):
+                        bricks.rows[block + e, k] = bricks.values[index]
+        # From the last row to the first: within a block rows only move up.
+        place, source = block + OCTETS + new_own, old_block + OCTETS + old_own
+        for w in range(words - 1, -1, -1):
+            old_mask = bricks.masks[index, w]
+            new_mask = old_mask | wanted[i, w]
+            for bit in range(63, -1, -1):
+                if new_mask >> np.uint64(bit) & np.uint64(1):
+                    place -= 1
+                    if old_mask >> np.uint64(bit) & np.uint64(1):
+                        source -= 1
+                        _copy_row(bricks.rows, place, source)
+                    else:
+                        _copy_row(bricks.rows, place, block + (bit >> 3))
+            bricks.masks[index, w] = new_mask
+        if 0 <= old_block != block:
+            _release(bricks, old_block, old_own)
+        bricks.blocks[index] = block
+        share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
 
 
 @kernel
 def collapse(bricks, index):
-    """Make a SCALAR brick UNIFORM when all its cells are known and equal: the in-memory prune."""
-    if bricks.tiers[index] != SCALAR or bricks.known[index] != ALL_CELLS:
+    """Make a brick one value when all its cells are known and all values equal: the in-memory prune."""
+    block = np.int64(bricks.blocks[index])
+    if block < 0 or bricks.known[index] != ALL_CELLS or num_own_rows(bricks.masks, index) > 0:
         return
-    data = bricks.scalar[bricks.rows[index]]
-    first = data[0]
+    first = bricks.rows[block, 0]
     different = 0
-    for i in range(BRICK_CELLS):
-        different += data[i] != first
+    for e in range(OCTETS):
+        for k in range(OCTETS):
+            different += bricks.rows[block + e, k] != first
     if different == 0:
-        _release_scalar(bricks, index)
-        bricks.tiers[index] = UNIFORM
-        bricks.rows[index] = -1
+        _release(bricks, block, 0)
+        bricks.blocks[index] = -1
         bricks.values[index] = first
 
 
-@kernel
-def copy_bricks(source, indices, target, target_indices):
-    """Copy the bricks ``indices`` (n,) of one octree over ``target_indices`` (n,) of another, raised beforehand."""
-    for i in range(indices.size):
-        a, b = indices[i], target_indices[i]
-        tier = source.tiers[a]
-        target.known[b] = source.known[a]
-        if target.tiers[b] == UNIFORM:
-            target.values[b] = source.values[a]
-        elif target.tiers[b] == SCALAR:
-            if tier == UNIFORM:
-                _fill(target.scalar[target.rows[b]], source.values[a])
-            else:
-                _copy(target.scalar[target.rows[b]], source.scalar[source.rows[a]])
-            collapse(target, b)
-        else:
-            for c in range(target.vector.shape[1]):
-                row = target.vector[target.rows[b], c]
-                if tier == UNIFORM:
-                    _fill(row, source.values[a])
-                elif tier == SCALAR:
-                    _copy(row, source.scalar[source.rows[a]])
-                else:
-                    _copy(row, source.vector[source.rows[a], c])
+class BrickTable(NamedTuple):
+    """Where bricks of several octrees are, and what is known of them: (J, n) of J octrees, the masks (J, n, W).
+
+    ``addresses`` are those of the blocks, 0 where the brick is the one value in ``values`` (0 where it is absent).
+    ``is_changed`` says which have a revision from a given one on. Valid until an octree grows.
+    """
+
+    addresses: Int64Array
+    values: Float32Array
+    masks: UInt64Array
+    known: UInt64Array
+    is_changed: BoolArray
 
 
 @kernel
-def brick_addresses(bricks, indices, scalar_base, vector_base, values_base, addresses, tiers):
-    """Where the data of the bricks ``indices`` (n,) lies in memory and their tier; 0 and ABSENT for index -1."""
-    vector_bytes = bricks.vector.shape[1] * BRICK_CELLS * 4
+def fill_table(bricks, indices, since, table, column):
+    """Fill one column of a table with the bricks ``indices`` (n,); index -1 is an absent brick."""
+    base = np.int64(bricks.rows.ctypes.data)
     for i in range(indices.size):
         index = indices[i]
         if index < 0:
-            addresses[i] = 0
-            tiers[i] = ABSENT
+            table.addresses[column, i] = 0
+            table.values[column, i] = np.float32(0.0)
+            table.known[column, i] = 0
+            table.is_changed[column, i] = False
+            for w in range(table.masks.shape[2]):
+                table.masks[column, i, w] = 0
             continue
-        tier = bricks.tiers[index]
-        tiers[i] = tier
-        if tier == UNIFORM:
-            addresses[i] = values_base + index * 4
-        elif tier == SCALAR:
-            addresses[i] = scalar_base + np.int64(bricks.rows[index]) * BRICK_CELLS * 4
-        else:
-            addresses[i] = vector_base + np.int64(bricks.rows[index]) * vector_bytes
+        block = np.int64(bricks.blocks[index])
+        table.addresses[column, i] = base + block * ROW_BYTES if block >= 0 else 0
+        table.values[column, i] = bricks.values[index]
+        table.known[column, i] = bricks.known[index]
+        table.is_changed[column, i] = bricks.revisions[index] >= since
+        for w in range(table.masks.shape[2]):
+            table.masks[column, i, w] = bricks.masks[index, w]
 
 
 @kernel
-def merge_known(known, indices, other_known):
-    """known[indices] |= other_known; returns a flag (n,) where that changed anything."""
-    changed = np.zeros(indices.size, dtype=np.bool_)
+def load(target_at, table, n, column, layout, m, num_classes):
+    """Write the brick ``n`` of a table's column to an address, with the rows of the mask ``layout[m]``.
+
+    The mask must hold the brick's own. Returns the number of rows.
+    """
+    rows = OCTETS + num_own_rows(layout, m)
+    size = rows * OCTETS
+    target = float_array(target_at, (size,))
+    address = table.addresses[column, n]
+    if address == 0:
+        value = table.values[column, n]
+        for i in range(size):
+            target[i] = value
+        return rows
+    source = float_array(address, (BRICK_CELLS,))
+    for i in range(BRICK_CELLS):
+        target[i] = source[i]
+    place, own = target_at + OCTETS * ROW_BYTES, address + OCTETS * ROW_BYTES
+    for w in range(layout.shape[1]):
+        bits = layout[m, w]
+        mask = table.masks[column, n, w]
+        while bits:
+            bit = lowest_one(bits)
+            if mask >> np.uint64(bit) & np.uint64(1):
+                copy_octet(place, own)
+                own += ROW_BYTES
+            else:
+                copy_octet(place, address + (bit >> 3) * ROW_BYTES)
+            place += ROW_BYTES
+            bits &= bits - np.uint64(1)
+    # An octet may be full in the layout alone.
+    share_first_class(float_array(target_at, (rows, OCTETS)), 0, layout, m, num_classes)
+    return rows
+
+
+@kernel
+def store_bricks(bricks, indices, known, table, num_classes):
+    """Overwrite the bricks ``indices`` (n,), raised beforehand, by those of a table's only column.
+
+    ``known`` (n,) are the masks of their known cells.
+    """
+    base = np.int64(bricks.rows.ctypes.data)
     for i in range(indices.size):
-        old = known[indices[i]]
-        new = old | other_known[i]
-        known[indices[i]] = new
-        changed[i] = new != old
-    return changed
+        index = indices[i]
+        bricks.known[index] = known[i]
+        if bricks.blocks[index] < 0:
+            bricks.values[index] = table.values[0, i]
+        else:
+            load(base + np.int64(bricks.blocks[index]) * ROW_BYTES, table, i, 0, bricks.masks, index, num_classes)
+            collapse(bricks, index)
+
+
+@kernel
+def merge_known(known, indices, other_known, changed):
+    """known[indices] |= other_known, leaving out index -1; ``changed`` (n,) says where that changed anything."""
+    for i in range(indices.size):
+        changed[i] = False
+        if indices[i] >= 0:
+            old = known[indices[i]]
+            known[indices[i]] = old | other_known[i]
+            changed[i] = known[indices[i]] != old
