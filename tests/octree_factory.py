@@ -44,16 +44,20 @@ def _write_brick(octree, index, values):
     masks = np.zeros((1, mask_bytes(octree.num_classes)), np.uint64)
     for c, e in itertools.product(range(octree.num_classes), range(storage.OCTETS)):
         masks[0, c // 8] |= np.uint64(has_row[c][e] << (8 * e + c % 8))
-    octree.raise_bricks(np.array([index]), masks)
-    row = octree.bricks.blocks[index] + storage.OCTETS
-    octree.bricks.rows[row - storage.OCTETS : row] = shared
+    known = octree.known[index : index + 1].copy()
+    octree.raise_bricks(np.array([index]), masks, known, np.array([True]))
+    row = int(octree.bricks.blocks[index])
+    for e in range(storage.OCTETS):
+        if int(known[0]) >> (8 * e) & 255:
+            octree.bricks.rows[row] = shared[e]
+            row += 1
     for word, e in itertools.product(range(masks.size), range(storage.OCTETS)):
         for c in range(8 * word, min(8 * word + 8, octree.num_classes)):
             if has_row[c][e]:
                 octree.bricks.rows[row] = octets[c, e]
                 row += 1
     storage.share_first_class(
-        octree.bricks.rows, octree.bricks.blocks[index], octree.bricks.masks, index, octree.num_classes
+        octree.bricks.rows, int(octree.bricks.blocks[index]), known[0], octree.bricks.masks, index, octree.num_classes
     )
     storage.collapse(octree.bricks, index)
 
@@ -76,7 +80,8 @@ def cells_of(octree):
         known = (octree.known[index] >> np.arange(storage.BRICK_CELLS, dtype=np.uint64)) & np.uint64(1) == 1
         values = np.full((octree.num_classes, storage.BRICK_CELLS), octree.bricks.values[index])
         if octree.bricks.blocks[index] >= 0:
-            values = octree.bricks.rows[class_rows(octree, np.array([index]))[0]].reshape(values.shape)
+            rows = class_rows(octree, np.array([index]))[0]
+            values = np.where(rows[..., None] >= 0, octree.bricks.rows[rows], 0).reshape(values.shape)
         cells = np.flatnonzero(known)
         keys = np.empty((len(cells), 3), np.int64)
         storage.codes_to_keys((octree.codes[index] << storage.CELL_BITS) + cells, keys)
@@ -86,13 +91,18 @@ def cells_of(octree):
 
 
 def class_rows(octree, indices):
-    """Which rows (n, C, 8) hold the values of every class in every octet of the bricks ``indices`` (n,) with blocks."""
+    """Which rows (n, C, 8) hold the values of every class in every octet of the bricks ``indices`` (n,) with blocks.
+
+    -1 where the octet has no known cell.
+    """
     blocks, masks = octree.bricks.blocks[indices].astype(np.int64), octree.bricks.masks[indices]
+    is_present = octree.known[indices].astype("<u8").view(np.uint8).reshape(-1, storage.OCTETS) != 0
+    shared = blocks[:, None] + np.cumsum(is_present, axis=1) - 1
+    first_own = blocks + is_present.sum(axis=1)
     rows = np.empty((len(indices), octree.num_classes, storage.OCTETS), np.int64)
     for c, e in itertools.product(range(octree.num_classes), range(storage.OCTETS)):
         word, bit = masks[:, c // 8], np.uint64(1) << np.uint64(8 * e + c % 8)
-        before = np.bitwise_count(masks[:, : c // 8]).sum(axis=1, dtype=np.int64) + np.bitwise_count(
-            word & (bit - np.uint64(1))
-        )
-        rows[:, c, e] = np.where(word & bit, blocks + storage.OCTETS + before, blocks + e)
+        before = np.bitwise_count(masks[:, : c // 8]).sum(axis=1, dtype=np.int64)
+        before += np.bitwise_count(word & (bit - np.uint64(1)))
+        rows[:, c, e] = np.where(word & bit, first_own + before, np.where(is_present[:, e], shared[:, e], -1))
     return rows

@@ -177,9 +177,9 @@ def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
     """They never come from scans, but may from a packet: nothing else may change, and nothing is written outside."""
     octree = SemanticOctree(0.25, 3)
     octree.find_or_add(np.arange(64))
-    octree.raise_bricks(np.arange(0, 64, 3), np.zeros((22, 1), np.uint64))
-    octree.raise_bricks(np.arange(1, 64, 3), np.full((21, 1), 0x0001_0507_0203_0004, np.uint64))
-    octree.bricks.known[:64] = storage.ALL_CELLS
+    masks = np.repeat([0, 0x0001_0507_0203_0004, 0], [22, 21, 21]).astype(np.uint64)[:, None]
+    has_block = np.repeat([True, False], [43, 21])
+    octree.raise_bricks(np.arange(64), masks, np.full(64, storage.ALL_CELLS), has_block)
     for array in (octree.bricks.values, octree.bricks.rows):
         array[:] = value
     streams = octree.streams(tolerance=tolerance)

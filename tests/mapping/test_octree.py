@@ -225,6 +225,8 @@ def test_morton_codes():
 def test_memory_is_what_the_bricks_take():
     octree = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
     assert octree.memory_bytes < 2000
-    hit = octree_of({(0, 0, 0): [1.0, 0.0]})
-    values = storage.BRICK_CELLS * 4 * 2
-    assert values < hit.memory_bytes < values + 2000
+    # One octet has a known cell: a row for all classes, and in the second map two more, one for each.
+    free, hit = octree_of({(0, 0, 0): [1.0, 1.0]}), octree_of({(0, 0, 0): [1.0, 0.0]})
+    one_value = octree_of(cube((0, 0, 0), 4, [1.0, 1.0]))
+    rows = [(other.memory_bytes - one_value.memory_bytes) // storage.ROW_BYTES for other in (free, hit)]
+    assert rows == [storage.block_rows(1), storage.block_rows(3)]

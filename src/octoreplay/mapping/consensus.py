@@ -93,12 +93,13 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     is_awake, known_changed, is_even = np.zeros((3, *shape), np.bool_)
     changes = np.zeros(shape, np.float32)
     indices = np.empty(shape, np.int64)
-    layouts = np.empty((*shape, table.masks.shape[2]), np.uint64)
+    layouts, known = np.empty((*shape, table.masks.shape[2]), np.uint64), np.empty(shape, np.uint64)
 
     def prepare(n: int) -> None:
         own = steps[n].own
         is_awake[n] = steps[n].since is None
-        indices[n], layouts[n], known_changed[n] = _raise_to_columns(own, codes, table, columns[n], is_awake[n])
+        raised = _raise_to_columns(own, codes, table, columns[n], is_awake[n])
+        indices[n], layouts[n], known[n], known_changed[n] = raised
         storage.fill_table(own.bricks, indices[n], since, table, columns[n][OWN])
 
     list(run(prepare, range(len(steps))))
@@ -111,8 +112,8 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
             part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, _RULES[rule], num_classes,
-            layouts.reshape(-1, layouts.shape[2]), is_awake, *_scratch(num_classes, np.diff(first_columns).max()),
-            changes, is_even,
+            layouts.reshape(-1, layouts.shape[2]), known.ravel(), is_awake,
+            *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
     parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
@@ -152,23 +153,20 @@ def _codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
 
 def _raise_to_columns(
     octree: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array, is_awake: BoolArray
-) -> tuple[Int64Array, UInt64Array, BoolArray]:
+) -> tuple[Int64Array, UInt64Array, UInt64Array, BoolArray]:
     """Give an octree the cells, blocks and rows that it takes to hold the awake bricks ``codes`` (n,) of the columns.
 
     Bricks that changed are awake, those without a known cell are not. Returns the indices (n,), -1 for the others, the
-    masks (n, W), and where known cells were added (n,).
+    masks (n, W) and known cells (n,), and where known cells were added (n,).
     """
     known, has_block = np.zeros(codes.size, np.uint64), np.zeros(codes.size, np.bool_)
     masks = np.zeros((codes.size, table.masks.shape[2]), np.uint64)
     consensus_kernels.join_columns(table, columns, is_awake, known, has_block, masks)
     indices = np.full(codes.size, -1)
     indices[is_awake] = octree.find_or_add(codes[is_awake])
-    known_changed = np.empty(codes.size, np.bool_)
-    storage.merge_known(octree.bricks.known, indices, known, known_changed)
-    has_block &= is_awake
-    octree.raise_bricks(indices[has_block], masks[has_block])
-    masks[is_awake] = octree.bricks.masks[indices[is_awake]]
-    return indices, masks, known_changed
+    known_changed = octree.raise_bricks(indices, masks, known, has_block)
+    masks[is_awake], known[is_awake] = octree.bricks.masks[indices[is_awake]], octree.known[indices[is_awake]]
+    return indices, masks, known, known_changed
 
 
 def _scratch(num_classes: int, num_columns: int) -> tuple[Float32Array, Int64Array]:
@@ -189,14 +187,12 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     table, count_table = brick_table(octrees, codes), brick_table(counts, codes)
     columns = np.arange(len(octrees))
-    indices, masks, _ = _raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
-    written = indices >= 0
-    differ = indices[written & (count_table.addresses != 0).any(axis=0)]
-    target.raise_bricks(differ, target.bricks.masks[differ])
+    indices, masks, known, _ = _raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
+    target.raise_bricks(indices, masks, known, (count_table.addresses != 0).any(axis=0))
     scales: Float32Array = np.array([entry.scale for entry in evidence], np.float32)
     scratch, int_scratch = _scratch(target.num_classes, 0)
     consensus_kernels.sum_evidence(
-        target.bricks, indices, table, masks, count_table, scales, target.num_classes, scratch,
-        int_scratch[0], np.zeros((1, 1), np.uint64),
+        target.bricks, indices, table, masks, known, count_table, scales, target.num_classes, scratch, int_scratch[0],
+        np.zeros((codes.size, 1), np.uint64),
     )  # fmt: skip
-    target.bricks.revisions[indices[written]] = revision
+    target.bricks.revisions[indices[indices >= 0]] = revision

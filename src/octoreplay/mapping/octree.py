@@ -69,7 +69,7 @@ class SemanticOctree:
             codes=np.empty(0, np.int64), blocks=np.empty(0, np.int32), values=np.empty(0, np.float32),
             masks=np.empty((0, num_words), np.uint64), known=np.empty(0, np.uint64), revisions=np.empty(0, np.int64),
             table=np.full(64, -1, np.int32), counters=np.zeros(3, np.int64),
-            free=np.full(num_classes * storage.OCTETS // storage.GROWTH + 1, -1, np.int32),
+            free=np.full((num_classes + 1) * storage.OCTETS // storage.GROWTH + 1, -1, np.int32),
             rows=np.empty((0, storage.OCTETS), np.float32),
         )  # fmt: skip
 
@@ -140,18 +140,24 @@ class SemanticOctree:
         storage.find_or_add(self.bricks, codes, indices)
         return indices
 
-    def raise_bricks(self, indices: Int64Array, masks: UInt64Array) -> None:
-        """Give the bricks ``indices`` (n,) blocks that have at least the rows of ``masks`` (n, W)."""
-        self.reserve(rows=storage.rows_to_raise(self.bricks, indices, masks))
-        storage.raise_bricks(self.bricks, indices, masks, self.num_classes)
+    def raise_bricks(
+        self, indices: Int64Array, masks: UInt64Array, known: UInt64Array, needs_block: BoolArray
+    ) -> BoolArray:
+        """Add ``known`` cells (n,) to the bricks ``indices`` (n,), and a block where one is needed (n,).
+
+        A block gets at least the rows of ``masks`` (n, W). Index -1 is left out. Returns where cells were added (n,).
+        """
+        gains = np.empty(indices.size, np.bool_)
+        self.reserve(rows=storage.rows_to_raise(self.bricks, indices, masks, known, needs_block))
+        storage.raise_bricks(self.bricks, indices, masks, known, needs_block, self.num_classes, gains)
+        return gains
 
     def overwrite(self, source: SemanticOctree, indices: Int64Array, revision: int = 0) -> None:
         """Replace the bricks that ``indices`` (n,) name in ``source`` by its values."""
         own = self.find_or_add(source.codes[indices])
         table = brick_table([source], source.codes[indices])
-        has_block = table.addresses[0] != 0
-        self.raise_bricks(own[has_block], table.masks[0, has_block])
-        storage.store_bricks(self.bricks, own, source.known[indices], table, self.num_classes)
+        self.reserve(rows=storage.rows_of_column(table))
+        storage.replace_bricks(self.bricks, own, table)
         self.bricks.revisions[own] = revision
 
     def copy(self) -> Self:
@@ -293,7 +299,7 @@ def _encoder_scratch(num_classes: int, *, is_lossy: bool) -> packets.EncoderScra
         classes=np.zeros(most_rows, np.int64),
         flags=np.empty((2, storage.BRICK_CELLS), np.uint8),
         octet_rows=np.empty((storage.OCTETS, num_classes), np.int64),
-        num_rows=np.empty(storage.OCTETS, np.int64),
+        octet_sizes=np.empty(storage.OCTETS, np.int64),
         class_values=np.empty(num_classes, np.float32),
         before=np.empty((storage.BRICK_DEPTH + 1, 4), np.int64),
         states=np.empty((storage.BRICK_DEPTH, 8), np.uint8),

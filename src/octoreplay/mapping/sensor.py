@@ -254,14 +254,14 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
     words = cells.marks.view(np.uint64)
     miss, least, most = np.float32(increments.miss), np.float32(increments.least), np.float32(increments.most)
     wanted = np.zeros((indices.size, octree.bricks.masks.shape[1]), np.uint64)
-    changes = np.empty(indices.size, np.bool_)
+    known, changes = np.empty(indices.size, np.uint64), np.empty(indices.size, np.bool_)
     evidence.wanted_rows(
-        octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, changes
+        octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
     )
+    octree.raise_bricks(indices, wanted, known, changes)
     indices = indices[changes]
-    octree.raise_bricks(indices, wanted[changes])
     evidence.apply_marks(
         octree.bricks, indices, cells.touched[changes], words, octree.num_classes, np.float32(increments.hit), miss,
         np.float32(increments.hit_other), least, most, revision,
-        np.empty((2, storage.OCTETS * (octree.num_classes + 1)), np.uint64),
+        np.empty((2, storage.OCTETS * (octree.num_classes + 1) + 1), np.uint64),
     )  # fmt: skip

@@ -20,7 +20,7 @@ from octoreplay.mapping.kernels.intrinsics import (
     raise_octet,
     same_bits,
 )
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, collapse, load
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, collapse, load, octets_of, ones_below
 
 GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
 
@@ -45,7 +45,7 @@ def prefetch(table, n, column):
     """Ask for a brick's block ahead of its use: bricks lie in another order in every octree."""
     if table.addresses[column, n] != 0:
         # Most maps have one word to a mask.
-        rows = OCTETS + count_ones(table.masks[column, n, 0])
+        rows = count_ones(octets_of(table.known[column, n])) + count_ones(table.masks[column, n, 0])
         for w in range(1, table.masks.shape[2]):
             rows += count_ones(table.masks[column, n, w])
         for offset in range(0, rows * ROW_BYTES, 64):
@@ -53,14 +53,15 @@ def prefetch(table, n, column):
 
 
 @inline_kernel
-def _rows_at(table, n, column, layout, m, scratch_at, num_classes):
-    """Where a brick's values lie with the rows of the mask ``layout[m]``: in its block, or copied to ``scratch_at``."""
+def _rows_at(table, n, column, layout, known, m, scratch_at, num_classes):
+    """Where a brick's values lie with the rows for ``known[m]`` and ``layout[m]``: in its block, or ``scratch_at``."""
     place = table.addresses[column, n]
     other = np.uint64(place == 0) | (table.masks[column, n, 0] ^ layout[m, 0])
+    other |= octets_of(table.known[column, n]) ^ octets_of(known[m])
     for w in range(1, layout.shape[1]):
         other |= table.masks[column, n, w] ^ layout[m, w]
     if other != 0:
-        load(scratch_at, table, n, column, layout, m, num_classes)
+        load(scratch_at, table, n, column, layout, known, m, num_classes)
         place = scratch_at
     return place
 
@@ -78,49 +79,49 @@ PREFETCH_AHEAD = 4
 
 
 @kernel
-def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, rows, num_classes, gamma):
+def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, num_shared, rows, num_classes, gamma):
     """Mixed (rows, 8) += gamma x the gradient, with ``delta`` (rows, 8) = h~ - log q; all given by address.
 
-    The first eight rows stand for all the classes of their octet that have no row; ``octets`` (rows,) are the octets of
-    the others. ``scratch_at`` has place for three arrays of ``room`` bytes and four rows of a brick's cells.
+    The shared rows stand for all the classes of their octet that have no row; ``octets`` (rows,) are the shared rows of
+    the others' octets. ``scratch_at`` has place for three arrays of ``room`` bytes and three of a brick's cells.
     """
-    size = rows * OCTETS
-    mixed = float_array(mixed_at, (size,))
-    delta = float_array(delta_at, (size,))
+    size, shared_size = rows * OCTETS, num_shared * OCTETS
+    mixed, delta = float_array(mixed_at, (size,)), float_array(delta_at, (size,))
     sigma_at, spread_at, other_at = scratch_at, scratch_at + room, scratch_at + 2 * room
-    sigma = float_array(sigma_at, (size,))
-    spread = float_array(spread_at, (size,))
-    other = float_array(other_at, (size,))
+    sigma, spread, other = (
+        float_array(sigma_at, (size,)),
+        float_array(spread_at, (size,)),
+        float_array(other_at, (size,)),
+    )
     terms_at = scratch_at + 3 * room
     total_at, dot_at = terms_at + BRICK_CELLS * 4, terms_at + BRICK_CELLS * 8
-    terms = float_array(terms_at, (BRICK_CELLS,))
-    total = float_array(total_at, (BRICK_CELLS,))
-    dot = float_array(dot_at, (BRICK_CELLS,))
-    for i in range(BRICK_CELLS):
+    terms = float_array(terms_at, (shared_size,))
+    total, dot = float_array(total_at, (shared_size,)), float_array(dot_at, (shared_size,))
+    for i in range(shared_size):
         terms[i] = np.float32(num_classes)
         spread[i] = max(mixed[i], np.float32(0.0))
-    for r in range(OCTETS, rows):
+    for r in range(num_shared, rows):
         first = octets[r] * OCTETS
         for k in range(OCTETS):
             terms[first + k] -= np.float32(1.0)
         raise_octet(spread_at + octets[r] * ROW_BYTES, mixed_at + r * ROW_BYTES)
-    for r in range(OCTETS, rows):
+    for r in range(num_shared, rows):
         copy_octet(spread_at + r * ROW_BYTES, spread_at + octets[r] * ROW_BYTES)
     for i in range(size):
         share = exp_negative(mixed[i] - spread[i])
         sigma[i] = share
         other[i] = share * delta[i]
-    for i in range(BRICK_CELLS):
+    for i in range(shared_size):
         total[i] = terms[i] * sigma[i]
         dot[i] = terms[i] * other[i]
-    for r in range(OCTETS, rows):
+    for r in range(num_shared, rows):
         add_octet(total_at + octets[r] * ROW_BYTES, sigma_at + r * ROW_BYTES)
         add_octet(dot_at + octets[r] * ROW_BYTES, other_at + r * ROW_BYTES)
-    for i in range(BRICK_CELLS):
+    for i in range(shared_size):
         share = np.float32(1.0) / (total[i] + exp_negative(-spread[i]))
         spread[i] = gamma * share
         other[i] = dot[i] * share
-    for r in range(OCTETS, rows):
+    for r in range(num_shared, rows):
         copy_octet(spread_at + r * ROW_BYTES, spread_at + octets[r] * ROW_BYTES)
         copy_octet(other_at + r * ROW_BYTES, other_at + octets[r] * ROW_BYTES)
     for i in range(size):
@@ -128,16 +129,18 @@ def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, rows, num_classe
 
 
 @kernel
-def _row_octets(layout, b, octets):
-    """The octet of every row from the ninth on, by the mask ``layout[b]``; returns the number of rows."""
-    rows = np.int64(OCTETS)
+def _row_octets(layout, known, m, octets):
+    """The shared row of the octet of each row of a single class; returns the number of shared rows and of all rows."""
+    present = octets_of(known[m])
+    num_shared = count_ones(present)
+    rows = num_shared
     for w in range(layout.shape[1]):
-        bits = layout[b, w]
+        bits = layout[m, w]
         while bits:
-            octets[rows] = lowest_one(bits) >> 3
+            octets[rows] = ones_below(present, lowest_one(bits) & 56)
             rows += 1
             bits &= bits - np.uint64(1)
-    return rows
+    return num_shared, rows
 
 
 @kernel
@@ -163,6 +166,7 @@ def team_step(
     rule,
     num_classes,
     layouts,
+    known,
     is_awake,
     scratch,
     int_scratch,
@@ -173,10 +177,10 @@ def team_step(
 
     ``table`` says where the bricks ``start`` to ``end`` of all maps lie. Robot r's ``columns`` of it are those from
     ``first_columns[r]`` to ``first_columns[r + 1]``: OWN, BASE, EVIDENCE, OLD_EVIDENCE, then its neighbours', with
-    their ``weights`` 2 epsilon A_ij at the same places. ``layouts`` (R n, W) are the masks of the own bricks, which
-    hold those of all the robot's columns; an own brick is one value only where all others are. Only bricks that are
-    awake (R, n) are worked on. ``changes`` (R, n) get their largest changes, ``is_even`` (R, n) where all values are
-    equal then; what is one value is left in the table.
+    their ``weights`` 2 epsilon A_ij at the same places. ``layouts`` (R n, W) and ``known`` (R n,) are the masks and the
+    known cells of the own bricks, which hold those of all the robot's columns; an own brick is one value only where all
+    others are. Only bricks that are awake (R, n) are worked on. ``changes`` (R, n) get their largest changes,
+    ``is_even`` (R, n) where all values are equal then; what is one value is left in the table.
 
     ``scratch`` float32 has room for NUM_SCRATCH_BLOCKS blocks with every row, one more for each of a robot's columns,
     and 3 x 64 values; ``int_scratch`` int64 for two numbers for each row of a block and each of a robot's columns.
@@ -194,14 +198,14 @@ def team_step(
             if not is_awake[robot, b]:
                 continue
             m = robot * is_awake.shape[1] + b
-            rows = _row_octets(layouts, m, octets)
+            num_shared, rows = _row_octets(layouts, known, m, octets)
             size = rows * OCTETS
             first = first_columns[robot]
             num_columns = first_columns[robot + 1] - first
             for k in range(num_columns):
                 if k == OLD_EVIDENCE and rule != BAYES:
                     continue
-                places[k] = _rows_at(table, b, columns[first + k], layouts, m, spare_at + k * room, num_classes)
+                places[k] = _rows_at(table, b, columns[first + k], layouts, known, m, spare_at + k * room, num_classes)
             own_at, base_at = places[OWN], places[BASE]
             own = float_array(own_at, (size,))
             mixed = float_array(mixed_at, (size,))
@@ -232,7 +236,9 @@ def team_step(
                     for i in range(size):
                         mixed[i] -= gammas[robot] * delta[i]
                 elif gammas[robot] != np.float32(0.0):
-                    _add_gradient(mixed_at, delta_at, gradient_at, room, octets, rows, num_classes, gammas[robot])
+                    _add_gradient(
+                        mixed_at, delta_at, gradient_at, room, octets, num_shared, rows, num_classes, gammas[robot]
+                    )
             # Numbers that are not negative are in the order of their bits.
             largest = np.int32(0)
             for i in range(size):
@@ -241,8 +247,8 @@ def team_step(
             if largest > 0:
                 column = columns[first + OWN]
                 table.values[column, b] = mixed[0]
-                different = np.int32(rows > OCTETS)
-                for i in range(BRICK_CELLS):
+                different = np.int32(0)
+                for i in range(size):
                     different = np.int32(different | np.int32(mixed[i] != mixed[0]))
                 is_even[robot, b] = different == 0
                 if table.addresses[column, b] != 0:
@@ -291,12 +297,13 @@ def join_columns(table, columns, is_awake, known, has_block, layout):
 
 
 @kernel
-def sum_evidence(bricks, indices, table, layout, counts, scales, num_classes, scratch, octets, no_rows):
+def sum_evidence(bricks, indices, table, layout, known, counts, scales, num_classes, scratch, octets, no_rows):
     """The sum over robots of log q, written to the bricks ``indices`` (n,), whose masks are ``layout`` (n, W).
 
-    Index -1 is left out. ``table`` says where the robots' evidence lies. It is divided by each cell's scans where the
-    table ``counts`` has columns, and otherwise multiplied by ``scales`` (N,). ``scratch`` float32 has room for 3 blocks
-    with every row, ``octets`` int64 for a number for each row of a block, and ``no_rows`` (1, 1) is an empty mask.
+    ``known`` (n,) are their known cells; index -1 is left out. ``table`` says where the robots' evidence lies. It is
+    divided by each cell's scans where the table ``counts`` has columns, and otherwise multiplied by ``scales`` (N,).
+    ``scratch`` float32 has room for 3 blocks with every row, ``octets`` int64 for a number for each row of a block, and
+    ``no_rows`` (n, 1) are empty masks.
     """
     term_at = np.int64(scratch.ctypes.data)
     room = (num_classes + 1) * BRICK_CELLS * 4
@@ -305,7 +312,7 @@ def sum_evidence(bricks, indices, table, layout, counts, scales, num_classes, sc
         index = indices[b]
         if index < 0:
             continue
-        rows = _row_octets(layout, b, octets)
+        num_shared, rows = _row_octets(layout, known, b, octets)
         size = rows * OCTETS
         term = float_array(term_at, (size,))
         count = float_array(count_at, (size,))
@@ -314,10 +321,10 @@ def sum_evidence(bricks, indices, table, layout, counts, scales, num_classes, sc
             total[i] = np.float32(0.0)
             count[i] = np.float32(1.0)
         for r in range(table.addresses.shape[0]):
-            load(term_at, table, b, r, layout, b, num_classes)
+            load(term_at, table, b, r, layout, known, b, num_classes)
             if counts.addresses.shape[0] > 0:
-                load(count_at, counts, b, r, no_rows, 0, 1)
-                for own in range(OCTETS, rows):
+                load(count_at, counts, b, r, no_rows, known, b, 1)
+                for own in range(num_shared, rows):
                     copy_octet(count_at + own * ROW_BYTES, count_at + octets[own] * ROW_BYTES)
             for i in range(size):
                 total[i] += term[i] * scales[r] / max(count[i], np.float32(1.0))

@@ -6,7 +6,7 @@ import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
 from octoreplay.mapping.kernels.intrinsics import lowest_one
-from octoreplay.mapping.kernels.storage import ALL_CELLS, OCTETS, collapse, share_first_class
+from octoreplay.mapping.kernels.storage import ALL_CELLS, OCTETS, collapse, octets_of, share_first_class
 
 EVERY_BYTE = np.uint64(0x0101010101010101)
 LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
@@ -21,17 +21,20 @@ def _marked(marks):
 
 
 @kernel
-def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, changes):
+def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
     """Which classes the marks of a scan hit in each octet of the bricks ``indices`` (n,), as masks ``wanted`` (n, W).
 
     ``touched`` (n,) are the scratch bricks of the marks, ``words`` the marks, eight to a word: 0 for no mark, 1 for a
-    free cell, c + 2 for a hit of class c. ``changes`` (n,) says which bricks change at all: one that is free and
-    clamped does not. A map of one class has no rows of single classes, and takes every hit as its own.
+    free cell, c + 2 for a hit of class c. ``known`` (n,) gets the marked cells. ``changes`` (n,) says which bricks
+    change at all: one that is free and clamped does not. A map of one class has no rows of single classes, and takes
+    every hit as its own.
     """
     for t in range(indices.size):
         any_hit = np.uint64(0)
+        known[t] = 0
         for e in range(OCTETS):
             marks = words[touched[t] * OCTETS + e]
+            known[t] |= _marked(marks) << np.uint64(8 * e)
             # Bits above the lowest of a byte say that a cell was hit.
             hits = marks & ~EVERY_BYTE
             any_hit |= hits
@@ -56,7 +59,7 @@ def apply_marks(
     """Add one scan's log-odds to the bricks ``indices`` (n,), raised beforehand.
 
     A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped. The marks are those of ``wanted_rows``. ``scratch`` (2, 8 + 8 C) uint64 is set.
+    are clamped. The marks are those of ``wanted_rows``. ``scratch`` (2, 9 + 8 C) uint64 is set.
     """
     # The marks, and the mark that says a row's own class was hit, of every value of a block.
     row_marks, row_hits = scratch[0], scratch[1]
@@ -66,23 +69,22 @@ def apply_marks(
         hit_other = hit
     for t in range(indices.size):
         index = indices[t]
-        known = np.uint64(0)
+        octets = octets_of(bricks.known[index])
+        rows = 0
         for e in range(OCTETS):
-            marks = words[touched[t] * OCTETS + e]
-            known |= _marked(marks) << np.uint64(8 * e)
-            row_marks[e] = marks
-            row_hits[e] = 0
-        rows = OCTETS
+            row_marks[rows] = words[touched[t] * OCTETS + e]
+            row_hits[rows] = 0
+            rows += np.int64(octets >> np.uint64(8 * e) & np.uint64(1))
+        num_shared = rows
         for w in range(bricks.masks.shape[1]):
             bits = bricks.masks[index, w]
             while bits:
                 bit = lowest_one(bits)
-                row_marks[rows] = row_marks[bit >> 3]
+                row_marks[rows] = words[touched[t] * OCTETS + (bit >> 3)]
                 row_hits[rows] = np.uint64(8 * w + (bit & 7) + 2) * EVERY_BYTE
                 rows += 1
                 bits &= bits - np.uint64(1)
         bricks.revisions[index] = revision
-        bricks.known[index] |= known
         block = np.int64(bricks.blocks[index])
         first = block * OCTETS
         for i in range(rows * OCTETS):
@@ -90,7 +92,7 @@ def apply_marks(
             step = miss if mark == 1 else (hit if mark == all_hits[i] else hit_other)
             changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
             flat[first + i] = changed if mark > 0 else flat[first + i]
-        if rows > OCTETS:
-            share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
+        if rows > num_shared:
+            share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
         else:
             collapse(bricks, index)

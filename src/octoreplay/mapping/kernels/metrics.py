@@ -7,7 +7,7 @@ import numpy as np
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
 from octoreplay.mapping.kernels.consensus import PREFETCH_AHEAD, exp_negative, prefetch
 from octoreplay.mapping.kernels.intrinsics import copy_octet, count_ones, float_array, fma, lowest_one, same_bits
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, octets_of
 
 
 @inline_kernel
@@ -39,11 +39,17 @@ def _load_classes(target_at, table, n, column, width):
             for i in range(BRICK_CELLS):
                 target[c, i] = value
         return
-    shared = float_array(address, (BRICK_CELLS,))
-    for c in range(width):
-        for i in range(BRICK_CELLS):
-            target[c, i] = shared[i]
-    row_at = address + OCTETS * ROW_BYTES
+    octets = octets_of(table.known[column, n])
+    row_at = address
+    for e in range(OCTETS):
+        is_present = octets >> np.uint64(8 * e) & np.uint64(1)
+        for c in range(width):
+            if is_present:
+                copy_octet(target_at + (c * OCTETS + e) * ROW_BYTES, row_at)
+            else:
+                for k in range(OCTETS):
+                    target[c, 8 * e + k] = np.float32(0.0)
+        row_at += np.int64(is_present) * ROW_BYTES
     for w in range(table.masks.shape[2]):
         bits = table.masks[column, n, w]
         while bits:

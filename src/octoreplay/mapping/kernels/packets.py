@@ -20,11 +20,14 @@ from octoreplay.mapping.kernels.storage import (
     ALL_CELLS,
     BRICK_CELLS,
     BRICK_DEPTH,
+    FIRST_CELLS,
     OCTETS,
     add_brick,
     block_rows,
     new_block,
-    num_own_rows,
+    num_rows,
+    octets_of,
+    ones_below,
     share_first_class,
 )
 from octoreplay.records import Float32Array, Int64Array, UInt8Array
@@ -36,8 +39,6 @@ ALL_LEAVES = 0xAAAA
 ZERO, ONE = np.uint64(0), np.uint64(1)
 EIGHT_CELLS = np.uint64(0xFF)
 """An octet: a byte of a brick's mask."""
-FIRST_CELLS = np.uint64(0x0101010101010101)
-"""The first cell of each octet."""
 LAST_CELLS = np.uint64(0x8080808080808080)
 """The last cell of each octet."""
 NO_SIGN = np.float32(0.0)
@@ -59,7 +60,7 @@ class EncoderScratch(NamedTuple):
     classes: Int64Array
     flags: UInt8Array
     octet_rows: Int64Array
-    num_rows: Int64Array
+    octet_sizes: Int64Array
     class_values: Float32Array
     before: Int64Array
     states: UInt8Array
@@ -69,9 +70,9 @@ class EncoderScratch(NamedTuple):
 
 @kernel
 def _copy_block(bricks, index, block, octets, classes):
-    """Copy a brick's rows to ``block`` (8 + 8 C, 8); one value is spelt out. Returns the number of rows.
+    """Copy a brick's rows to ``block`` (8 + 8 C, 8), all eight shared ones; one value is spelt out.
 
-    Row r >= 8 holds the values of class ``classes[r]`` in octet ``octets[r]``.
+    Returns the number of rows. Row r >= 8 holds the values of class ``classes[r]`` in octet ``octets[r]``.
     """
     rows = OCTETS
     for w in range(bricks.masks.shape[1]):
@@ -82,10 +83,17 @@ def _copy_block(bricks, index, block, octets, classes):
             classes[rows] = 8 * w + (bit & 7)
             rows += 1
             bits &= bits - ONE
-    first = np.int64(bricks.blocks[index])
+    source = np.int64(bricks.blocks[index])
+    present = octets_of(bricks.known[index])
     for r in range(rows):
-        for k in range(OCTETS):
-            block[r, k] = (bricks.rows[first + r, k] if first >= 0 else bricks.values[index]) + NO_SIGN
+        is_stored = source >= 0 and (r >= OCTETS or present >> np.uint64(8 * r) & ONE)
+        if is_stored:
+            for k in range(OCTETS):
+                block[r, k] = bricks.rows[source, k] + NO_SIGN
+            source += 1
+        else:
+            for k in range(OCTETS):
+                block[r, k] = bricks.values[index] + NO_SIGN if source < 0 else np.float32(0.0)
     return rows
 
 
@@ -247,19 +255,31 @@ def _write_words(known, starts, vector, words, totals):
 
 @kernel
 def _write_vectors(
-    block, rows, octets, classes, octet_rows, num_rows, class_values, starts, vector, values, masks, own_values, totals
+    block,
+    rows,
+    octets,
+    classes,
+    octet_rows,
+    octet_sizes,
+    class_values,
+    starts,
+    vector,
+    values,
+    masks,
+    own_values,
+    totals,
 ):
     """Append the masks and other values of a brick's vector leaves, the first of which stands at ``totals[1]``.
 
-    ``octet_rows``, ``num_rows`` and ``class_values`` are set.
+    ``octet_rows``, ``octet_sizes`` and ``class_values`` are set.
     """
     num_classes = class_values.size
     for e in range(OCTETS):
-        num_rows[e] = 0
+        octet_sizes[e] = 0
     for r in range(OCTETS, rows):
         e = octets[r]
-        octet_rows[e, num_rows[e]] = r
-        num_rows[e] += 1
+        octet_rows[e, octet_sizes[e]] = r
+        octet_sizes[e] += 1
     left = vector
     while left:
         i = lowest_one(left)
@@ -269,7 +289,7 @@ def _write_vectors(
         for b in range(masks.shape[1]):
             masks[totals[2], b] = 0
         num_own = 0
-        for j in range(num_rows[e]):
+        for j in range(octet_sizes[e]):
             r = octet_rows[e, j]
             own_values[totals[3] + num_own] = block[r, k]
             is_own = same_bits(block[r, k]) != same_bits(shared)
@@ -282,10 +302,10 @@ def _write_vectors(
         # The shared value may not be the one that most classes have.
         for c in range(num_classes):
             class_values[c] = shared
-        for j in range(num_rows[e]):
+        for j in range(octet_sizes[e]):
             r = octet_rows[e, j]
             class_values[classes[r]] = block[r, k]
-        place = totals[1] + count_ones(starts & ((ONE << np.uint64(i)) - ONE))
+        place = totals[1] + ones_below(starts, i)
         _write_leaf(class_values, place, values, masks, own_values, totals)
 
 
@@ -319,7 +339,7 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
     each, from 0. ``scratch`` is an EncoderScratch whose first octets are 0 to 7.
     """
     lossy = prune and tolerance > 0
-    block, octets, classes, flags, octet_rows, num_rows, class_values, before, states, low, high = scratch
+    block, octets, classes, flags, octet_rows, octet_sizes, class_values, before, states, low, high = scratch
     shared = 0
     for n in range(order.size):
         index = order[n]
@@ -367,8 +387,8 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
                         last += (starts >> np.uint64(8 * e + k)) & ONE
                 if vector:
                     _write_vectors(
-                        block, rows, octets, classes, octet_rows, num_rows, class_values, starts, vector, values, masks,
-                        own_values, totals,
+                        block, rows, octets, classes, octet_rows, octet_sizes, class_values, starts, vector, values,
+                        masks, own_values, totals,
                     )  # fmt: skip
                 totals[1] = np.int64(last)
         states[BRICK_DEPTH - 1, place] = state
@@ -487,7 +507,7 @@ def read_class_masks(entries, masks, class_masks):
     They are (n, W), from 0; ``masks`` (V, W) are those of the vector leaves. Returns the rows that the bricks take.
     """
     leaf = 0
-    num_rows = 0
+    total = 0
     for n in range(entries.codes.size):
         is_leaf = entries.known[n] == ALL_CELLS and entries.starts[n] == ONE
         vector = entries.vector[n]
@@ -498,19 +518,24 @@ def read_class_masks(entries, masks, class_masks):
                 class_masks[n, w] |= np.uint64(masks[leaf, w]) * octets
             leaf += 1
         if entries.vector[n] or not is_leaf:
-            num_rows += entries.spans[n] * block_rows(num_own_rows(class_masks, n))
-    return num_rows
+            total += entries.spans[n] * block_rows(num_rows(entries.known[n], class_masks, n))
+    return total
 
 
 @kernel
 def _fill_shared(bricks, block, known, starts, values, first):
     """Write the shared values of a block from its leaves' values, from ``first`` on; returns the number of leaves."""
-    count = ZERO
-    for i in range(BRICK_CELLS):
-        count += (starts >> np.uint64(i)) & ONE
-        # The last leaf that started.
-        value = values[first + max(count, ONE) - ONE]
-        bricks.rows[block + (i >> 3), i & 7] = value if (known >> np.uint64(i)) & ONE else np.float32(0.0)
+    count, row = ZERO, block
+    for e in range(OCTETS):
+        cells = (known >> np.uint64(8 * e)) & EIGHT_CELLS
+        if cells == ZERO:
+            continue
+        for k in range(OCTETS):
+            count += (starts >> np.uint64(8 * e + k)) & ONE
+            # The last leaf that started.
+            value = values[first + max(count, ONE) - ONE]
+            bricks.rows[row, k] = value if (cells >> np.uint64(k)) & ONE else np.float32(0.0)
+        row += 1
     return count
 
 
@@ -521,11 +546,13 @@ def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
     Returns the next leaf and value.
     """
     block = np.int64(bricks.blocks[index])
-    row = block + OCTETS
+    present = octets_of(entries.known[n])
+    first_row = block + count_ones(present)
+    row = first_row
     for w in range(masks.shape[1]):
         bits = bricks.masks[index, w]
         while bits:
-            octet = block + (lowest_one(bits) >> 3)
+            octet = block + ones_below(present, lowest_one(bits) & 56)
             for k in range(OCTETS):
                 bricks.rows[row, k] = bricks.rows[octet, k]
             row += 1
@@ -548,7 +575,7 @@ def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
                 c = np.uint64(lowest_one(classes))
                 classes &= classes - ONE
                 for bit in range(first_bit + c, end_bit + c, 8):
-                    row = block + OCTETS + before + count_ones(of_brick & ((ONE << np.uint64(bit)) - ONE))
+                    row = first_row + before + ones_below(of_brick, bit)
                     for k in range(first_cell, end_cell):
                         bricks.rows[row, k] = own_values[first]
                 first += 1
@@ -573,13 +600,13 @@ def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_va
             if is_value:
                 bricks.values[index] = values[first_value]
                 continue
-            block = new_block(bricks, num_own_rows(class_masks, n))
+            block = new_block(bricks, num_rows(entries.known[n], class_masks, n))
             bricks.blocks[index] = block
             num_leaves = _fill_shared(bricks, block, entries.known[n], entries.starts[n], values, first_value)
             if entries.vector[n]:
                 for w in range(class_masks.shape[1]):
                     bricks.masks[index, w] = class_masks[n, w]
                 next_leaf, next_own = _fill_own(bricks, index, entries, n, masks, first_leaf, own_values, first_own)
-                share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
+                share_first_class(bricks.rows, block, entries.known[n], bricks.masks, index, num_classes)
         first_value += num_leaves
         first_leaf, first_own = next_leaf, next_own

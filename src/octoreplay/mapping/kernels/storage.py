@@ -4,10 +4,10 @@ A *brick* is a cube of 4 x 4 x 4 finest cells in Morton order (bit 0 of the inde
 cells are an *octet*; a brick has eight. Most classes have the same value in a cell, because none of them was ever hit
 there, so a brick holds what its classes share and, octet by octet, the classes with values of their own.
 
-A brick is one value for all its cells and classes, or a *block* of rows of 8 values: one row for each octet with the
-shared values, then one for each octet and class with values of its own. ``masks`` says which those are: bit
-8 e + c % 8 of word c // 8 stands for class c in octet e, and the rows are in the order of the bits. Where every class
-of an octet has a row of its own, the shared one repeats that of class 0.
+A brick is one value for all its cells and classes, or a *block* of rows of 8 values: one row for each octet that has a
+known cell, with the shared values, then one for each octet and class with values of its own. ``masks`` says which those
+are: bit 8 e + c % 8 of word c // 8 stands for class c in octet e, and the rows are in the order of the bits. Where
+every class of an octet has a row of its own, the shared one repeats that of class 0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.mapping.kernels.compiler import kernel
+from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
 from octoreplay.mapping.kernels.intrinsics import copy_octet, count_ones, float_array, lowest_one, same_bits
 from octoreplay.records import BoolArray, Float32Array, Int32Array, Int64Array, UInt64Array
 
@@ -27,13 +27,15 @@ CELL_BITS = 3 * BRICK_BITS
 BRICK_CELLS = 1 << CELL_BITS
 ALL_CELLS = np.uint64(0xFFFFFFFFFFFFFFFF)
 """The mask of a brick with all its cells known: bit i stands for cell i."""
+FIRST_CELLS = np.uint64(0x0101010101010101)
+"""The first cell of each octet."""
 OCTETS = 8
 """Octets of a brick, and cells of an octet."""
 ROW_BYTES = 4 * OCTETS
 BRICK_BYTES = 32
 """Bytes that are kept of every brick beside its rows, mask and place in the hash table."""
-GROWTH = 4
-"""Blocks have room for a multiple of so many rows."""
+GROWTH = 2
+"""Blocks have room for a multiple of so many rows: whole cache lines."""
 KEY_BITS = 19
 """A key's three coordinates lie in [-2^18, 2^18)."""
 KEY_OFFSET = 1 << (KEY_BITS - 1)
@@ -172,134 +174,163 @@ def find_all(bricks, codes, indices):
         indices[i] = find_brick(bricks, codes[i])
 
 
-@kernel
-def block_rows(num_own):
-    """Rows of a block that holds so many rows of single classes."""
-    return OCTETS + (num_own + GROWTH - 1) // GROWTH * GROWTH
+@inline_kernel
+def octets_of(known):
+    """The octets with a cell in the mask ``known``, one bit each at 8 e."""
+    x = known | known >> np.uint64(4)
+    x |= x >> np.uint64(2)
+    return (x | x >> np.uint64(1)) & FIRST_CELLS
+
+
+@inline_kernel
+def ones_below(mask, bit):
+    """Number of ones of a mask below a bit."""
+    return count_ones(mask & ((np.uint64(1) << np.uint64(bit)) - np.uint64(1)))
 
 
 @kernel
-def num_own_rows(masks, n):
-    """How many octets and classes have values of their own by the mask ``masks[n]``."""
-    total = 0
+def num_rows(known, masks, n):
+    """Rows of a block with these known cells and values of single classes by the mask ``masks[n]``."""
+    total = count_ones(octets_of(known))
     for w in range(masks.shape[1]):
         total += count_ones(masks[n, w])
     return total
 
 
+@inline_kernel
+def block_rows(rows):
+    """Rows of the block that holds so many."""
+    return (rows + GROWTH - 1) // GROWTH * GROWTH
+
+
 @kernel
-def new_block(bricks, num_own):
-    """First row of a block with room for so many rows of single classes. The room must be there."""
-    rows = block_rows(num_own)
-    size = (rows - OCTETS) // GROWTH
-    block = np.int64(bricks.free[size])
+def new_block(bricks, rows):
+    """First row of a block with room for so many rows. The room must be there."""
+    size = block_rows(rows)
+    block = np.int64(bricks.free[size // GROWTH])
     if block >= 0:
-        bricks.free[size] = same_bits(bricks.rows[block, 0])
-        bricks.counters[NUM_FREE_ROWS] -= rows
+        bricks.free[size // GROWTH] = same_bits(bricks.rows[block, 0])
+        bricks.counters[NUM_FREE_ROWS] -= size
     else:
         block = bricks.counters[NUM_ROWS]
-        bricks.counters[NUM_ROWS] = block + rows
+        bricks.counters[NUM_ROWS] = block + size
     return block
 
 
 @kernel
-def _release(bricks, block, num_own):
-    """Give a block back."""
-    rows = block_rows(num_own)
-    size = (rows - OCTETS) // GROWTH
-    bricks.rows[block, 0] = same_bits(bricks.free[size])
-    bricks.free[size] = block
-    bricks.counters[NUM_FREE_ROWS] += rows
+def _release(bricks, block, rows):
+    """Give a block with so many rows back."""
+    size = block_rows(rows)
+    bricks.rows[block, 0] = same_bits(bricks.free[size // GROWTH])
+    bricks.free[size // GROWTH] = block
+    bricks.counters[NUM_FREE_ROWS] += size
 
 
-@kernel
+@inline_kernel
 def _copy_row(rows, target, source):
     """Copy one row. A loop, because numba compiles assignments to slices slowly."""
     for i in range(OCTETS):
         rows[target, i] = rows[source, i]
 
 
+@inline_kernel
+def _fill_row(rows, target, value):
+    """Set a row to one value."""
+    for i in range(OCTETS):
+        rows[target, i] = value
+
+
 @kernel
-def full_octets(masks, n, num_classes):
-    """The octets, one bit each at 8 e, in which every class has values of its own by the mask ``masks[n]``."""
-    full = np.uint64(0x0101010101010101)
+def share_first_class(rows, block, known, masks, n, num_classes):
+    """Repeat the values of class 0 as the shared ones of the octets in which every class has values of its own."""
+    full = FIRST_CELLS
     for c in range(num_classes):
         full &= masks[n, c >> 3] >> np.uint64(c & 7)
-    return full
-
-
-@kernel
-def share_first_class(rows, block, masks, n, num_classes):
-    """Repeat the values of class 0 as the shared ones of the octets in which every class has values of its own."""
-    full = full_octets(masks, n, num_classes)
+    octets = octets_of(known)
     while full:
         bit = lowest_one(full)
-        own = count_ones(masks[n, 0] & ((np.uint64(1) << np.uint64(bit)) - np.uint64(1)))
-        _copy_row(rows, block + (bit >> 3), block + OCTETS + own)
+        own = block + count_ones(octets) + ones_below(masks[n, 0], bit)
+        _copy_row(rows, block + ones_below(octets, bit), own)
         full &= full - np.uint64(1)
 
 
 @kernel
-def rows_to_raise(bricks, indices, wanted):
-    """At most how many new rows it takes to raise the bricks ``indices`` (n,) to the masks ``wanted`` (n, W)."""
+def rows_to_raise(bricks, indices, wanted, known, needs_block):
+    """At most how many new rows ``raise_bricks`` takes."""
     total = 0
     for i in range(indices.size):
         index = indices[i]
-        own = 0
+        if index < 0 or not needs_block[i]:
+            continue
+        rows = count_ones(octets_of(bricks.known[index] | known[i]))
         for w in range(wanted.shape[1]):
-            own += count_ones(bricks.masks[index, w] | wanted[i, w])
-        if bricks.blocks[index] < 0 or block_rows(own) != block_rows(num_own_rows(bricks.masks, index)):
-            total += block_rows(own)
+            rows += count_ones(bricks.masks[index, w] | wanted[i, w])
+        old_rows = num_rows(bricks.known[index], bricks.masks, index)
+        if bricks.blocks[index] < 0 or block_rows(rows) != block_rows(old_rows):
+            total += block_rows(rows)
     return total
 
 
 @kernel
-def raise_bricks(bricks, indices, wanted, num_classes):
-    """Give the bricks ``indices`` (n,) blocks with at least the rows of the masks ``wanted`` (n, W)."""
+def raise_bricks(bricks, indices, wanted, known, needs_block, num_classes, gains):
+    """Add known cells (n,) to the bricks ``indices`` (n,), and a block where one is needed (n,), with the rows that it
+    takes for them and at least those of the masks ``wanted`` (n, W). Index -1 is left out.
+
+    ``gains`` (n,) says which bricks get a known cell more. Room for the rows must be there.
+    """
     words = wanted.shape[1]
     for i in range(indices.size):
         index = indices[i]
-        old_own = num_own_rows(bricks.masks, index)
-        new_own = 0
-        for w in range(words):
-            new_own += count_ones(bricks.masks[index, w] | wanted[i, w])
+        gains[i] = False
+        if index < 0:
+            continue
+        old_octets, new_octets = octets_of(bricks.known[index]), octets_of(bricks.known[index] | known[i])
+        gains[i] = bricks.known[index] | known[i] != bricks.known[index]
         old_block = np.int64(bricks.blocks[index])
-        if old_block >= 0 and new_own == old_own:
+        old_rows = num_rows(bricks.known[index], bricks.masks, index)
+        bricks.known[index] |= known[i]
+        if not needs_block[i]:
+            continue
+        rows = count_ones(new_octets)
+        for w in range(words):
+            rows += count_ones(bricks.masks[index, w] | wanted[i, w])
+        if old_block >= 0 and rows == old_rows:
             continue
         block = old_block
-        if old_block < 0 or block_rows(new_own) != block_rows(old_own):
-            block = new_block(bricks, new_own)
-            for e in range(OCTETS):
-                if old_block >= 0:
-                    _copy_row(bricks.rows, block + e, old_block + e)
-                else:
-                    for k in range(OCTETS):
-                        bricks.rows[block + e, k] = bricks.values[index]
+        if old_block < 0 or block_rows(rows) != block_rows(old_rows):
+            block = new_block(bricks, rows)
         # From the last row to the first: within a block rows only move up.
-        place, source = block + OCTETS + new_own, old_block + OCTETS + old_own
-        for w in range(words - 1, -1, -1):
-            old_mask = bricks.masks[index, w]
-            new_mask = old_mask | wanted[i, w]
+        place, source = block + rows, old_block + old_rows
+        for w in range(words - 1, -2, -1):
+            # The last round is that of the shared rows.
+            old_mask = bricks.masks[index, w] if w >= 0 else old_octets
+            new_mask = old_mask | wanted[i, w] if w >= 0 else new_octets
             for bit in range(63, -1, -1):
-                if new_mask >> np.uint64(bit) & np.uint64(1):
-                    place -= 1
-                    if old_mask >> np.uint64(bit) & np.uint64(1):
-                        source -= 1
-                        _copy_row(bricks.rows, place, source)
-                    else:
-                        _copy_row(bricks.rows, place, block + (bit >> 3))
-            bricks.masks[index, w] = new_mask
+                if not new_mask >> np.uint64(bit) & np.uint64(1):
+                    continue
+                place -= 1
+                if old_block < 0:
+                    _fill_row(bricks.rows, place, bricks.values[index])
+                elif old_mask >> np.uint64(bit) & np.uint64(1):
+                    source -= 1
+                    _copy_row(bricks.rows, place, source)
+                elif old_octets >> np.uint64(bit & 56) & np.uint64(1):
+                    _copy_row(bricks.rows, place, old_block + ones_below(old_octets, bit & 56))
+                else:
+                    _fill_row(bricks.rows, place, np.float32(0.0))
+            if w >= 0:
+                bricks.masks[index, w] = new_mask
         if 0 <= old_block != block:
-            _release(bricks, old_block, old_own)
+            _release(bricks, old_block, old_rows)
         bricks.blocks[index] = block
-        share_first_class(bricks.rows, block, bricks.masks, index, num_classes)
+        share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
 
 
 @kernel
 def collapse(bricks, index):
     """Make a brick one value when all its cells are known and all values equal: the in-memory prune."""
     block = np.int64(bricks.blocks[index])
-    if block < 0 or bricks.known[index] != ALL_CELLS or num_own_rows(bricks.masks, index) > 0:
+    if block < 0 or bricks.known[index] != ALL_CELLS or num_rows(ALL_CELLS, bricks.masks, index) > OCTETS:
         return
     first = bricks.rows[block, 0]
     different = 0
@@ -307,7 +338,7 @@ def collapse(bricks, index):
         for k in range(OCTETS):
             different += bricks.rows[block + e, k] != first
     if different == 0:
-        _release(bricks, block, 0)
+        _release(bricks, block, OCTETS)
         bricks.blocks[index] = -1
         bricks.values[index] = first
 
@@ -350,64 +381,66 @@ def fill_table(bricks, indices, since, table, column):
 
 
 @kernel
-def load(target_at, table, n, column, layout, m, num_classes):
-    """Write the brick ``n`` of a table's column to an address, with the rows of the mask ``layout[m]``.
+def load(target_at, table, n, column, layout, known, m, num_classes):
+    """Write the brick ``n`` of a table's column to an address, with the rows for ``known[m]`` and ``layout[m]``.
 
-    The mask must hold the brick's own. Returns the number of rows.
+    They must hold the brick's own. Cells that the brick does not know are 0.
     """
-    rows = OCTETS + num_own_rows(layout, m)
-    size = rows * OCTETS
-    target = float_array(target_at, (size,))
+    octets, own_octets = octets_of(known[m]), octets_of(table.known[column, n])
+    rows = num_rows(known[m], layout, m)
+    target = float_array(target_at, (rows * OCTETS,))
     address = table.addresses[column, n]
     if address == 0:
         value = table.values[column, n]
-        for i in range(size):
+        for i in range(rows * OCTETS):
             target[i] = value
-        return rows
-    source = float_array(address, (BRICK_CELLS,))
-    for i in range(BRICK_CELLS):
-        target[i] = source[i]
-    place, own = target_at + OCTETS * ROW_BYTES, address + OCTETS * ROW_BYTES
-    for w in range(layout.shape[1]):
-        bits = layout[m, w]
-        mask = table.masks[column, n, w]
+        return
+    for i in range(rows * OCTETS):
+        target[i] = np.float32(0.0)
+    place, source = target_at, address
+    for w in range(-1, layout.shape[1]):
+        # The first round is that of the shared rows.
+        bits = layout[m, w] if w >= 0 else octets
+        mask = table.masks[column, n, w] if w >= 0 else own_octets
         while bits:
             bit = lowest_one(bits)
             if mask >> np.uint64(bit) & np.uint64(1):
-                copy_octet(place, own)
-                own += ROW_BYTES
-            else:
-                copy_octet(place, address + (bit >> 3) * ROW_BYTES)
+                copy_octet(place, source)
+                source += ROW_BYTES
+            elif own_octets >> np.uint64(bit & 56) & np.uint64(1):
+                copy_octet(place, address + ones_below(own_octets, bit & 56) * ROW_BYTES)
             place += ROW_BYTES
             bits &= bits - np.uint64(1)
     # An octet may be full in the layout alone.
-    share_first_class(float_array(target_at, (rows, OCTETS)), 0, layout, m, num_classes)
-    return rows
+    share_first_class(float_array(target_at, (rows, OCTETS)), 0, known[m], layout, m, num_classes)
 
 
 @kernel
-def store_bricks(bricks, indices, known, table, num_classes):
-    """Overwrite the bricks ``indices`` (n,), raised beforehand, by those of a table's only column.
+def rows_of_column(table):
+    """How many rows the blocks of a table's only column take."""
+    total = 0
+    for i in range(table.known.shape[1]):
+        if table.addresses[0, i] != 0:
+            total += block_rows(num_rows(table.known[0, i], table.masks[0], i))
+    return total
 
-    ``known`` (n,) are the masks of their known cells.
-    """
+
+@kernel
+def replace_bricks(bricks, indices, table):
+    """Replace the bricks ``indices`` (n,) by those of a table's only column. Room for their rows must be there."""
     base = np.int64(bricks.rows.ctypes.data)
     for i in range(indices.size):
         index = indices[i]
-        bricks.known[index] = known[i]
-        if bricks.blocks[index] < 0:
-            bricks.values[index] = table.values[0, i]
-        else:
-            load(base + np.int64(bricks.blocks[index]) * ROW_BYTES, table, i, 0, bricks.masks, index, num_classes)
-            collapse(bricks, index)
-
-
-@kernel
-def merge_known(known, indices, other_known, changed):
-    """known[indices] |= other_known, leaving out index -1; ``changed`` (n,) says where that changed anything."""
-    for i in range(indices.size):
-        changed[i] = False
-        if indices[i] >= 0:
-            old = known[indices[i]]
-            known[indices[i]] = old | other_known[i]
-            changed[i] = known[indices[i]] != old
+        if bricks.blocks[index] >= 0:
+            _release(bricks, np.int64(bricks.blocks[index]), num_rows(bricks.known[index], bricks.masks, index))
+        bricks.known[index] = table.known[0, i]
+        bricks.values[index] = table.values[0, i]
+        bricks.blocks[index] = -1
+        for w in range(table.masks.shape[2]):
+            bricks.masks[index, w] = table.masks[0, i, w]
+        if table.addresses[0, i] != 0:
+            rows = num_rows(table.known[0, i], bricks.masks, index)
+            block = new_block(bricks, rows)
+            bricks.blocks[index] = block
+            for r in range(rows):
+                copy_octet(base + (block + r) * ROW_BYTES, table.addresses[0, i] + r * ROW_BYTES)
