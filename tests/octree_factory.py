@@ -38,7 +38,10 @@ def _write_brick(octree, index, values):
     shared = [octets[e % 2 - 1, e] for e in range(storage.OCTETS)]
     # An octet in three gives every class a row, the others only those that differ from the first or the last class.
     has_row = [
-        [(octets[c, e] != shared[e]).any() or (e % 3 == 0 and np.ptp(octets[:, e]) > 0) for e in range(storage.OCTETS)]
+        [
+            (octets[c, e] != shared[e]).any() or (e % 3 == 0 and np.ptp(octets[:, e], axis=0).any())
+            for e in range(storage.OCTETS)
+        ]
         for c in range(octree.num_classes)
     ]
     masks = np.zeros((1, mask_bytes(octree.num_classes)), np.uint64)
