@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,9 @@ from octoreplay.records import (
 
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Calls a function with each of some items: ``map``, or an executor's."""
+
+BRICK_ARRAYS = ("codes", "blocks", "values", "masks", "known", "revisions")
+"""The arrays with one entry for each brick."""
 
 CACHE_LINE = 64
 """Bytes of a cache line."""
@@ -112,7 +115,7 @@ class SemanticOctree:
         num = self.num_bricks
         changes: dict[str, Any] = {}
         if num + bricks > old.codes.size:
-            for name in ("codes", "blocks", "values", "masks", "known", "revisions"):
+            for name in BRICK_ARRAYS:
                 changes[name] = _grown(getattr(old, name), num, num + bricks)
         used = int(old.counters[storage.NUM_ROWS])
         if used + rows > len(old.rows):
@@ -163,7 +166,12 @@ class SemanticOctree:
     def copy(self) -> Self:
         """An octree with the same content."""
         twin = type(self)(self.resolution, self.num_classes)
-        twin.bricks = Bricks(*(cast("Any", array).copy() for array in self.bricks))
+        rows = self.bricks.rows[: self.bricks.counters[storage.NUM_ROWS]]
+        used = {name: getattr(self.bricks, name)[: self.num_bricks] for name in BRICK_ARRAYS}
+        rest = {name: getattr(self.bricks, name) for name in ("table", "counters", "free")}
+        copies = {name: array.copy() for name, array in (used | rest).items()}
+        twin.bricks = Bricks(**copies, rows=cache_aligned(rows.shape, rows.dtype))
+        twin.bricks.rows[:] = rows
         return twin
 
     def streams(self, indices: Int64Array | None = None, *, prune: bool = True, tolerance: float = 0.0) -> TreeStreams:

@@ -114,9 +114,11 @@ class Robot:
         """
         compress = self._config.network.packet_compression == "zstd"
         packet = codec.pack(self.map, self.streams, codec.FULL, compress=compress)
-        # What decoding the packet gives, without undoing the compression.
-        received = octree_from_streams(self.streams, self.map.resolution, self.map.num_classes)
-        received.revisions[:] = self.map.revisions[self.map.find(received.codes)]
+        # What decoding the packet gives; a lossless one gives the map as it is.
+        received = self.map.copy()
+        if self._config.map.prune_tolerance > 0:
+            received = octree_from_streams(self.streams, self.map.resolution, self.map.num_classes)
+            received.revisions[:] = self.map.revisions[self.map.find(received.codes)]
         unpruned = self.map.streams(prune=False) if with_unpruned else None
         return PublishedMap(
             packet=packet,
