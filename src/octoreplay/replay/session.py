@@ -21,6 +21,7 @@ from octoreplay.io.robot_log import RobotLog
 from octoreplay.mapping.consensus import sum_of_evidence, team_step
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import (
     FrameCounts,
     LinkMetrics,
@@ -287,6 +288,7 @@ def replay_team(
     config = resolve(config)
     assert config.classes is not None
     with ExitStack() as stack:
+        stack.enter_context(second_compiler())
         logs = [stack.enter_context(RobotLog(robot, config.time, config.classes)) for robot in config.robots]
         session = Session(config, logs, num_threads=num_threads)
         threads = stack.enter_context(ThreadPoolExecutor(session.num_threads))

@@ -37,13 +37,18 @@ def _cache_folder() -> str | None:
             continue
         if os.access(folder, os.W_OK):
             if is_new:
-                logger.info("compiling kernels for this machine, which takes up to half a minute; they are kept")
+                logger.info("compiling kernels for this machine, which takes about 15 seconds; they are kept")
             return str(folder)
     logger.warning("no folder for compiled kernels can be written; they are compiled anew in every run")
     return None
 
 
 _CACHE_FOLDER = _cache_folder()
+
+
+def cache_is_empty() -> bool:
+    """True where compiled kernels can be kept, and none is yet."""
+    return _CACHE_FOLDER is not None and not any(Path(_CACHE_FOLDER).rglob("*.nbi"))
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Any:
