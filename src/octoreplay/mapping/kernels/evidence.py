@@ -5,8 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import kernel
-from octoreplay.mapping.kernels.intrinsics import lowest_one
-from octoreplay.mapping.kernels.storage import ALL_CELLS, OCTETS, collapse, octets_of, share_first_class
+from octoreplay.mapping.kernels.intrinsics import lowest_one, prefetch_line
+from octoreplay.mapping.kernels.storage import (
+    ALL_CELLS,
+    BRICK_CELLS,
+    OCTETS,
+    ROW_BYTES,
+    collapse,
+    octets_of,
+    share_first_class,
+)
+
+PREFETCH_AHEAD = 8
 
 EVERY_BYTE = np.uint64(0x0101010101010101)
 LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
@@ -67,8 +77,13 @@ def apply_marks(
     flat = bricks.rows.reshape(bricks.rows.size)
     if num_classes == 1:
         hit_other = hit
+    rows_at = np.int64(bricks.rows.ctypes.data)
     for t in range(indices.size):
         index = indices[t]
+        # Bricks lie anywhere: the block of one that comes soon is asked for ahead of its use.
+        ahead = np.int64(bricks.blocks[indices[min(t + PREFETCH_AHEAD, indices.size - 1)]])
+        for offset in range(0, BRICK_CELLS * 4, 64):
+            prefetch_line(rows_at + ahead * ROW_BYTES + offset)
         octets = octets_of(bricks.known[index])
         rows = 0
         for e in range(OCTETS):
@@ -94,5 +109,5 @@ def apply_marks(
             flat[first + i] = changed if mark > 0 else flat[first + i]
         if rows > num_shared:
             share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
-        else:
+        elif bricks.known[index] == ALL_CELLS:
             collapse(bricks, index)

@@ -81,6 +81,17 @@ def lowest_one(typing_context: Any, mask: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
+@intrinsic
+def highest_one(typing_context: Any, mask: Any) -> Any:
+    """Place of the highest one in a uint64 that is not 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = ir.IntType(64)
+        return builder.sub(number(63), builder.ctlz(arguments[0], ir.IntType(1)(1)))
+
+    return types.int64(types.uint64), generate
+
+
 def _octets(builder: Any, addresses: Any) -> list[Any]:
     """Pointers to eight float32 each. A loop over eight values would be unrolled into single ones."""
     return [builder.inttoptr(address, ir.VectorType(ir.FloatType(), 8).as_pointer()) for address in addresses]

@@ -17,7 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.intrinsics import copy_octet, count_ones, float_array, lowest_one, same_bits
+from octoreplay.mapping.kernels.intrinsics import (
+    copy_octet,
+    count_ones,
+    float_array,
+    highest_one,
+    lowest_one,
+    same_bits,
+)
 from octoreplay.records import BoolArray, Float32Array, Int32Array, Int64Array, UInt64Array
 
 BRICK_BITS = 2
@@ -305,9 +312,10 @@ def raise_bricks(bricks, indices, wanted, known, needs_block, num_classes, gains
             # The last round is that of the shared rows.
             old_mask = bricks.masks[index, w] if w >= 0 else old_octets
             new_mask = old_mask | wanted[i, w] if w >= 0 else new_octets
-            for bit in range(63, -1, -1):
-                if not new_mask >> np.uint64(bit) & np.uint64(1):
-                    continue
+            bits = new_mask
+            while bits:
+                bit = highest_one(bits)
+                bits ^= np.uint64(1) << np.uint64(bit)
                 place -= 1
                 if old_block < 0:
                     _fill_row(bricks.rows, place, bricks.values[index])
