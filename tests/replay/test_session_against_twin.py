@@ -13,6 +13,7 @@ import pytest
 from octoreplay.config import PRESETS
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
+from octoreplay.mapping.kernels import storage
 from octoreplay.replay import robot as robot_module
 from octoreplay.replay import session as session_module
 from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
@@ -479,9 +480,12 @@ def _free_is_not_reset(monkeypatch):
         changes = right(steps, rule=rule, **kwargs)
         for own, without in ((step.own, other.own) for step, other in zip(steps, mixed, strict=True)):
             codes = own.codes[own.bricks.masks[: own.num_bricks].any(axis=1)]
-            rows = class_rows(own, own.find(codes))
-            after, before = own.bricks.rows[rows], without.bricks.rows[class_rows(without, without.find(codes))]
-            own.bricks.rows[rows] = after + (after - before).sum(axis=1, keepdims=True)
+            rows, others = class_rows(own, own.find(codes)), class_rows(without, without.find(codes))
+            is_there = rows >= 0
+            after, before = np.zeros((2, *rows.shape, storage.OCTETS), np.float32)
+            after[is_there], before[is_there] = own.bricks.rows[rows[is_there]], without.bricks.rows[others[is_there]]
+            after += (after - before).sum(axis=1, keepdims=True)
+            own.bricks.rows[rows[is_there]] = after[is_there]
         return changes
 
     for module in (robot_module, session_module):

@@ -122,16 +122,10 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     def finish(n: int) -> float:
         return float(
             consensus_kernels.finish_step(
-                steps[n].own.bricks,
-                indices[n],
-                table,
-                columns[n][OWN],
-                changes[n],
-                is_even[n],
-                known_changed[n],
+                steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n],
                 revision,
             )
-        )
+        )  # fmt: skip
 
     return list(run(finish, range(len(steps))))
 

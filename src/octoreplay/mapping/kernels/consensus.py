@@ -88,11 +88,8 @@ def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, num_shared, rows
     size, shared_size = rows * OCTETS, num_shared * OCTETS
     mixed, delta = float_array(mixed_at, (size,)), float_array(delta_at, (size,))
     sigma_at, spread_at, other_at = scratch_at, scratch_at + room, scratch_at + 2 * room
-    sigma, spread, other = (
-        float_array(sigma_at, (size,)),
-        float_array(spread_at, (size,)),
-        float_array(other_at, (size,)),
-    )
+    sigma, spread = float_array(sigma_at, (size,)), float_array(spread_at, (size,))
+    other = float_array(other_at, (size,))
     terms_at = scratch_at + 3 * room
     total_at, dot_at = terms_at + BRICK_CELLS * 4, terms_at + BRICK_CELLS * 8
     terms = float_array(terms_at, (shared_size,))
@@ -156,23 +153,9 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 @kernel
 def team_step(
-    start,
-    end,
-    table,
-    columns,
-    first_columns,
-    weights,
-    gammas,
-    rule,
-    num_classes,
-    layouts,
-    known,
-    is_awake,
-    scratch,
-    int_scratch,
-    changes,
-    is_even,
-):
+    start, end, table, columns, first_columns, weights, gammas, rule, num_classes, layouts, known, is_awake, scratch,
+    int_scratch, changes, is_even,
+):  # fmt: skip
     """One iteration of a rule at R robots, brick by brick for all of them, in place in their own maps.
 
     ``table`` says where the bricks ``start`` to ``end`` of all maps lie. Robot r's ``columns`` of it are those from

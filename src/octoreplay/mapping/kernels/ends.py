@@ -104,11 +104,8 @@ def points_to_runs(
         size = min(_BLOCK, points.shape[0] - first)
         num_cut = 0
         for i in range(size):
-            x, y, z = (
-                np.float64(points[first + i, 0]),
-                np.float64(points[first + i, 1]),
-                np.float64(points[first + i, 2]),
-            )
+            x, y = np.float64(points[first + i, 0]), np.float64(points[first + i, 1])
+            z = np.float64(points[first + i, 2])
             distance = x * x + y * y + z * z
             valid = (distance > 0.0) & (distance < np.inf) & (distance >= least)
             kind = _UNLABELLED if valid else _NONE
