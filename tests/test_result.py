@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import leaf_list
-from octoreplay.errors import InputError
+from octoreplay.errors import InputError, PacketError
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.result import Result, open_result
@@ -136,3 +136,15 @@ def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(stored.leaves(team_posterior=True).log_odds, 2 * LEAVES.log_odds + prior, rtol=1e-6)
     box = stored.query_box((0, 0, 0), (0.2, 0.2, 0.2), team_posterior=True)
     np.testing.assert_allclose(box.log_odds, whole.log_odds[:1], rtol=1e-6)
+
+
+def test_a_map_that_cannot_be_read_is_named_with_its_file(tmp_path: Path) -> None:
+    """Here a packet of another version of the format."""
+    path = write_result(
+        tmp_path, lambda writer: writer.write_state(state("alpha", 0, 1, b"OCTM\1" + bytes(39), key=True))
+    )
+    with open_result(path) as opened, pytest.raises(PacketError) as caught:
+        opened.map("alpha")
+    assert str(caught.value) == (
+        f"{path}: robot 'alpha': map packet of format version 1, this octoreplay reads version 2; run the logs again"
+    )

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.config import RunConfig
-from octoreplay.errors import InputError
+from octoreplay.errors import InputError, PacketError
 from octoreplay.io import posterior
 from octoreplay.io.result_reader import ResultReader
 from octoreplay.mapping.codec import apply_delta, decode_packet
@@ -183,15 +183,18 @@ class Result:
         """A robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
         Raises InputError for an unknown robot, a tick at which no map is stored, or a time before the first stored map.
-        Raises PacketError where a stored map is damaged.
+        Raises PacketError where a stored map is damaged, or of a version that is not read.
         """
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick)
         states = self._reader.states(robot_id, until_ns)
-        octree = decode_packet(states[0].data)
-        for state in states[1:]:
-            apply_delta(octree, state.data)
+        try:
+            octree = decode_packet(states[0].data)
+            for state in states[1:]:
+                apply_delta(octree, state.data)
+        except PacketError as error:
+            raise PacketError(f"{self.path}: robot '{robot_id}': {error}; run the logs again") from error
         last = states[-1]
         return StoredMap(octree, robot_id, last.tick, last.stamp_ns, self._reader.prior, len(self.robots))
 
