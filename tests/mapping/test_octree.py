@@ -230,3 +230,17 @@ def test_memory_is_what_the_bricks_take():
     one_value = octree_of(cube((0, 0, 0), 4, [1.0, 1.0]))
     rows = [(other.memory_bytes - one_value.memory_bytes) // storage.ROW_BYTES for other in (free, hit)]
     assert rows == [storage.block_rows(1), storage.block_rows(3)]
+
+
+@pytest.mark.parametrize("needs_block", [True, False])
+def test_a_block_grows_with_the_cells_that_become_known(needs_block):
+    """Also where nobody asks for a block: the brick has one."""
+    octree = octree_of({(3, 0, 0): [1.0, 2.0], (3, 3, 3): [0.5, 0.5]})
+    before = cells_of(octree)
+    masks = np.zeros((1, 1), np.uint64)
+    gains = octree.raise_bricks(np.array([0]), masks, np.array([storage.ALL_CELLS]), np.array([needs_block]))
+    assert gains.tolist() == [True]
+    after = cells_of(octree)
+    assert len(after) == storage.BRICK_CELLS
+    assert {key: after[key] for key in before} == before
+    assert {value for key, value in after.items() if key not in before} == {bytes(8)}

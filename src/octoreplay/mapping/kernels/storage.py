@@ -267,7 +267,7 @@ def rows_to_raise(bricks, indices, wanted, known, needs_block):
     total = 0
     for i in range(indices.size):
         index = indices[i]
-        if index < 0 or not needs_block[i]:
+        if index < 0 or not (needs_block[i] or bricks.blocks[index] >= 0):
             continue
         rows = count_ones(octets_of(bricks.known[index] | known[i]))
         for w in range(wanted.shape[1]):
@@ -296,7 +296,7 @@ def raise_bricks(bricks, indices, wanted, known, needs_block, num_classes, gains
         old_block = np.int64(bricks.blocks[index])
         old_rows = num_rows(bricks.known[index], bricks.masks, index)
         bricks.known[index] |= known[i]
-        if not needs_block[i]:
+        if not (needs_block[i] or old_block >= 0):
             continue
         rows = count_ones(new_octets)
         for w in range(words):
