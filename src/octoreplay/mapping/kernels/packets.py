@@ -255,20 +255,9 @@ def _write_words(known, starts, vector, words, totals):
 
 @kernel
 def _write_vectors(
-    block,
-    rows,
-    octets,
-    classes,
-    octet_rows,
-    octet_sizes,
-    class_values,
-    starts,
-    vector,
-    values,
-    masks,
-    own_values,
+    block, rows, octets, classes, octet_rows, octet_sizes, class_values, starts, vector, values, masks, own_values,
     totals,
-):
+):  # fmt: skip
     """Append the masks and other values of a brick's vector leaves, the first of which stands at ``totals[1]``.
 
     ``octet_rows``, ``octet_sizes`` and ``class_values`` are set.

@@ -40,7 +40,7 @@ OCTETS = 8
 """Octets of a brick, and cells of an octet."""
 ROW_BYTES = 4 * OCTETS
 BRICK_BYTES = 32
-"""Bytes that are kept of every brick beside its rows, mask and place in the hash table."""
+"""Bytes of a brick's code, block, value, known cells and revision."""
 GROWTH = 2
 """Blocks have room for a multiple of so many rows: whole cache lines."""
 KEY_BITS = 19
