@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 EXIT_ERROR, EXIT_USAGE, EXIT_DATA_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 _SECTIONS = {
-    "sensor": "Inverse sensor model", "map": "Map", "consensus": "Consensus", "network": "Communication",
-    "time": "Time and pairing", "output": "What the result holds",
+    "sensor": "Inverse sensor model", "map": "Map", "consensus": "Consensus", "network": "Communication graph",
+    "link": "Links", "packet": "Packets", "time": "Time and pairing", "output": "What the result holds",
 }  # fmt: skip
 """Headings of the parameters' sections in ``run --help``."""
 
@@ -108,9 +108,11 @@ def cli() -> None:
 )
 @click.option("--preset", type=click.Choice(tuple(PRESETS)), help="a named set of settings; options override it")
 @click.option("--edges", metavar="A:B[:W],...", help="links of the communication graph, with weights if all have one")
+@click.option("--one-way", metavar="A:B,...", help="links that carry from A to B only")
+@click.option("--schedule", type=_existing, metavar="FILE.yaml", help="when which robots and links are up or down")
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
-    preset: str | None, edges: str | None, **parameters: Any,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into maps that the team agrees on.
 
@@ -129,7 +131,7 @@ def run(
     out, err = tables.terminal(), tables.terminal(stderr=True)
     base = _base_config(inputs, config_from, err)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config = discover.resolve(_with_options(base, preset, edges, given))
+    config = discover.resolve(_with_network(_with_options(base, preset, edges, given), one_way, schedule))
     if config_from is None and not _is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         if config.classes is not None:
@@ -431,6 +433,18 @@ def _with_options(base: RunConfig, preset: str | None, edges: str | None, given:
         if base.network.weights == "given":
             network.setdefault("weights", "metropolis")
     return dataclasses.replace(config, network=dataclasses.replace(config.network, **network))
+
+
+def _with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:
+    """The configuration with one-way links and a schedule, where they are given."""
+    from octoreplay.config import load_schedule
+
+    changes: dict[str, Any] = {}
+    if one_way is not None:
+        changes["one_way"] = tuple((a, b) for a, b, _ in _links(one_way))
+    if schedule is not None:
+        changes["schedule"] = load_schedule(schedule)
+    return dataclasses.replace(config, network=dataclasses.replace(config.network, **changes))
 
 
 def _links(text: str) -> tuple[tuple[str, str, float | None], ...]:

@@ -19,11 +19,11 @@ from typing import Any, cast
 from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable, SemanticClass
 
-RULES = ("gradient", "bayes", "natural", "local")
+RULES = ("gradient", "bayes", "natural", "ratio", "flood", "merge", "local")
 EVIDENCES = ("sum", "time-average", "cell-average")
 MODES = ("sync", "on-arrival")
-TOPOLOGIES = ("complete", "ring", "line", "star", "edges")
-WEIGHTS = ("metropolis", "degree", "given")
+TOPOLOGIES = ("complete", "ring", "line", "star", "grid", "nearest", "range", "random", "edges")
+WEIGHTS = ("metropolis", "degree", "max-degree", "given")
 
 PALETTE: tuple[tuple[int, int, int], ...] = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167),
@@ -160,17 +160,52 @@ class ConsensusConfig:
 
 
 @dataclass(frozen=True)
+class ScheduleEntry:
+    """What is up or down from ``start`` up to, but not with, ``end`` [s since the run's start].
+
+    ``groups`` cut all links between robots of different groups; ``links_down`` and ``links_up`` are links, both
+    directions; ``robots_off`` neither map nor talk, and ``forget`` what they knew when they come back;
+    ``robots_silent`` hear and do not talk.
+    """
+
+    start: float
+    end: float = math.inf
+    groups: tuple[tuple[str, ...], ...] = ()
+    links_down: tuple[tuple[str, str], ...] = ()
+    links_up: tuple[tuple[str, str], ...] = ()
+    robots_off: tuple[str, ...] = ()
+    robots_silent: tuple[str, ...] = ()
+    forget: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.start < self.end:
+            raise ConfigError(f"schedule: an entry lasts from {self.start:g} s to {self.end:g} s; 'from' must be first")
+        if self.forget and not self.robots_off:
+            raise ConfigError("schedule: 'forget' goes with robots_off")
+
+
+@dataclass(frozen=True)
 class NetworkConfig:
-    """The simulated communication graph."""
+    """The simulated communication graph: who can hear whom, and when."""
 
     topology: str = _parameter("complete", "communication graph", choices=TOPOLOGIES)
     edges: tuple[tuple[str, str, float | None], ...] = field(default=())
+    one_way: tuple[tuple[str, str], ...] = field(default=())
+    schedule: tuple[ScheduleEntry, ...] = field(default=())
+    num_nearest: int = _parameter(2, "topology nearest: links to so many nearest robots", minimum=1)
+    radio_range: float = _parameter(30.0, "topology range: robots nearer than this get a link [m]", above=0.0)
+    range_hysteresis: float = _parameter(
+        3.0, "topology range: a link breaks this much beyond radio_range [m]", minimum=0.0
+    )
+    link_prob: float = _parameter(
+        0.5, "topology random: probability of each link (Erdos-Renyi)", minimum=0.0, maximum=1.0
+    )
+    network_seed: int = _parameter(0, "seed of the random graph, losses and jitter", minimum=0)
     weights: str = _parameter("metropolis", "weights A_ij of the links", choices=WEIGHTS)
     publish_period: float = _parameter(1.0, "every robot publishes its map every so often [s]", above=0.0)
     after_end: str = _parameter(
         "stay", "after a robot's last scan it stays in the team or leaves", choices=("stay", "leave")
     )
-    packet_compression: str = _parameter("zstd", "compression of the packets", choices=("zstd", "none"))
 
     def __post_init__(self) -> None:
         _check_ranges(self)
@@ -180,6 +215,70 @@ class NetworkConfig:
             raise ConfigError("weights: 'given' goes with an edge list that carries a weight for every edge")
         if self.weights == "given" and any(weight is None for *_, weight in self.edges):
             raise ConfigError("edges: with weights 'given' every edge needs a weight")
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """What happens to a packet on a link (one direction): delay, loss, rate and queue.
+
+    Losses follow Gilbert and Elliott's two states: a packet is lost with ``loss`` in the good state and ``burst_loss``
+    in the bad one; before every packet the good state turns bad with ``burst_start`` and the bad one good with
+    ``burst_end``. Without ``burst_start`` they are independent (Bernoulli).
+    """
+
+    latency: float = _parameter(0.0, "mean delay of a packet [s]", minimum=0.0)
+    jitter: float = _parameter(0.0, "the delay varies evenly by up to this much both ways [s]", minimum=0.0)
+    loss: float = _parameter(0.0, "probability that a packet is lost (in the good state)", minimum=0.0, maximum=1.0)
+    burst_start: float = _parameter(
+        0.0, "probability that a burst of losses starts with a packet (Gilbert-Elliott)", minimum=0.0, maximum=1.0
+    )
+    burst_end: float = _parameter(0.5, "probability that a burst ends with a packet", above=0.0, maximum=1.0)
+    burst_loss: float = _parameter(1.0, "probability that a packet is lost in a burst", minimum=0.0, maximum=1.0)
+    corruption: float = _parameter(0.0, "probability that a packet arrives damaged", minimum=0.0, maximum=1.0)
+    rate: float | None = _parameter(None, "what a link carries [bytes/s] (default: no limit)", above=0.0)
+    queue: str = _parameter(
+        "newest", "a busy link keeps the newest packet waiting, or all that fit", choices=("newest", "drop-tail")
+    )
+    queue_bytes: int = _parameter(1_000_000, "what fits in the queue of a link, for drop-tail [bytes]", minimum=1)
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if self.jitter > self.latency:
+            raise ConfigError(f"jitter: {self.jitter:g} is above latency {self.latency:g}; a delay cannot be negative")
+
+
+@dataclass(frozen=True)
+class PacketConfig:
+    """What robots send: whole maps or changes, how exactly, and how much of it."""
+
+    packets: str = _parameter("full", "whole maps, or what the receiver does not have yet", choices=("full", "delta"))
+    acknowledge: bool = _parameter(True, "receivers of deltas acknowledge what they have")
+    key_frame_every: int = _parameter(
+        10, "deltas without acknowledgement: every so many packets a whole map", minimum=1
+    )
+    content: str = _parameter("float32", "numbers in packets", choices=("float32", "float16", "int8"))
+    int8_step: float = _parameter(0.05, "log-odds of one step of int8", above=0.0)
+    top_classes: int | None = _parameter(
+        None, "only so many of a cell's classes are sent, one value for the others (default: all)", minimum=1
+    )
+    packet_compression: str = _parameter("zstd", "compression of the packets", choices=("zstd", "none"))
+    zstd_level: int = _parameter(1, "zstd's level: higher is smaller and slower", minimum=1, maximum=22)
+    budget: int | None = _parameter(
+        None, "most bytes of a robot's packet in a tick; what changes most goes first (default: no limit)", minimum=256
+    )
+    cast: str = _parameter(
+        "unicast", "one packet for each receiver, or one for all of them", choices=("unicast", "broadcast")
+    )
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if self.budget is not None and self.packets != "delta":
+            raise ConfigError("budget: goes with packets 'delta'; a whole map cannot be sent in parts")
+
+    @property
+    def is_exact(self) -> bool:
+        """True when receivers have just what was published."""
+        return self.content == "float32" and self.top_classes is None and self.budget is None
 
 
 @dataclass(frozen=True)
@@ -215,7 +314,9 @@ class RobotConfig:
 
     ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo. Transforms are (x, y, z, qx, qy, qz, qw):
     ``T_team_map`` from the robot's map frame to the team's, ``T_body_sensor`` from the sensor's frame to the frame
-    whose pose the pose topic gives, in place of TF. ``clock_offset`` [s] is added to the robot's stamps.
+    whose pose the pose topic gives, in place of TF. ``clock_offset`` [s] is added to the robot's stamps. The robot
+    publishes every ``publish_period`` [s], the team's unless given, ``publish_phase`` [s] after the ticks that are
+    multiples of it.
     """
 
     robot_id: str
@@ -233,6 +334,8 @@ class RobotConfig:
     clock_offset: float = 0.0
     T_team_map: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     T_body_sensor: tuple[float, ...] | None = None
+    publish_period: float | None = None
+    publish_phase: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.robot_id or "/" in self.robot_id:
@@ -251,13 +354,21 @@ class RobotConfig:
             raise ConfigError(f"robot '{self.robot_id}': intrinsics expects 4 numbers fx, fy, cx, cy")
         if self.depth_unit is not None and self.depth_unit <= 0:
             raise ConfigError(f"robot '{self.robot_id}': depth_unit must be greater than 0")
+        if self.publish_period is not None and not 0 < self.publish_period < math.inf:
+            raise ConfigError(f"robot '{self.robot_id}': publish_period must be greater than 0")
+        if not 0 <= self.publish_phase < math.inf:
+            raise ConfigError(f"robot '{self.robot_id}': publish_phase must not be negative")
         if self.depth_topic and self.cloud_topic:
             raise ConfigError(f"robot '{self.robot_id}': give depth_topic or cloud_topic, not both")
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that a run depends on. ``classes`` is None where the logs bring their own class table."""
+    """Everything that a run depends on.
+
+    ``classes`` is None where the logs bring their own class table. ``link_overrides`` are (sender, receiver, values):
+    what differs from ``link`` in one direction of a link.
+    """
 
     robots: tuple[RobotConfig, ...]
     classes: ClassTable | None = None
@@ -265,6 +376,9 @@ class RunConfig:
     map: MapConfig = MapConfig()
     consensus: ConsensusConfig = ConsensusConfig()
     network: NetworkConfig = NetworkConfig()
+    link: LinkConfig = LinkConfig()
+    packet: PacketConfig = PacketConfig()
+    link_overrides: tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...] = ()
     time: TimeConfig = TimeConfig()
     output: OutputConfig = OutputConfig()
 
@@ -284,6 +398,25 @@ class RunConfig:
                 raise ConfigError(f"edges: '{sender}' cannot have a link to itself")
             if weight is not None and not 0 <= weight < math.inf:
                 raise ConfigError(f"edges: the weight of {sender} - {receiver} must be a finite number from 0 on")
+        for key, robot_id in _named_robots(self):
+            if robot_id not in seen:
+                raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+        for sender, receiver, _ in self.link_overrides:
+            self.link_config(sender, receiver)
+        for robot in self.robots:
+            for name, value in (("publish_period", robot.publish_period), ("publish_phase", robot.publish_phase)):
+                ticks = (value or 0.0) / self.network.publish_period
+                if abs(ticks - round(ticks)) > 1e-6:
+                    raise ConfigError(
+                        f"robot '{robot.robot_id}': {name} {value:g} s is not a multiple of the team's publish_period"
+                        f" {self.network.publish_period:g} s, the length of a tick"
+                    )
+        _check_rule(self)
+
+    def link_config(self, sender: str, receiver: str) -> LinkConfig:
+        """What happens to a packet from one robot to another."""
+        values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
+        return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
 
     def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
         """This configuration with flat parameters replaced.
@@ -300,6 +433,31 @@ class RunConfig:
             section: dataclasses.replace(getattr(self, section), **fields) for section, fields in changes.items()
         }
         return dataclasses.replace(self, **sections)
+
+
+def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
+    """Every robot that the network's parameters name, with the parameter; edges are checked with their weights."""
+    for pair in config.network.one_way:
+        yield from (("one_way", robot_id) for robot_id in pair)
+    for entry in config.network.schedule:
+        for group in (*entry.groups, *entry.links_down, *entry.links_up, entry.robots_off, entry.robots_silent):
+            yield from (("schedule", robot_id) for robot_id in group)
+    for sender, receiver, _ in config.link_overrides:
+        yield from (("links", robot_id) for robot_id in (sender, receiver))
+
+
+def _check_rule(config: RunConfig) -> None:
+    """Refuse what a rule cannot do."""
+    rule, packet = config.consensus.rule, config.packet
+    if rule in ("ratio", "flood") and config.consensus.mode != "sync":
+        raise ConfigError(f"mode: rule '{rule}' adds up what arrived once in a tick; use mode 'sync'")
+    if rule == "ratio":
+        is_exact = packet.is_exact and config.map.prune_tolerance == 0
+        if not is_exact or packet.packets != "full":
+            raise ConfigError(
+                "rule: 'ratio' sends running sums, all of which change in every tick and must be exact; use packets"
+                " 'full', content 'float32' and prune_tolerance 0, without budget and top_classes"
+            )
 
 
 @dataclass(frozen=True)
@@ -362,7 +520,7 @@ def _parameters() -> Iterator[Parameter]:
     kinds = {"float": "float", "float | None": "float", "int": "int", "int | None": "int", "bool": "bool",
              "str": "str", "tuple[float, ...]": "floats"}  # fmt: skip
     for section in dataclasses.fields(RunConfig):
-        if section.name in ("robots", "classes"):
+        if section.name in ("robots", "classes", "link_overrides"):
             continue
         for item in dataclasses.fields(cast("Any", section.default)):
             if item.metadata:
@@ -398,7 +556,9 @@ def _suggestion(name: str, known: Any) -> str:
 
 _ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
 _CLASS_KEYS = ("name", "color", "raw_labels")
-_TEAM_KEYS = ("robots", "classes", "ignored_raw_labels", "edges")
+_SCHEDULE_KEYS = {"from": "start", "to": "end", **{f.name: f.name for f in dataclasses.fields(ScheduleEntry)[2:]}}
+_LINK_KEYS = tuple(f.name for f in dataclasses.fields(LinkConfig))
+_TEAM_KEYS = ("robots", "classes", "ignored_raw_labels", "edges", "one_way", "schedule", "links")
 
 
 def load_team_file(path: str | Path) -> RunConfig:
@@ -407,30 +567,39 @@ def load_team_file(path: str | Path) -> RunConfig:
     Raises ConfigError with the file and the key for anything that is not understood.
     """
     path = Path(path)
+    return parse_team(_read_text(path, "team"), source=str(path), folder=path.parent)
+
+
+def _read_text(path: Path, kind: str) -> str:
+    """A configuration file's text."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a team file (no UTF-8 text)") from error
-    return parse_team(text, source=str(path), folder=path.parent)
+        raise ConfigError(f"{path}: not a {kind} file (no UTF-8 text)") from error
 
 
 def parse_team(text: str, *, source: str, folder: Path) -> RunConfig:
     """A configuration from a team file's text; ``source`` names it in errors. Raises ConfigError."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        content = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        line = getattr(getattr(error, "problem_mark", None), "line", None)
-        where = "" if line is None else f" (line {line + 1})"
-        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
+    content = _load_yaml(text, source)
     try:
         return _team_from_mapping(content, folder)
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from error
+
+
+def _load_yaml(text: str, source: str) -> Any:
+    """What a YAML text holds."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        line = getattr(getattr(error, "problem_mark", None), "line", None)
+        where = "" if line is None else f" (line {line + 1})"
+        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
 
 
 def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
@@ -447,12 +616,15 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
         classes = class_table(content["classes"], content.get("ignored_raw_labels") or ())
     parameters = {key: value for key, value in content.items() if key in PARAMETERS}
     network = {key: parameters.pop(key) for key in ("topology", "weights") if key in parameters}
-    edges = _edges(content.get("edges") or ())
     config = RunConfig(robots=robots, classes=classes).with_parameters(parameters)
     section = dataclasses.replace(
-        config.network, edges=edges, **{key: PARAMETERS[key].coerce(value) for key, value in network.items()}
+        config.network,
+        edges=_edges(content.get("edges") or ()),
+        one_way=_pairs("one_way", content.get("one_way") or ()),
+        schedule=schedule(content.get("schedule") or ()),
+        **{key: PARAMETERS[key].coerce(value) for key, value in network.items()},
     )
-    return dataclasses.replace(config, network=section)
+    return dataclasses.replace(config, network=section, link_overrides=_link_overrides(content.get("links") or ()))
 
 
 def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
@@ -473,7 +645,7 @@ def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
         try:
             if key in ("intrinsics", "T_team_map", "T_body_sensor"):
                 fields[key] = tuple(_number(number) for number in value)
-            elif key in ("clock_offset", "depth_unit"):
+            elif key in ("clock_offset", "depth_unit", "publish_period", "publish_phase"):
                 fields[key] = _number(value)
             else:
                 if not isinstance(value, str):
@@ -494,6 +666,82 @@ def _edges(entries: Any) -> tuple[tuple[str, str, float | None], ...]:
             raise ConfigError(f"edges: the weight of {entry[0]} - {entry[1]} is not a number")
         edges.append((str(entry[0]), str(entry[1]), float(entry[2]) if len(entry) == 3 else None))
     return tuple(edges)
+
+
+def _pairs(key: str, entries: Any) -> tuple[tuple[str, str], ...]:
+    """Pairs of robots from lists [a, b]."""
+    if not isinstance(entries, list | tuple) or not all(isinstance(e, list | tuple) and len(e) == 2 for e in entries):
+        raise ConfigError(f"{key}: expects a list of pairs [robot, robot]")
+    return tuple((str(a), str(b)) for a, b in entries)
+
+
+def load_schedule(path: str | Path) -> tuple[ScheduleEntry, ...]:
+    """Read a schedule file: a YAML list of entries. Raises ConfigError with the file and the entry."""
+    path = Path(path)
+    content = _load_yaml(_read_text(path, "schedule"), str(path))
+    try:
+        return schedule(content)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def schedule(entries: Any) -> tuple[ScheduleEntry, ...]:
+    """A schedule from the list that a file holds: mappings with from, to and what is up or down.
+
+    Raises ConfigError for an unknown key or a wrong type.
+    """
+    if not isinstance(entries, list | tuple):
+        raise ConfigError("schedule: expects a list of entries, each with 'from' and what is up or down")
+    found = []
+    for entry in entries:
+        if not isinstance(entry, Mapping) or "from" not in entry:
+            raise ConfigError("schedule: every entry is a mapping with 'from' [s] and what is up or down")
+        values: dict[str, Any] = {}
+        for key, value in entry.items():
+            if key not in _SCHEDULE_KEYS:
+                raise ConfigError(f"schedule: {key}: unknown key{_suggestion(str(key), _SCHEDULE_KEYS)}")
+            if key in ("from", "to"):
+                if not _is_number(value):
+                    raise ConfigError(f"schedule: {key}: {value!r} is not a number of seconds")
+                value = float(value)
+            elif key == "forget":
+                if not isinstance(value, bool):
+                    raise ConfigError(f"schedule: {key}: expects true or false, got {value!r}")
+            elif key in ("links_down", "links_up"):
+                value = _pairs(f"schedule: {key}", value)
+            elif key == "groups":
+                if not isinstance(value, list | tuple) or not all(isinstance(group, list | tuple) for group in value):
+                    raise ConfigError("schedule: groups: expects a list of lists of robots")
+                value = tuple(tuple(str(robot_id) for robot_id in group) for group in value)
+            else:
+                names = [value] if isinstance(value, str) else value
+                if not isinstance(names, list | tuple):
+                    raise ConfigError(f"schedule: {key}: expects a list of robots")
+                value = tuple(str(robot_id) for robot_id in names)
+            values[_SCHEDULE_KEYS[key]] = value
+        found.append(ScheduleEntry(**values))
+    return tuple(found)
+
+
+def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...]:
+    """Links that differ, from mappings with 'from' and 'to', or 'between' for both directions, and link parameters."""
+    if not isinstance(entries, list | tuple):
+        raise ConfigError("links: expects a list of links, each with 'from' and 'to' or 'between', and what differs")
+    found = []
+    for entry in entries:
+        if not isinstance(entry, Mapping) or ("between" in entry) == ("from" in entry and "to" in entry):
+            raise ConfigError("links: every link names 'from' and 'to', or 'between' two robots for both directions")
+        changes = {key: value for key, value in entry.items() if key not in ("between", "from", "to")}
+        for key in changes:
+            if key not in _LINK_KEYS:
+                raise ConfigError(f"links: {key}: unknown key{_suggestion(str(key), _LINK_KEYS)}")
+        values = tuple((key, PARAMETERS[key].coerce(value)) for key, value in changes.items())
+        if "between" in entry:
+            ((a, b),) = _pairs("links: between", [entry["between"]])
+            found += [(a, b, values), (b, a, values)]
+        else:
+            found.append((str(entry["from"]), str(entry["to"]), values))
+    return tuple(found)
 
 
 def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
@@ -554,6 +802,12 @@ def dump_team(config: RunConfig, folder: Path | None = None) -> str:
             content["ignored_raw_labels"] = list(config.classes.ignored_raw_labels)
     if config.network.edges:
         content["edges"] = [[e for e in edge if e is not None] for edge in config.network.edges]
+    if config.network.one_way:
+        content["one_way"] = [list(pair) for pair in config.network.one_way]
+    if config.network.schedule:
+        content["schedule"] = [_entry_to_mapping(entry) for entry in config.network.schedule]
+    if config.link_overrides:
+        content["links"] = [{"from": a, "to": b, **dict(values)} for a, b, values in config.link_overrides]
     for name, parameter in PARAMETERS.items():
         value = getattr(getattr(config, parameter.section), name)
         if value != parameter.default:
@@ -565,6 +819,21 @@ def dump_team(config: RunConfig, folder: Path | None = None) -> str:
     yaml.width = 110
     yaml.dump(content, buffer)
     return buffer.getvalue()
+
+
+def _entry_to_mapping(entry: ScheduleEntry) -> dict[str, Any]:
+    """One entry of a schedule as a file holds it."""
+
+    def plain(value: Any) -> Any:
+        return [plain(part) for part in value] if isinstance(value, tuple) else value
+
+    defaults = ScheduleEntry(start=0.0)
+    values = {key: getattr(entry, name) for key, name in _SCHEDULE_KEYS.items()}
+    return {
+        key: plain(value)
+        for key, value in values.items()
+        if key == "from" or value != getattr(defaults, _SCHEDULE_KEYS[key])
+    }
 
 
 def _robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:

@@ -112,7 +112,7 @@ class Robot:
 
         The sizes without pruning are 0 unless ``with_unpruned``: they take as long as the packet itself.
         """
-        compress = self._config.network.packet_compression == "zstd"
+        compress = self._config.packet.packet_compression == "zstd"
         packet = codec.pack(self.map, self.streams, codec.FULL, compress=compress)
         # What decoding the packet gives; a lossless one gives the map as it is.
         received = self.map.copy()
