@@ -18,6 +18,7 @@ from octoreplay.records import (
     RobotPose,
     RunSummary,
     TickMetrics,
+    link_totals,
 )
 
 SECOND = 1_000_000_000
@@ -47,6 +48,7 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
             robot_id=robot_id, active=index == 0 or tick > 1, num_scans=4 * tick + index, num_iterations=tick,
             agreement=0.9 + index / 100, agreement_occupied=0.8 - index / 300, num_leaves=100 + tick,
             num_cells=1000 + tick, observed_volume=1.25 * tick, entropy_bits=0.1 + 0.2 * index, memory_bytes=12345,
+            sent_bytes=100 * tick,
             packet_bytes=100 * tick + 40 * index, octree_bytes=200 * tick + 50 * index,
             grid_bytes=4000 * tick + 60 * index, unpruned_bytes=3000 * tick, unpruned_compressed_bytes=900 * tick,
         )
@@ -58,7 +60,7 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
         total_distance_all=0.1 + 2 * tick, distance_per_leaf=1e-7 * tick, distance_per_cell_and_link=2e-300,
         num_known_cells=2000 + tick, label_disagreement=0.25, max_change=float(tick) ** -2 if tick else 0.0,
         robots=robots,
-        links=tuple(LinkMetrics(a, b, 100 * tick, 1, 1, 0, 0, 100.0 * tick) for a, b in directed),
+        links=tuple(LinkMetrics(a, b, 1, 100 * tick, *range(2, 10), 100.0 * tick) for a, b in directed),
     )  # fmt: skip
 
 
@@ -68,6 +70,7 @@ def summary(metrics: Sequence[TickMetrics]) -> RunSummary:
         num_ticks=len(metrics), num_settling_ticks=sum(tick.settling for tick in metrics), stop_reason="it was over",
         log_seconds=12.5, wall_seconds=3.25, last=metrics[-1], peak_total_distance=77.0, peak_total_distance_all=88.0,
         mean_packet_bytes=150.5, mean_octree_bytes=250.25, mean_grid_bytes=6000.125, total_sent_bytes=9999,
+        links=link_totals(link for tick in metrics for link in tick.links),
         frame_counts={
             "alpha": FrameCounts(used=7, no_pose=2, unknown_label_pixels={42: 3}),
             "beta": FrameCounts(used=9, truncated_files=["beta.bag"]),

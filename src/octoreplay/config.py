@@ -215,6 +215,14 @@ class NetworkConfig:
             raise ConfigError("weights: 'given' goes with an edge list that carries a weight for every edge")
         if self.weights == "given" and any(weight is None for *_, weight in self.edges):
             raise ConfigError("edges: with weights 'given' every edge needs a weight")
+        for sender, receiver in self.one_way:
+            if sender == receiver:
+                raise ConfigError(f"one_way: '{sender}' cannot have a link to itself")
+            if (receiver, sender) in self.one_way:
+                raise ConfigError(
+                    f"one_way: {sender} -> {receiver} and {receiver} -> {sender} are both listed; keep the one that"
+                    " carries"
+                )
 
 
 @dataclass(frozen=True)
@@ -246,6 +254,13 @@ class LinkConfig:
         if self.jitter > self.latency:
             raise ConfigError(f"jitter: {self.jitter:g} is above latency {self.latency:g}; a delay cannot be negative")
 
+    @property
+    def mean_loss(self) -> float:
+        """Share of the packets that do not arrive whole, over a long time and without rate limit."""
+        in_burst = self.burst_start / (self.burst_start + self.burst_end)
+        loss = self.loss + in_burst * (self.burst_loss - self.loss)
+        return 1.0 - (1.0 - loss) * (1.0 - self.corruption)
+
 
 @dataclass(frozen=True)
 class PacketConfig:
@@ -274,6 +289,8 @@ class PacketConfig:
         _check_ranges(self)
         if self.budget is not None and self.packets != "delta":
             raise ConfigError("budget: goes with packets 'delta'; a whole map cannot be sent in parts")
+        if self.budget is not None and not self.acknowledge:
+            raise ConfigError("budget: goes with acknowledge; what waits is sent from what the receiver has")
 
     @property
     def is_exact(self) -> bool:

@@ -5,8 +5,8 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -149,7 +149,7 @@ class FrameCounts:
 
 @dataclass(frozen=True)
 class RobotMetrics:
-    """One robot at one tick. Bytes are of the map that it published in this tick (0 while dormant)."""
+    """One robot at one tick. Bytes of packets and maps are of what it published in this tick (0 while dormant)."""
 
     robot_id: str
     active: bool
@@ -162,6 +162,7 @@ class RobotMetrics:
     observed_volume: float
     entropy_bits: float
     memory_bytes: int
+    sent_bytes: int
     packet_bytes: int
     octree_bytes: int
     grid_bytes: int
@@ -171,16 +172,28 @@ class RobotMetrics:
 
 @dataclass(frozen=True)
 class LinkMetrics:
-    """One directed link in one tick: packets that were sent, arrived, got lost or came late, and their bytes."""
+    """One directed link in one tick: what became of its packets. Acknowledgements count in bytes only."""
 
     sender: str
     receiver: str
-    sent_bytes: int
     num_sent: int
+    sent_bytes: int
     num_delivered: int
+    delivered_bytes: int
     num_lost: int
+    num_dropped: int
     num_late: int
+    num_stale: int
+    num_gaps: int
+    num_damaged: int
     bytes_per_second: float
+
+    @classmethod
+    def total(cls, entries: Sequence[LinkMetrics]) -> LinkMetrics:
+        """The sums over several ticks of one link (at least one), with the mean of ``bytes_per_second``."""
+        counts = {f.name: sum(getattr(entry, f.name) for entry in entries) for f in fields(cls)[2:-1]}
+        rate = sum(entry.bytes_per_second for entry in entries) / len(entries)
+        return cls(entries[0].sender, entries[0].receiver, **counts, bytes_per_second=rate)
 
 
 @dataclass(frozen=True)
@@ -199,6 +212,14 @@ class TickMetrics:
     max_change: float
     robots: tuple[RobotMetrics, ...]
     links: tuple[LinkMetrics, ...]
+
+
+def link_totals(links: Iterable[LinkMetrics]) -> tuple[LinkMetrics, ...]:
+    """Each directed link over all ticks, in the order in which they first occur."""
+    entries: dict[tuple[str, str], list[LinkMetrics]] = {}
+    for link in links:
+        entries.setdefault((link.sender, link.receiver), []).append(link)
+    return tuple(LinkMetrics.total(of_link) for of_link in entries.values())
 
 
 @dataclass(frozen=True)
@@ -227,7 +248,10 @@ class RobotPose:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a whole run came to; the wall time is for the reader's eyes and never stored in the result."""
+    """What a whole run came to; the wall time is for the reader's eyes and never stored in the result.
+
+    ``links`` are the directed links over all ticks.
+    """
 
     num_ticks: int
     num_settling_ticks: int
@@ -241,6 +265,7 @@ class RunSummary:
     mean_octree_bytes: float
     mean_grid_bytes: float
     total_sent_bytes: int
+    links: tuple[LinkMetrics, ...]
     frame_counts: Mapping[str, FrameCounts]
     warnings: tuple[str, ...]
 

@@ -145,9 +145,9 @@ def test_other_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_later_format_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("octoreplay.io.result_writer.FORMAT_VERSION", "2")
+    monkeypatch.setattr("octoreplay.io.result_writer.FORMAT_VERSION", "3")
     path = write_result(tmp_path)
-    with pytest.raises(InputError, match="result format 2, this version reads 1"):
+    with pytest.raises(InputError, match="result format 3, this version reads 2"):
         ResultReader(path)
 
 

@@ -152,7 +152,7 @@ def test_half_turns_have_a_quaternion_too(axis: tuple[int, int, int]) -> None:
 
 def test_metadata_says_what_was_run(tmp_path: Path) -> None:
     records = metadata(write_result(tmp_path))
-    assert records["octoreplay"]["format_version"] == "1"
+    assert records["octoreplay"]["format_version"] == "2"
     assert json.loads(records["octoreplay"]["robots"]) == ["alpha", "beta"]
     assert json.loads(records["classes"]["classes"])[1:] == [
         {"id": 1, "name": "ground", "color": [10, 20, 30]},

@@ -13,11 +13,16 @@ from hypothesis import strategies as st
 from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
 from octoreplay.mapping import octree as octree_module
-from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.codec import MapVersion, PacketFormat
+from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values, octree_from_streams
+from octoreplay.mapping.quantise import CONTENTS, quantised
 from octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
+PLAIN = PacketFormat(zstd_level=None)
+HEADER = "<4sBBBBdqHHIIIfIIIIII"
+DTYPES = {"float32": "<f4", "float16": "<f2", "int8": "i1"}
 
 VALUES = st.sampled_from([0.0, -5.0, 5.0, -0.3, 1.0, 1e-30, -3e38, float(np.float32(0.1))])
 
@@ -40,9 +45,9 @@ def octrees(draw, num_classes=None):
 
 
 @settings(max_examples=60, deadline=None)
-@given(octree=octrees(), compress=st.booleans(), prune=st.booleans())
-def test_a_packet_gives_the_map_back_bit_for_bit(octree, compress, prune):
-    packet = codec.encode_packet(octree, compress=compress, prune=prune)
+@given(octree=octrees(), level=st.sampled_from([None, 1, 3, 22]), prune=st.booleans())
+def test_a_packet_gives_the_map_back_bit_for_bit(octree, level, prune):
+    packet = codec.encode_packet(octree, packet_format=PacketFormat(zstd_level=level), prune=prune)
     decoded = codec.decode_packet(packet)
     assert (decoded.resolution, decoded.num_classes) == (octree.resolution, octree.num_classes)
     assert cells_of(decoded) == cells_of(octree)
@@ -149,8 +154,8 @@ def test_the_corners_of_the_key_space():
 
 def test_an_empty_map():
     octree = SemanticOctree(0.2, 3)
-    packet = codec.encode_packet(octree, compress=False)
-    assert len(packet) == codec.HEADER_BYTES
+    packet = codec.encode_packet(octree, packet_format=PLAIN)
+    assert len(packet) == codec.HEADER_BYTES == 68
     assert codec.decode_packet(packet).num_bricks == 0
     assert codec.decode_packet(codec.encode_packet(octree)).num_classes == 3
 
@@ -192,12 +197,20 @@ def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
 
 def test_the_bytes_by_hand():
     """A root with a single cell at key (0, 0, 0): child 7 of the root, then child 0 of each; one vector leaf."""
-    packet = codec.encode_packet(octree_of({(0, 0, 0): [1.5, -2.0]}), compress=False)
-    words = [codec_state << (2 * child) for codec_state, child in [(1, 7)] + [(1, 0)] * 17 + [(3, 0)]]
-    payload = struct.pack("<19HfBf", *words, 1.5, 0b10, -2.0)
-    fields = (b"OCTM", 2, 0, 0, 0, 2, 0, 0.25, 19, 1, 1, 1, len(payload))
-    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIIII", *fields, 0)))
-    assert packet == struct.pack("<4sBBBBHHdIIIIII", *fields, checksum) + payload
+    octree = octree_of({(0, 0, 0): [1.5, -2.0]})
+    words = struct.pack("<19H", *(state << (2 * child) for state, child in [(1, 7)] + [(1, 0)] * 17 + [(3, 0)]))
+    numbers = {"float32": ("f", 1.5, -2.0), "float16": ("e", 1.5, -2.0), "int8": ("b", 3, -4)}
+    for content, (code, shared, own) in numbers.items():
+        payload = words + struct.pack(f"<{code}B{code}", shared, 0b10, own)
+        map_version = MapVersion(origin=5, epoch=2, version=9, weight=-7)
+        packet_format = PacketFormat(content, step=0.5, zstd_level=None)
+        packet = codec.encode_packet(octree, packet_format=packet_format, map_version=map_version)
+        step = 0.5 if content == "int8" else 0.0
+        numbers_of_header = (0.25, -7, 2, 5, 2, 9, 0, step, 19, 1, 1, 1, len(payload))
+        fields = (b"OCTM", 3, 0, CONTENTS.index(content), 0, *numbers_of_header)
+        checksum = zlib.crc32(payload, zlib.crc32(struct.pack(HEADER, *fields, 0)))
+        assert packet == struct.pack(HEADER, *fields, checksum) + payload
+        assert codec.read_header(packet).raw_bytes == len(payload)
 
 
 def test_tolerance_merges_within_its_bound():
@@ -214,6 +227,188 @@ def test_tolerance_merges_within_its_bound():
 
 def test_grid_bytes():
     assert codec.grid_bytes(10, 5) == 10 * (8 + 6 * 4)
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    octree=octrees(), content=st.sampled_from(CONTENTS), step=st.sampled_from([0.05, 0.3, 1e-3]), level=st.booleans(),
+    every=st.integers(1, 3),
+)  # fmt: skip
+def test_a_quantised_map_comes_back_bit_for_bit_in_its_content(octree, content, step, level, every):
+    octree = quantised(octree, content, step)
+    packet_format = PacketFormat(content, step, 1 if level else None)
+    packet = codec.encode_packet(octree, packet_format=packet_format)
+    decoded = codec.decode_packet(packet)
+    assert cells_of(decoded) == cells_of(octree)
+    # Equal maps are equal bytes, whatever they were before.
+    assert codec.encode_packet(decoded, packet_format=packet_format) == packet
+    chosen = np.arange(0, octree.num_bricks, every)
+    receiver = SemanticOctree(octree.resolution, octree.num_classes)
+    codec.apply_delta(receiver, codec.encode_delta(octree, chosen, packet_format=packet_format))
+    codes = set(octree.codes[chosen].tolist())
+    assert cells_of(receiver) == {key: value for key, value in cells_of(octree).items() if _code(key) in codes}
+
+
+def test_what_a_content_cannot_hold_is_refused():
+    octree = octree_of({(0, 0, 0): [0.1, 0.15]})
+    for content in ("float16", "int8"):
+        packet_format = PacketFormat(content, step=0.2)
+        with pytest.raises(ValueError, match=f"{content} cannot hold"):
+            codec.encode_packet(octree, packet_format=packet_format)
+        with pytest.raises(ValueError, match=f"{content} cannot hold"):
+            codec.encode_delta(octree, np.arange(1), packet_format=packet_format)
+    for content, step in [("float64", 0.2), ("int8", 0.0), ("int8", 1e-60), ("int8", 1e60), ("int8", float("nan"))]:
+        with pytest.raises(ValueError, match="step" if content == "int8" else "content 'float64'"):
+            codec.encode_packet(SemanticOctree(0.25, 2), packet_format=PacketFormat(content, step))
+
+
+def test_the_middle_of_merged_values_is_refused_where_it_is_no_step():
+    octree = octree_of(cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [1.5, 0.0]})
+    packet_format = PacketFormat("int8", step=0.5)
+    assert codec.encode_packet(octree, packet_format=packet_format, tolerance=0.4)
+    with pytest.raises(ValueError, match="int8 cannot hold"):
+        codec.encode_packet(octree, packet_format=packet_format, tolerance=0.5)
+
+
+def test_siblings_that_become_equal_are_one_leaf():
+    """Across rows, octets, bricks and classes."""
+    rng = np.random.default_rng(5)
+    cells = {key: rng.uniform(0.96, 1.04, 3) for key in cube((0, 0, 0), 8, 0.0)}
+    octree = octree_of(cells, num_classes=3)
+    assert codec.read_header(codec.encode_packet(octree)).num_leaves == 512
+    packet_format = PacketFormat("int8", step=0.1)
+    packet = codec.encode_packet(quantised(octree, "int8", 0.1), packet_format=packet_format)
+    header = codec.read_header(packet)
+    assert (header.num_leaves, header.num_vectors) == (1, 0)
+    exact = octree_of(dict.fromkeys(cells, float(np.float32(0.1) * np.float32(10))), num_classes=3)
+    assert codec.encode_packet(exact, packet_format=packet_format) == packet
+
+
+# --- compression ------------------------------------------------------------------------------------------------------
+
+
+def _naive_codes(numbers):
+    """The codes of numbers (bytes of each), then their literals byte by byte, as docs/packet-format.md says it."""
+    slots, codes, literals = {}, [], []
+    for number in numbers:
+        bits = int.from_bytes(number, "little")
+        slot = max((bits * 2654435761 % 2**32) // 2**24, 1)
+        if slots.get(slot, 0) == bits:
+            codes.append(slot)
+            continue
+        slots[slot] = bits
+        codes.append(0)
+        literals.append(number)
+    return bytes(codes) + bytes(number[i] for i in range(len(numbers[0]) if numbers else 0) for number in literals)
+
+
+def _coded_payload(payload, counts, width=4, num_classes=2):
+    """What is compressed in place of a payload with these counts."""
+    ends = np.cumsum([2 * counts[0], width * counts[1], counts[2] * -(-num_classes // 8)]).tolist()
+    words, values, masks, own = (payload[a:b] for a, b in zip([0, *ends], [*ends, None], strict=True))
+
+    def coded(content):
+        return _naive_codes([content[i : i + width] for i in range(0, len(content), width)])
+
+    return words + coded(values) + masks + coded(own)
+
+
+def _counts(header):
+    return header.num_words, header.num_leaves, header.num_vectors, header.num_own_values
+
+
+@settings(max_examples=60, deadline=None)
+@given(octree=octrees(), content=st.sampled_from(CONTENTS), prune=st.booleans())
+def test_what_is_compressed_reads_as_the_format_says(octree, content, prune):
+    octree = quantised(octree, content, 0.05)
+    plain = codec.encode_packet(octree, packet_format=PacketFormat(content, zstd_level=None), prune=prune)
+    packet = codec.encode_packet(octree, packet_format=PacketFormat(content), prune=prune)
+    header = codec.read_header(packet)
+    assert header.raw_bytes == len(plain) - codec.HEADER_BYTES
+    expected = plain[codec.HEADER_BYTES :]
+    if content != "int8":
+        width = 4 if content == "float32" else 2
+        expected = _coded_payload(expected, _counts(header), width, octree.num_classes)
+    assert zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :]) == expected
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    numbers=st.lists(st.sampled_from([0, 1, 2, 255, 256, 2**16 - 1, 2**31, 2**32 - 1, 0xC0A00000, 377, 754, 1131])),
+    width=st.sampled_from([2, 4]),
+)
+def test_codes_and_literals_against_the_naive_ones_both_ways(numbers, width):
+    numbers = np.array([number % 2 ** (8 * width) for number in numbers], np.uint32)
+    codes, literals = np.empty(numbers.size, np.uint8), np.empty((4, numbers.size), np.uint8)
+    num_literals = packets.write_codes(numbers, np.zeros(256, np.uint32), codes, literals)
+    coded = codes.tobytes() + literals[:width, :num_literals].tobytes()
+    assert coded == _naive_codes([number.tobytes()[:width] for number in numbers.astype("<u4")])
+    padded = np.zeros((4, num_literals + 1), np.uint8)
+    padded[:, :-1] = literals[:, :num_literals]
+    again = np.empty_like(numbers)
+    codes.flags.writeable = False
+    packets.read_codes(codes, padded, np.zeros(256, np.uint32), again)
+    assert again.tolist() == numbers.tolist()
+
+
+def test_any_codes_are_read_as_the_format_says():
+    """A slot in which nothing stands holds 0; a literal enters its slot also where it stands there already."""
+    one, slot = struct.pack("<f", 1.0), max((0x3F800000 * 2654435761 % 2**32) // 2**24, 1)
+    codes = bytes([1, 255, 0, slot, 9, 0, slot, 0])
+    literals = b"".join(bytes(plane) for plane in zip(one, one, struct.pack("<f", 2.0), strict=True))
+    packet = _compressed(_words(*CHAIN, 0xAAAA) + codes + literals, (19, 8, 0, 0))
+    expected = {
+        tuple(-LIMIT + (child >> axis & 1) for axis in range(3)): np.full(2, value, np.float32).tobytes()
+        for child, value in enumerate([0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 2.0])
+    }
+    assert cells_of(codec.decode_packet(packet)) == expected
+
+
+@pytest.mark.parametrize("change", [-1, 1])
+def test_codes_with_another_number_of_literals_are_refused(change):
+    octree = octree_of({(0, 0, 0): [1.0, 2.0], (1, 0, 0): [1.0, 1.0]})
+    packet = codec.encode_packet(octree)
+    counts = _counts(codec.read_header(packet))
+    payload = zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :])
+    assert codec.decode_packet(_compressed(payload, counts)).num_cells == 2
+    wrong = payload + bytes(4) if change > 0 else payload[:-1]
+    with pytest.raises(PacketError, match="size"):
+        codec.decode_packet(_compressed(wrong, counts))
+
+
+def _compressed(payload, counts):
+    return _forged(zstandard.ZstdCompressor().compress(payload), counts=counts, compression=1)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A map with a few hundred different values, in no order that zstd could follow."""
+    rng = np.random.default_rng(3)
+    palette = rng.normal(0, 2, 300).astype(np.float32)
+    cells = {}
+    for key in cube((-8, 0, -8), 16, 0.0):
+        shared, own = palette[rng.geometric(0.02, 2) % 300]
+        cells[key] = [shared, own if rng.random() < 0.2 else shared]
+    return octree_of(cells)
+
+
+def test_codes_and_blocks_make_packets_smaller(noisy):
+    plain = codec.encode_packet(noisy, packet_format=PLAIN)[codec.HEADER_BYTES :]
+    packet = codec.encode_packet(noisy)
+    coded = _coded_payload(plain, _counts(codec.read_header(packet)))
+    in_one_piece = zstandard.ZstdCompressor(level=1).compress(coded)
+    assert len(packet) < 0.98 * len(in_one_piece) < 0.8 * len(zstandard.ZstdCompressor(level=1).compress(plain))
+
+
+def test_a_level_changes_the_bytes_and_not_what_is_compressed(noisy):
+    packets_of_levels = [codec.encode_packet(noisy, packet_format=PacketFormat(zstd_level=n)) for n in (1, 3, 19)]
+    assert len(set(packets_of_levels)) == 3
+    assert packets_of_levels[0] == codec.encode_packet(noisy)
+    payloads = {zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :]) for packet in packets_of_levels}
+    assert len(payloads) == 1
 
 
 # --- damage ----------------------------------------------------------------------------------------------------------
@@ -233,12 +428,15 @@ def _refused(packet, sample):
     assert cells_of(sample) == before
 
 
-@pytest.mark.parametrize("compress", [True, False])
+@pytest.mark.parametrize("level", [1, None])
+@pytest.mark.parametrize("content", CONTENTS)
 @pytest.mark.parametrize("kind", ["packet", "delta"])
-def test_every_single_damaged_byte_is_seen(sample, kind, compress):
-    packet = codec.encode_packet(sample, compress=compress)
+def test_every_single_damaged_byte_is_seen(sample, kind, content, level):
+    options = {"packet_format": PacketFormat(content, zstd_level=level), "map_version": MapVersion(1, 2, 3, 0, 5)}
+    sample = quantised(sample, content, 0.05)
+    packet = codec.encode_packet(sample, **options)
     if kind == "delta":
-        packet = codec.encode_delta(sample, np.arange(sample.num_bricks), compress=compress)
+        packet = codec.encode_delta(sample, np.arange(sample.num_bricks), **options)
     for place in range(len(packet)):
         for flip in (0x01, 0x80, 0xFF):
             damaged = bytearray(packet)
@@ -248,9 +446,9 @@ def test_every_single_damaged_byte_is_seen(sample, kind, compress):
     _refused(bytes([*packet[:-1], packet[-1] ^ 1]), sample)
 
 
-@pytest.mark.parametrize("compress", [True, False])
-def test_cut_and_longer_packets_are_refused(sample, compress):
-    packet = codec.encode_packet(sample, compress=compress)
+@pytest.mark.parametrize("level", [1, None])
+def test_cut_and_longer_packets_are_refused(sample, level):
+    packet = codec.encode_packet(sample, packet_format=PacketFormat(zstd_level=level))
     for length in range(len(packet)):
         with pytest.raises(PacketError):
             codec.decode_packet(packet[:length])
@@ -271,27 +469,84 @@ def test_kinds_are_not_mixed_up(sample):
         codec.apply_delta(sample, codec.encode_delta(other, np.arange(1)))
 
 
-def _forged(payload, *, version=2, kind=0, content=0, compression=0, num_classes=2, zero=0, resolution=0.25, counts):
+def _forged(
+    payload, *, version=3, kind=0, content=0, compression=0, num_classes=2, resolution=0.25, map_version=(0, 0, 0, 0),
+    weight=0, step=0.0, counts,
+):  # fmt: skip
     """A packet with a good checksum and any content."""
-    fields = (b"OCTM", version, kind, content, compression, num_classes, zero, resolution, *counts, len(payload))
-    checksum = zlib.crc32(payload, zlib.crc32(struct.pack("<4sBBBBHHdIIIIII", *fields, 0)))
-    return struct.pack("<4sBBBBHHdIIIIII", *fields, checksum) + payload
+    fields = (
+        b"OCTM", version, kind, content, compression, resolution, weight, num_classes, *map_version, step, *counts,
+        len(payload),
+    )  # fmt: skip
+    checksum = zlib.crc32(payload, zlib.crc32(struct.pack(HEADER, *fields, 0)))
+    return struct.pack(HEADER, *fields, checksum) + payload
 
 
 @pytest.mark.parametrize(
     "fields",
     [
-        {"version": 1}, {"version": 3}, {"kind": 2}, {"content": 1}, {"compression": 2}, {"num_classes": 0},
-        {"num_classes": 255}, {"zero": 1},
+        {"version": 2}, {"version": 4}, {"kind": 2}, {"content": 3}, {"content": 255}, {"compression": 2},
+        {"num_classes": 0}, {"num_classes": 255},
         {"resolution": 0.0}, {"resolution": -0.25}, {"resolution": float("nan")}, {"resolution": float("inf")},
+        {"step": 0.05}, {"content": 1, "step": 0.05}, {"step": float("nan")}, {"content": 2, "step": 0.0},
+        {"content": 2, "step": -0.05}, {"content": 2, "step": float("nan")}, {"content": 2, "step": float("inf")},
+        {"content": 2, "step": 3e36}, {"map_version": (0, 0, 5, 1)},
     ],
     ids=str,
 )  # fmt: skip
 def test_unknown_headers_are_refused(fields):
-    good = _forged(b"", counts=(0, 0, 0, 0))
-    assert codec.decode_packet(good).num_bricks == 0
+    good = {"counts": (0, 0, 0, 0), "content": fields.get("content", 0) % 3}
+    good["step"] = 0.05 if good["content"] == 2 else 0.0
+    assert codec.decode_packet(_forged(b"", **good)).num_bricks == 0
     with pytest.raises(PacketError):
-        codec.decode_packet(_forged(b"", counts=(0, 0, 0, 0), **fields))
+        codec.decode_packet(_forged(b"", **good | fields))
+
+
+def test_a_delta_goes_from_a_base_to_no_earlier_state():
+    octree = octree_of({(0, 0, 0): [1.0, 2.0]})
+    packet = _forged(b"", kind=1, map_version=(1, 0, 5, 5), counts=(0, 0, 0, 0))
+    assert codec.read_header(packet).map_version == MapVersion(origin=1, version=5, base=5)
+    codec.apply_delta(octree, packet)
+    with pytest.raises(PacketError, match="base"):
+        codec.apply_delta(octree, _forged(b"", kind=1, map_version=(1, 0, 5, 6), counts=(0, 0, 0, 0)))
+    with pytest.raises(ValueError, match="base 6"):
+        codec.encode_delta(octree, np.arange(1), map_version=MapVersion(version=5, base=6))
+    with pytest.raises(ValueError, match="base 1"):
+        codec.encode_packet(octree, map_version=MapVersion(version=5, base=1))
+
+
+@given(
+    map_version=st.builds(
+        MapVersion, *(st.integers(0, 2**bits - 1) for bits in (16, 32, 32)), base=st.just(0),
+        weight=st.integers(-(2**63), 2**63 - 1),
+    ),
+    base=st.integers(0, 2**32 - 1),
+    content=st.sampled_from(CONTENTS),
+    step=st.sampled_from([0.05, 1e-3, 2.0]),
+    level=st.sampled_from([None, 1]),
+)  # fmt: skip
+def test_the_header_gives_back_what_was_written(map_version, base, content, step, level):
+    octree = quantised(octree_of({(0, 0, 0): [0.1, -0.1]}, resolution=0.3), content, step)
+    options = {"packet_format": PacketFormat(content, step, level)}
+    header = codec.read_header(codec.encode_packet(octree, map_version=map_version, **options))
+    assert (header.kind, header.content, header.compression) == (codec.FULL, content, int(level is not None))
+    assert (header.resolution, header.num_classes, header.map_version) == (0.3, 2, map_version)
+    assert header.step == (float(np.float32(step)) if content == "int8" else 0.0)
+    map_version = MapVersion(**vars(map_version) | {"base": min(base, map_version.version)})
+    header = codec.read_header(codec.encode_delta(octree, np.arange(1), map_version=map_version, **options))
+    assert (header.kind, header.map_version) == (codec.DELTA, map_version)
+
+
+def test_int8_has_no_number_below_its_range():
+    words = _words(*CHAIN, 2)
+    packet = _forged(words + b"\x81", content=2, step=0.5, counts=(19, 1, 0, 0))
+    expected = np.full(2, -63.5, np.float32).tobytes()
+    assert set(cells_of(codec.decode_packet(packet)).values()) == {expected}
+    for compression in (0, 1):
+        payload = words + b"\x80"
+        payload = zstandard.ZstdCompressor().compress(payload) if compression else payload
+        with pytest.raises(PacketError, match="int8"):
+            codec.decode_packet(_forged(payload, content=2, step=0.5, compression=compression, counts=(19, 1, 0, 0)))
 
 
 def _words(*words):
@@ -326,7 +581,7 @@ CHAIN = (1,) * 18
 @pytest.mark.parametrize("compression", [0, 1])
 def test_payloads_that_are_no_octree_are_refused_and_take_no_memory(payload, counts, compression):
     if compression:
-        payload = zstandard.ZstdCompressor().compress(payload)
+        payload = zstandard.ZstdCompressor().compress(_coded_payload(payload, counts))
     _refused_without_memory(_forged(payload, counts=counts, compression=compression))
 
 
@@ -363,7 +618,7 @@ def test_bytes_behind_the_compressed_payload_are_refused():
     octree = octree_of({(0, 0, 0): [1.0, 2.0]})
     packet = codec.encode_packet(octree)
     header = codec.read_header(packet)
-    counts = (header.num_words, header.num_leaves, header.num_vectors, header.num_own_values)
+    counts = _counts(header)
     payload = packet[codec.HEADER_BYTES :]
     assert codec.decode_packet(_forged(payload, counts=counts, compression=1)).num_cells == 1
     for tail in (b"\0", payload):

@@ -6,17 +6,20 @@ import math
 import numpy as np
 import pytest
 
-from octoreplay.config import ConsensusConfig, NetworkConfig
+from octoreplay.config import ConsensusConfig, NetworkConfig, ScheduleEntry
 from octoreplay.errors import ConfigError
 from reference import graph
 
 FIVE = ("a", "b", "c", "d", "e")
 
 
-def _team(topology="complete", robots=FIVE, active=None, epsilon=None, rule="gradient", **network):
+def _team(
+    topology="complete", robots=FIVE, active=None, epsilon=None, rule="gradient", elapsed_s=0.0, history=(), **network
+):
     config = NetworkConfig(topology=topology, **network)
     active = active or [True] * len(robots)
-    return graph.team_graph(config, ConsensusConfig(epsilon=epsilon, rule=rule), robots, active)
+    consensus = ConsensusConfig(epsilon=epsilon, rule=rule)
+    return graph.team_graph(config, consensus, robots, active, elapsed_s, history)
 
 
 def test_topologies_by_hand():
@@ -31,6 +34,51 @@ def test_topologies_by_hand():
 def test_one_and_two_robots(topology):
     assert _team(topology, robots=("a",)).links == ()
     assert _team(topology, robots=("a", "b")).links == ((0, 1),)
+
+
+def test_more_topologies_by_hand():
+    # a b c
+    # d e
+    assert _team("grid").links == ((0, 1), (0, 3), (1, 2), (1, 4), (3, 4))
+    assert _team("grid", robots=("a", "b")).links == ((0, 1),)
+    assert _team("random", link_prob=0.0).links == ()
+    assert len(_team("random", link_prob=1.0).links) == 10
+    assert _team("random", network_seed=7).links == _team("random", network_seed=7).links
+    here = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)]
+    # b is as near to a as e is; the lower index counts.
+    assert _team("nearest", num_nearest=1, history=[here]).links == ((0, 1), (0, 4), (1, 3))
+
+
+def test_a_link_in_range_stands_until_it_is_beyond_the_hysteresis():
+    def linked(*distances):
+        history = [[(0.0, 0.0, 0.0), None if d is None else (0.0, d, 0.0)] for d in distances]
+        robots = ("a", "b")
+        return _team("range", robots, radio_range=10.0, range_hysteresis=2.0, history=history).links == ((0, 1),)
+
+    assert not linked(10.0)
+    assert linked(9.9)
+    assert linked(9.9, 12.0)
+    assert not linked(9.9, 12.1)
+    assert not linked(9.9, 12.1, 11.0)
+    assert not linked(9.9, None, 11.0)
+    assert linked(9.9, 12.1, 9.0)
+
+
+def test_one_way_pairs_and_what_the_schedule_says():
+    entries = (
+        ScheduleEntry(10.0, 20.0, groups=(("a", "b"), ("c",))),
+        ScheduleEntry(20.0, 30.0, links_up=(("a", "c"),), robots_silent=("b",)),
+        ScheduleEntry(30.0, 40.0, robots_off=("b",)),
+    )
+    network = {"robots": ("a", "b", "c"), "one_way": (("a", "b"),), "schedule": entries}
+    assert _team("line", elapsed_s=0.0, **network).directed == ((0, 1), (1, 2), (2, 1))
+    assert _team("line", elapsed_s=10.0, **network).directed == ((0, 1),)
+    silent = _team("line", elapsed_s=20.0, **network)
+    assert silent.directed == ((0, 1), (0, 2), (2, 0), (2, 1))
+    assert silent.links == ((0, 1), (0, 2), (1, 2))
+    assert (silent.neighbours(1), silent.receivers(1), silent.degree(1)) == ([0, 2], [], 2)
+    assert _team("line", elapsed_s=30.0, **network).directed == ()
+    assert _team("line", elapsed_s=40.0, **network).directed == ((0, 1), (1, 2), (2, 1))
 
 
 def test_dormant_robots_have_no_links():
@@ -56,6 +104,17 @@ def test_weights_are_made_anew_among_the_active_robots():
 def test_degree_weights_are_not_symmetric_on_a_star():
     star = _team("star", robots=("a", "b", "c"), weights="degree")
     assert star.weights.tolist() == [[0.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+
+
+def test_max_degree_weights_by_hand():
+    star = _team("star", robots=("a", "b", "c"), weights="max-degree")
+    third = 1.0 / 3.0
+    np.testing.assert_allclose(star.weights, [[0.0, third, third], [third, 0.0, 0.0], [third, 0.0, 0.0]])
+
+
+def test_weights_of_a_one_way_link_are_the_receivers():
+    team = _team("line", robots=("a", "b", "c"), one_way=(("a", "b"),), weights="degree")
+    assert team.weights.tolist() == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.0, 1.0, 0.0]]
 
 
 def test_given_weights_hold_in_both_directions_and_sum_to_one_at_most():
@@ -86,8 +145,17 @@ def test_complex_eigenvalues_of_asymmetric_weights():
     assert graph.step_size_bound(directed) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
-@pytest.mark.parametrize("weights", ["metropolis", "degree"])
+def test_the_simulated_bound_by_hand():
+    directed = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    assert graph.simulated_bound(directed) == pytest.approx(0.5, rel=1e-3)
+    line = _team("line", robots=("a", "b", "c"))
+    assert graph.simulated_bound(line.weights) == pytest.approx(1.0, rel=1e-3)
+    # One robot hears another at 1/2: mu = 1/2.
+    assert graph.simulated_bound(np.array([[0.0, 0.5], [0.0, 0.0]])) == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("topology", ["complete", "ring", "line", "star", "grid"])
+@pytest.mark.parametrize("weights", ["metropolis", "degree", "max-degree"])
 def test_just_below_the_bound_converges_and_above_is_refused(topology, weights):
     bound = graph.step_size_bound(_team(topology, weights=weights).weights)
     team = _team(topology, weights=weights, epsilon=0.95 * bound)
@@ -100,12 +168,14 @@ def test_just_below_the_bound_converges_and_above_is_refused(topology, weights):
     assert graph.second_eigenvalue(diverging) > 1.0
 
 
-def test_local_has_no_bound():
-    assert _team(epsilon=50.0, rule="local").epsilon == 50.0
+@pytest.mark.parametrize("rule", ["local", "ratio", "flood", "merge"])
+def test_rules_without_a_step_size_have_no_bound(rule):
+    assert _team(epsilon=50.0, rule=rule).epsilon == 50.0
 
 
 def test_default_step_size_stays_below_the_bound_with_degree_weights():
     assert _team("complete").epsilon == 0.5
+    assert _team("complete", robots=("a", "b"), weights="max-degree").epsilon == 0.5
     # Six robots, 1 / degree: lambda_max = 6/5, 0.9 / 1.2 = 0.75.
     assert _team("complete", robots=tuple("abcdef"), weights="degree").epsilon == 0.5
     # Two robots of them: lambda_max = 2.

@@ -14,6 +14,7 @@ from octoreplay.config import PRESETS
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
+from octoreplay.replay import consensus_robot as consensus_module
 from octoreplay.replay import robot as robot_module
 from octoreplay.replay import session as session_module
 from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
@@ -137,7 +138,7 @@ def _compare_course(expected, tick):
     assert (tick.number, tick.stamp_ns, tick.settling) == (expected.tick, expected.stamp_ns, expected.settling)
     robots = tick.metrics.robots
     assert tuple(robot.active for robot in robots) == expected.active, f"active robots differ in tick {tick.number}"
-    assert tick.graph.links == expected.links, f"links differ in tick {tick.number}"
+    assert tick.graph.pairs == expected.links, f"links differ in tick {tick.number}"
     assert tuple(robot.num_scans for robot in robots) == expected.num_scans, f"scans differ in tick {tick.number}"
     assert tuple(robot.num_iterations for robot in robots) == expected.num_iterations, "iterations differ"
 
@@ -335,7 +336,7 @@ def test_one_robot_alone(rule):
     config = dataclasses.replace(scenario.config(rule=rule, settle=0), robots=scenario.base_config.robots[:1])
     frames = [frame for frame in scenario.frames if frame.robot_id == "robot_0"]
     outcome = _compare_frames(config, frames, every=4, with_metrics=True)
-    assert outcome.tick.graph.links == ()
+    assert outcome.tick.graph.pairs == ()
 
 
 # --- by hand ---------------------------------------------------------------------------------------------------------
@@ -384,10 +385,16 @@ def test_threads_do_not_change_a_byte(rule, mode):
         session = Session(config, _sources(config, scenario.frames), num_threads=num_threads)
         run = []
         for tick in session.ticks():
-            run.append((tick.metrics, [published and published.packet for published in tick.published]))
+            run.append((tick.metrics, _packets(tick)))
         runs.append((run, [octree.leaves().log_odds.tobytes() for octree in tick.maps]))
-    assert any(packet for _, packets in runs[0][0] for packet in packets) == (rule != "local")
+    assert any(packets for _, packets in runs[0][0]) == (rule != "local")
     assert runs[0] == runs[1] == runs[2]
+
+
+def _packets(tick):
+    """Every packet that was sent in a tick."""
+    messages = [message for published in tick.published if published for _, message in published.outbox]
+    return [part.data for message in messages for part in message.parts]
 
 
 @pytest.mark.parametrize("rule", ["gradient", "bayes", "natural"])
@@ -408,8 +415,7 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
     for function in (recorded, whole):
         monkeypatch.setattr(session_module, "team_step", function)
         session = Session(config, _sources(config, scenario.frames))
-        packets = [[published and published.packet for published in tick.published] for tick in session.ticks()]
-        runs.append(packets)
+        runs.append([_packets(tick) for tick in session.ticks()])
     assert runs[0] == runs[1]
     assert sum(since is not None for since in since_of_steps) > len(since_of_steps) / 3
 
@@ -426,7 +432,7 @@ def _change_steps(monkeypatch, change):
         measures = rule == "local"
         return right([step if measures else change(step) for step in steps], rule=rule, **kwargs)
 
-    for module in (robot_module, session_module):
+    for module in (consensus_module, session_module):
         monkeypatch.setattr(module, "team_step", wrong)
 
 
@@ -441,31 +447,37 @@ def _wrong_gradient_sign(monkeypatch):
     _change_steps(monkeypatch, lambda step: dataclasses.replace(step, gamma=-0.1 * step.gamma))
 
 
-def _current_maps_in_place_of_published_ones(monkeypatch):
+def _change_arrivals(monkeypatch, change):
+    """Before anybody iterates, ``change`` says of every map that arrived which one it is."""
     right = Session._iterate
 
-    def wrong(self, graph, published, factor, number):
-        swapped = [
-            entry and dataclasses.replace(entry, octree=robot.map)
-            for entry, robot in zip(published, self._robots, strict=True)
-        ]
-        return right(self, graph, swapped, factor, number)
+    def wrong(self, graph, factor, number):
+        for robot in self._robots:
+            robot._arrived = [a._replace(held=change(self, robot, a)) for a in robot._arrived]
+        return right(self, graph, factor, number)
 
     monkeypatch.setattr(Session, "_iterate", wrong)
+
+
+def _current_maps_in_place_of_published_ones(monkeypatch):
+    _change_arrivals(
+        monkeypatch,
+        lambda session, robot, arrival: dataclasses.replace(
+            arrival.held, octree=session._robots[arrival.source.origin].map
+        ),
+    )
 
 
 def _maps_of_the_tick_before(monkeypatch):
-    right = Session._iterate
     last = {}
 
-    def wrong(self, graph, published, factor, number):
-        stale = last.get("maps", published)
-        last["maps"] = published
-        return right(
-            self, graph, [old if new else None for old, new in zip(stale, published, strict=True)], factor, number
-        )
+    def before(session, robot, arrival):
+        key = (robot.index, arrival.source)
+        old = last.get(key, arrival.held)
+        last[key] = arrival.held
+        return old
 
-    monkeypatch.setattr(Session, "_iterate", wrong)
+    _change_arrivals(monkeypatch, before)
 
 
 def _free_is_not_reset(monkeypatch):
@@ -488,7 +500,7 @@ def _free_is_not_reset(monkeypatch):
             own.bricks.rows[rows[is_there]] = after[is_there]
         return changes
 
-    for module in (robot_module, session_module):
+    for module in (consensus_module, session_module):
         monkeypatch.setattr(module, "team_step", wrong)
 
 
@@ -505,7 +517,9 @@ def _evidence_of_the_last_iteration_is_forgotten(monkeypatch):
 
 def _scans_of_the_tick_come_late(monkeypatch):
     right = Session._integrate
-    monkeypatch.setattr(Session, "_integrate", lambda self, number, stamp_ns: right(self, number, stamp_ns - 10**9))
+    monkeypatch.setattr(
+        Session, "_integrate", lambda self, number, stamp_ns, is_off: right(self, number, stamp_ns - 10**9, is_off)
+    )
 
 
 def _hits_add_too_little(monkeypatch):

@@ -48,6 +48,8 @@ float64 observed_volume
 # Mean over observed cells, in bits.
 float64 entropy_bits
 uint64 memory_bytes
+# All that its radio sent in this tick, acknowledgements too.
+uint64 sent_bytes
 # The map published in this tick: as sent, as uncompressed octree, as uniform grid, as octree without pruning.
 uint64 packet_bytes
 uint64 octree_bytes
@@ -58,11 +60,18 @@ uint64 unpruned_compressed_bytes
     "octoreplay_msgs/msg/LinkMetrics": """\
 string sender
 string receiver
-uint64 sent_bytes
 uint32 num_sent
+uint64 sent_bytes
 uint32 num_delivered
+uint64 delivered_bytes
+# Never arrived: lost on the air; thrown out of a queue.
 uint32 num_lost
+uint32 num_dropped
+# Delivered in a later tick than they were sent in; older than what was there; deltas that did not fit; damaged.
 uint32 num_late
+uint32 num_stale
+uint32 num_gaps
+uint32 num_damaged
 float64 bytes_per_second
 """,
     "octoreplay_msgs/msg/TickMetrics": """\

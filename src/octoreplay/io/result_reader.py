@@ -31,6 +31,7 @@ from octoreplay.records import (
     RobotMetrics,
     RunSummary,
     TickMetrics,
+    link_totals,
 )
 
 
@@ -109,6 +110,7 @@ class ResultReader:
             name: text if name == "stop_reason" else json.loads(text) for name, text in stored.items() if name in names
         }
         values["warnings"] = tuple(values["warnings"])
+        values["links"] = tuple(LinkMetrics(**link) for link in values["links"])
         values["frame_counts"] = {robot: _frame_counts(count) for robot, count in values["frame_counts"].items()}
         return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
 
@@ -265,7 +267,8 @@ def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> R
         mean_packet_bytes=mean("packet_bytes"),
         mean_octree_bytes=mean("octree_bytes"),
         mean_grid_bytes=mean("grid_bytes"),
-        total_sent_bytes=sum(link.sent_bytes for tick in metrics for link in tick.links),
+        total_sent_bytes=sum(robot.sent_bytes for tick in metrics for robot in tick.robots),
+        links=link_totals(link for tick in metrics for link in tick.links),
         frame_counts={},
         warnings=(),
     )

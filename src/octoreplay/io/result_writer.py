@@ -21,7 +21,7 @@ from octoreplay.io.mcap_writer import RosMcapWriter
 from octoreplay.io.messages import header, message
 from octoreplay.records import ClassTable, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
 
-FORMAT_VERSION = "1"
+FORMAT_VERSION = "2"
 """Counts incompatible changes of the result format."""
 TEAM_FRAME = "team"
 """The frame that every map and pose in a result is given in."""
@@ -324,10 +324,11 @@ def _summary_values(summary: RunSummary) -> dict[str, str]:
     """A run's summary as metadata: numbers and lists as JSON; without the wall time, so that equal runs are equal."""
     values = {"complete": "true"}
     for item in dataclasses.fields(summary):
-        if item.name in ("wall_seconds", "last", "frame_counts"):
+        if item.name in ("wall_seconds", "last", "links", "frame_counts"):
             continue
         value = getattr(summary, item.name)
         values[item.name] = value if isinstance(value, str) else json.dumps(value)
+    values["links"] = json.dumps([dataclasses.asdict(link) for link in summary.links])
     counts = {robot_id: dataclasses.asdict(count) for robot_id, count in summary.frame_counts.items()}
     values["frame_counts"] = json.dumps(counts)
     return values

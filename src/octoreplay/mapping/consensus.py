@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ _RULES = {
     "gradient": consensus_kernels.GRADIENT,
     "natural": consensus_kernels.NATURAL,
     "bayes": consensus_kernels.BAYES,
+    "merge": consensus_kernels.MERGE,
     "local": consensus_kernels.LOCAL,
 }
 
@@ -65,7 +67,14 @@ NUM_PARTS = 16
 """Parts that a step in threads is cut into."""
 
 
-def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Executor | None = None) -> list[float]:
+def team_step(
+    steps: Sequence[Step],
+    *,
+    rule: str,
+    revision: int,
+    clamp: tuple[float, float] = (-math.inf, math.inf),
+    threads: Executor | None = None,
+) -> list[float]:
     """One iteration at each of several robots, in place; returns each one's largest change of a log-odds.
 
     h~ = h_i + sum_j w_ij (h_j - b_i) over the neighbours. Then
@@ -74,6 +83,7 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
       sigma = softmax(h~);
     - ``natural``: h_i = h~ + gamma (log q_i - h~);
     - ``bayes``: h_i = h~ + log q_i - log q_i at the last iteration;
+    - ``merge``: as ``bayes``, then clamped; with an empty ``base`` it adds w_ij h_j, again at every arrival;
     - ``local``: h_i = log q_i.
 
     h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same steps done cell by cell, robot
@@ -86,7 +96,7 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     column_of = {id(octree): column for column, octree in enumerate(octrees)}
     all_since = [step.since for step in steps if step.since is not None]
     since = min(all_since, default=0)
-    codes = _codes(octrees, since if len(all_since) == len(steps) else None)
+    codes = union_codes(octrees, since if len(all_since) == len(steps) else None)
     table = brick_table(octrees, codes, since, run)
     columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
     shape = (len(steps), codes.size)
@@ -98,7 +108,7 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     def prepare(n: int) -> None:
         own = steps[n].own
         is_awake[n] = steps[n].since is None
-        raised = _raise_to_columns(own, codes, table, columns[n], is_awake[n])
+        raised = raise_to_columns(own, codes, table, columns[n], is_awake[n])
         indices[n], layouts[n], known[n], known_changed[n] = raised
         storage.fill_table(own.bricks, indices[n], since, table, columns[n][OWN])
 
@@ -112,7 +122,7 @@ def team_step(steps: Sequence[Step], *, rule: str, revision: int, threads: Execu
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
             part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, _RULES[rule], num_classes,
-            layouts.reshape(-1, layouts.shape[2]), known.ravel(), is_awake,
+            np.float32(clamp[0]), np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(), is_awake,
             *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
@@ -137,7 +147,7 @@ def _octrees(step: Step) -> list[SemanticOctree]:
     return [step.own, base, step.log_likelihood, last, *step.neighbours]
 
 
-def _codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
+def union_codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
     """Sorted codes (n,) of the bricks of any of the octrees; with ``since`` of those that changed from there on."""
     union = SemanticOctree(1.0, 1)
     for octree in octrees:
@@ -145,7 +155,7 @@ def _codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
     return np.sort(union.codes)
 
 
-def _raise_to_columns(
+def raise_to_columns(
     octree: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array, is_awake: BoolArray
 ) -> tuple[Int64Array, UInt64Array, UInt64Array, BoolArray]:
     """Give an octree the cells, blocks and rows that it takes to hold the awake bricks ``codes`` (n,) of the columns.
@@ -181,7 +191,7 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     table, count_table = brick_table(octrees, codes), brick_table(counts, codes)
     columns = np.arange(len(octrees))
-    indices, masks, known, _ = _raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
+    indices, masks, known, _ = raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
     target.raise_bricks(indices, masks, known, (count_table.addresses != 0).any(axis=0))
     scales: Float32Array = np.array([entry.scale for entry in evidence], np.float32)
     scratch, int_scratch = _scratch(target.num_classes, 0)

@@ -80,6 +80,11 @@ class MapComparer:
         list(map(refresh, parts) if threads is None else threads.map(refresh, parts))
         return self._result()
 
+    @property
+    def brick_distances(self) -> tuple[Int64Array, Float64Array]:
+        """Of the last comparison: the bricks' codes (n,), and each one's part of ``total_distance`` (n,)."""
+        return self._bricks.codes, self._distances[: self._bricks.num_bricks, 0]
+
     def _refresh(
         self, maps: Sequence[SemanticOctree], oracle: SemanticOctree, rows: Int64Array, link_ends: Int64Array
     ) -> None:

@@ -11,7 +11,7 @@ from octoreplay.config import RunConfig
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import FrameCounts, LeafTable, MapState, RunSummary, TickMetrics
+from octoreplay.records import FrameCounts, LeafTable, LinkMetrics, MapState, RunSummary, TickMetrics, link_totals
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
@@ -36,6 +36,7 @@ class Recorder:
         self._bytes = np.zeros(3)
         self._num_published = 0
         self._sent_bytes = 0
+        self._links: list[LinkMetrics] = []
 
     def record(self, tick: Tick) -> None:
         """Take one tick in."""
@@ -48,11 +49,12 @@ class Recorder:
         self._writer.write_metrics(tick.metrics)
         self._writer.write_poses(tick.stamp_ns, tick.poses)
         ids = tick.graph.robot_ids
-        self._writer.write_graph(tick.stamp_ns, [(ids[a], ids[b]) for a, b in tick.graph.links], tick.poses)
+        self._writer.write_graph(tick.stamp_ns, [(ids[a], ids[b]) for a, b in tick.graph.pairs], tick.poses)
         if self._config.output.keep_packets:
             for robot_id, published in zip(ids, tick.published, strict=True):
-                if published is not None:
-                    self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, published.packet)
+                for _, message in published.outbox if published else ():
+                    data = b"".join(part.data for part in message.parts)
+                    self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, data)
         if self._is_due(tick, self._config.output.state_every):
             self._write_states(tick)
         if self._is_due(tick, self._config.output.view_every):
@@ -84,6 +86,7 @@ class Recorder:
             mean_octree_bytes=float(means[1]),
             mean_grid_bytes=float(means[2]),
             total_sent_bytes=self._sent_bytes,
+            links=link_totals(self._links),
             frame_counts=counts,
             warnings=warnings,
         )
@@ -97,7 +100,8 @@ class Recorder:
             if robot.packet_bytes:
                 self._bytes += (robot.packet_bytes, robot.octree_bytes, robot.grid_bytes)
                 self._num_published += 1
-        self._sent_bytes += sum(link.sent_bytes for link in metrics.links)
+        self._links += metrics.links
+        self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
 
     def _is_due(self, tick: Tick, every: float) -> bool:
         """True when a multiple of ``every`` seconds of log time fell into the period that ends with this tick."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import collections
+import dataclasses
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,11 +20,13 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.discover import resolve
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.io.robot_log import RobotLog
-from octoreplay.mapping.consensus import sum_of_evidence, team_step
+from octoreplay.mapping.consensus import Evidence, sum_of_evidence, team_step
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import (
+    BoolArray,
+    Float64Array,
     FrameCounts,
     LinkMetrics,
     RobotMetrics,
@@ -30,16 +34,16 @@ from octoreplay.records import (
     RunSummary,
     TickMetrics,
 )
-from octoreplay.replay.graph import (
-    CommunicationGraph,
-    build_graph,
-    check_team_graph,
-    settle_ticks_max,
-    step_size,
-)
+from octoreplay.replay.consensus_robot import ConsensusRobot
+from octoreplay.replay.exchange import Acknowledgement, Content, PacketEncoder, Receipt
+from octoreplay.replay.flood_robot import FloodRobot
+from octoreplay.replay.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
 from octoreplay.replay.interrupt import deferred_interrupts
+from octoreplay.replay.links import LinkCounts, Links
+from octoreplay.replay.ratio_robot import RatioRobot
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.robot import Arrival, PublishedMap, Robot
+from octoreplay.replay.robot import MapSizes, Publication, Robot
+from octoreplay.replay.settling import num_quiet_ticks, num_settle_ticks
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import FrameSource, Timeline
 
@@ -50,6 +54,7 @@ NO_SETTLING = "settling is off"
 MAX_TICKS = 10_000_000
 """Most ticks of one run: a day at 100 Hz is 8.6 million."""
 
+_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
@@ -77,16 +82,20 @@ class Session:
             raise InputError("a session needs a class table")
         self.config = config
         self.stop_reason = ""
-        num_classes = config.classes.num_classes
+        self._num_classes = config.classes.num_classes
         self._robot_ids = tuple(robot.robot_id for robot in config.robots)
         check_team_graph(config.network, config.consensus, self._robot_ids)
+        self._network = TeamNetwork(config.network, config.consensus, self._robot_ids)
         self._timeline = Timeline(sources)
-        self._robots = tuple(Robot(robot_id, config, num_classes) for robot_id in self._robot_ids)
-        self._oracle = SemanticOctree(config.map.resolution, num_classes)
-        self._comparer = MapComparer(len(self._robots), config.map.prior(num_classes))
+        self._encoder = PacketEncoder(config.packet)
+        self._robots = [self._new_robot(index, 0) for index in range(len(self._robot_ids))]
+        self._past_lives: list[Evidence] = []
+        self._links: Links[Content] = Links(config)
+        self._oracle = SemanticOctree(config.map.resolution, self._num_classes)
+        self._comparer = MapComparer(len(self._robots), config.map.prior(self._num_classes))
         self._period_ns = round(config.network.publish_period * 1e9)
         self.num_threads = num_threads or min(len(self._robots), os.cpu_count() or 1)
-        self._graph = build_graph(config.network, self._robot_ids, [False] * len(self._robots))
+        self._graph = self._network.at(0.0, [False] * len(self._robots), self._positions())
 
     def ticks(self) -> Iterator[Tick]:
         """The team after every tick, settling included; ``stop_reason`` is set at the end."""
@@ -107,13 +116,16 @@ class Session:
         if consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
-        most = settle_ticks_max(self._graph, consensus, step_size(self._graph, consensus))
+        quiet_ticks = num_quiet_ticks(self._graph, self.config)
+        most = num_settle_ticks(self._graph, self.config)
+        num_quiet = 0
         for n in range(1, most + 1):
             factor = max(0.0, 1.0 - n / consensus.settle)
             tick = self._tick(number, start_ns + number * self._period_ns, factor, settling=True)
             yield tick
             number += 1
-            if tick.metrics.max_change < consensus.settle_tolerance:
+            num_quiet = num_quiet + 1 if tick.metrics.max_change < consensus.settle_tolerance else 0
+            if num_quiet >= quiet_ticks:
                 self.stop_reason = CONVERGED
                 return
         self.stop_reason = SETTLE_MAX
@@ -121,79 +133,147 @@ class Session:
     def _tick(self, number: int, stamp_ns: int, gamma_factor: float = 1.0, *, settling: bool = False) -> Tick:
         """One tick, in the order of the paper: integrate, publish, deliver, iterate, measure."""
         if not settling:
-            self._integrate(number, stamp_ns)
-            active = self._active(stamp_ns)
-            if active != self._graph.active:
-                flags = [i in active for i in range(len(self._robots))]
-                self._graph = build_graph(self.config.network, self._robot_ids, flags)
+            elapsed = number * self._period_ns / 1e9
+            is_off = self._switch_off(elapsed)
+            self._integrate(number, stamp_ns, is_off)
+            self._graph = self._network.at(elapsed, self._active(stamp_ns, is_off), self._positions())
         graph = self._graph
-        published = self._publish(graph, number)
-        changes = self._iterate(graph, published, gamma_factor, number)
-        metrics = self._measure(graph, published, max(changes, default=0.0), number, stamp_ns, settling)
+        published = self._publish(graph, number, stamp_ns)
+        receipts = self._deliver(graph, stamp_ns)
+        changes = self._iterate(graph, gamma_factor, number)
+        metrics = self._measure(graph, published, receipts, max(changes, default=0.0), number, stamp_ns, settling)
+        self._encoder.end_tick()
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in self._robots), self._oracle,
             tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in self._robots if r.T_team_sensor is not None), metrics,
         )  # fmt: skip
 
-    def _integrate(self, number: int, stamp_ns: int) -> None:
-        """Every scan with a stamp before the tick goes into its robot's evidence, read in the robot's thread."""
+    # --- who is there -------------------------------------------------------------------------------------------------
 
-        def integrate(index: int) -> None:
-            self._robots[index].integrate(self._timeline.frames_before(index, stamp_ns), number)
+    def _new_robot(self, index: int, epoch: int) -> Robot:
+        """A robot that knows nothing yet."""
+        families = {"flood": FloodRobot, "ratio": RatioRobot}
+        family = families.get(self.config.consensus.rule, ConsensusRobot)
+        return family(index, self.config, self._num_classes, self._encoder, epoch)
 
-        self._each(integrate, range(len(self._robots)))
+    def _switch_off(self, elapsed: float) -> BoolArray:
+        """Which robots (N,) are off; one that forgets starts another life."""
+        availability = self._network.schedule.at(elapsed)
+        for index in np.flatnonzero(availability.forget):
+            robot = self._robots[index]
+            if robot.num_iterations > 0:
+                # What it saw was seen: the oracle does not forget.
+                self._past_lives.append(robot.evidence)
+                self._robots[index] = self._new_robot(int(index), robot.source.epoch + 1)
+                self._robots[index].T_team_sensor = robot.T_team_sensor
+        return availability.robots_off
 
-    def _active(self, stamp_ns: int) -> tuple[int, ...]:
-        """Indices of the robots that take part in the tick."""
+    def _active(self, stamp_ns: int, is_off: BoolArray) -> list[bool]:
+        """Which robots (N,) take part in the tick."""
         leaves = self.config.network.after_end == "leave"
 
         def is_active(index: int) -> bool:
             last_ns = self._timeline.last_stamp_ns(index)
-            if last_ns is None:
+            if last_ns is None or is_off[index]:
                 return False
             ended = self._timeline.has_ended(index) and last_ns < stamp_ns - self._period_ns
             return not (leaves and ended)
 
-        return tuple(index for index in range(len(self._robots)) if is_active(index))
+        return [is_active(index) for index in range(len(self._robots))]
 
-    def _publish(self, graph: CommunicationGraph, number: int) -> tuple[PublishedMap | None, ...]:
-        """Every active robot's map as a packet, and once what all its receivers make of it: the bytes are the same."""
+    def _positions(self) -> Float64Array:
+        """Where the robots' sensors are, (N, 3) in metres in the team's frame; NaN before the first scan."""
+        positions = np.full((len(self._robots), 3), np.nan)
+        for row, robot in zip(positions, self._robots, strict=True):
+            if robot.T_team_sensor is not None:
+                row[:] = robot.T_team_sensor[:3, 3]
+        return positions
+
+    # --- the steps of a tick ------------------------------------------------------------------------------------------
+
+    def _integrate(self, number: int, stamp_ns: int, is_off: BoolArray) -> None:
+        """Every scan with a stamp before the tick goes into its robot's evidence, read in the robot's thread.
+
+        A robot that is off sees nothing.
+        """
+
+        def integrate(index: int) -> None:
+            frames = self._timeline.frames_before(index, stamp_ns)
+            if is_off[index]:
+                collections.deque(frames, maxlen=0)
+            else:
+                self._robots[index].integrate(frames, number)
+
+        self._each(integrate, range(len(self._robots)))
+
+    def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
+        """Every active robot that is due hands its packets to its links."""
+        self._links.cut(graph.links)
         if self.config.consensus.rule == "local":
             return (None,) * len(self._robots)
-        talking = [self._robots[index] for index in graph.active]
+        due = [index for index in graph.active if self._is_due(index, number)]
         with_unpruned = falls_due(number * self._period_ns, self._period_ns, self.config.output.state_every)
-        packets = self._each(lambda robot: robot.publish(with_unpruned=with_unpruned), talking)
-        maps = dict(zip(graph.active, packets, strict=True))
-        return tuple(maps.get(index) for index in range(len(self._robots)))
 
-    def _iterate(
-        self, graph: CommunicationGraph, published: Sequence[PublishedMap | None], factor: float, number: int
-    ) -> list[float]:
-        """Every active robot's iterations with the maps that its neighbours published; the largest changes."""
+        def publish(index: int) -> Publication:
+            robot = self._robots[index]
+            return Publication(
+                robot.publish(graph.receivers(index), number), robot.map_sizes(with_unpruned=with_unpruned)
+            )
+
+        published = dict(zip(due, self._each(publish, due), strict=True))
+        for sender, publication in published.items():
+            for receivers, message in publication.outbox:
+                for receiver in receivers:
+                    self._links.send(sender, receiver, message, stamp_ns)
+        return tuple(published.get(index) for index in range(len(self._robots)))
+
+    def _is_due(self, index: int, number: int) -> bool:
+        """True when a robot publishes in the tick."""
+        robot, period = self.config.robots[index], self.config.network.publish_period
+        every = round((robot.publish_period or period) / period)
+        return number % every == round(robot.publish_phase / period) % every
+
+    def _deliver(self, graph: CommunicationGraph, stamp_ns: int) -> dict[Link, Receipt]:
+        """Packets that are due go to their receivers, which answer; what became of them, by (sender, receiver)."""
+        receipts: dict[Link, Receipt] = {}
+        # Answers without delay arrive in the same tick, so the links are asked again.
+        while deliveries := self._links.deliver(stamp_ns, graph.active):
+            for delivery in deliveries:
+                sender, receiver, content = delivery.sender, delivery.receiver, delivery.content
+                robot = self._robots[receiver]
+                if isinstance(content, Acknowledgement):
+                    robot.exchange.acknowledged(sender, content)
+                    continue
+                receipt, answer = robot.receive(sender, content)
+                receipts.setdefault((sender, receiver), Receipt()).add(receipt)
+                if answer is not None and sender in graph.receivers(receiver):
+                    self._links.send(receiver, sender, answer, stamp_ns)
+        return receipts
+
+    def _iterate(self, graph: CommunicationGraph, factor: float, number: int) -> list[float]:
+        """Every active robot's iterations with the maps that arrived; the largest changes."""
         consensus = self.config.consensus
         epsilon = step_size(graph, consensus)
-        arrived = {
-            index: [
-                Arrival(sender, packet.octree, 2.0 * epsilon * float(graph.weights[index, sender]))
-                for sender in graph.neighbours(index)
-                if (packet := published[sender]) is not None
-            ]
-            for index in graph.active
-        }
-        # One iteration with all maps, also where none arrived; the others make one for each map.
-        together = [index for index in graph.active if consensus.mode == "sync" or not arrived[index]]
-        alone = [index for index in graph.active if index not in together]
+        step_weights = 2.0 * epsilon * graph.weights
         robots = self._robots
-        steps = self._each(lambda i: robots[i].next_step(published[i], arrived[i], factor, number), together)
-        changes = team_step(steps, rule=consensus.rule, revision=number, threads=self._threads)
-        self._each(lambda i: robots[i].end_step(number), together)
-        changes += self._each(lambda i: robots[i].iterate_on_arrival(published[i], arrived[i], factor, number), alone)
+        arrived = {index: robots[index].take_arrivals() for index in graph.active}
+        # One iteration with all maps, also where none arrived; the others make one for each map.
+        together = {
+            i: r for i in graph.active if isinstance(r := robots[i], ConsensusRobot) and r.steps_with_team(arrived[i])
+        }
+        alone = [index for index in graph.active if index not in together]
+        steps = self._each(lambda i: together[i].next_step(arrived[i], step_weights[i], factor, number), together)
+        clamp = (self.config.sensor.clamp_min, self.config.sensor.clamp_max)
+        changes = team_step(steps, rule=consensus.rule, revision=number, clamp=clamp, threads=self._threads)
+        self._each(lambda i: together[i].end_step(number), together)
+        changes += self._each(lambda i: robots[i].iterate(arrived[i], step_weights[i], factor, number), alone)
         return changes
 
     def _measure(
         self,
         graph: CommunicationGraph,
-        published: Sequence[PublishedMap | None],
+        published: Sequence[Publication | None],
+        receipts: Mapping[Link, Receipt],
         max_change: float,
         number: int,
         stamp_ns: int,
@@ -201,11 +281,14 @@ class Session:
     ) -> TickMetrics:
         """The metrics of the tick, on its result."""
         changed = np.unique(np.concatenate([robot.changed_evidence(number) for robot in self._robots]))
-        sum_of_evidence(self._oracle, [robot.evidence for robot in self._robots], changed, number)
+        evidence = [*(robot.evidence for robot in self._robots), *self._past_lives]
+        sum_of_evidence(self._oracle, evidence, changed, number)
         maps = [robot.map for robot in self._robots]
-        comparison = self._comparer.compare(maps, self._oracle, graph.links, number, self._threads)
+        comparison = self._comparer.compare(maps, self._oracle, graph.pairs, number, self._threads)
+        counts = self._links.take_counts()
+        links = self._link_metrics(graph, counts, receipts)
         robots = tuple(
-            self._robot_metrics(index, index in graph.active, published[index], comparison)
+            self._robot_metrics(index, index in graph.active, published[index], links, comparison)
             for index in range(len(self._robots))
         )
         num_leaves = sum(robot.num_leaves for robot in robots)
@@ -221,15 +304,25 @@ class Session:
             label_disagreement=comparison.label_disagreement,
             max_change=max_change,
             robots=robots,
-            links=self._link_metrics(graph, published),
+            links=links,
         )
 
     def _robot_metrics(
-        self, index: int, active: bool, published: PublishedMap | None, comparison: MapComparison
+        self,
+        index: int,
+        active: bool,
+        published: Publication | None,
+        links: Sequence[LinkMetrics],
+        comparison: MapComparison,
     ) -> RobotMetrics:
         """One robot's part of the metrics."""
         robot = self._robots[index]
         num_cells = int(comparison.num_cells[index])
+        sizes = published.sizes if published else MapSizes()
+        sent_bytes = sum(link.sent_bytes for link in links if link.sender == robot.robot_id)
+        if published and self.config.packet.cast == "broadcast":
+            # One packet reaches all its receivers.
+            sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.outbox)
         return RobotMetrics(
             robot_id=robot.robot_id,
             active=active,
@@ -242,32 +335,33 @@ class Session:
             observed_volume=num_cells * robot.map.resolution**3,
             entropy_bits=float(comparison.entropy_bits[index]),
             memory_bytes=robot.memory_bytes,
-            packet_bytes=len(published.packet) if published else 0,
-            octree_bytes=published.octree_bytes if published else 0,
-            grid_bytes=published.grid_bytes if published else 0,
-            unpruned_bytes=published.unpruned_bytes if published else 0,
-            unpruned_compressed_bytes=published.unpruned_compressed_bytes if published else 0,
+            sent_bytes=sent_bytes,
+            packet_bytes=published.packet_bytes if published else 0,
+            octree_bytes=sizes.octree_bytes,
+            grid_bytes=sizes.grid_bytes,
+            unpruned_bytes=sizes.unpruned_bytes,
+            unpruned_compressed_bytes=sizes.unpruned_compressed_bytes,
         )
 
     def _link_metrics(
-        self, graph: CommunicationGraph, published: Sequence[PublishedMap | None]
+        self, graph: CommunicationGraph, counts: Mapping[Link, LinkCounts], receipts: Mapping[Link, Receipt]
     ) -> tuple[LinkMetrics, ...]:
-        """What went over each directed link; every packet arrives in its own tick."""
-        directed = sorted([*graph.links, *((b, a) for a, b in graph.links)])
+        """What went over each directed link; also over one that is gone, when something was still on its way."""
+        used = {link for link, count in counts.items() if count != LinkCounts()}
         entries = []
-        for sender, receiver in directed:
-            packet = published[sender]
-            size = len(packet.packet) if packet else 0
-            sent = int(packet is not None)
+        for sender, receiver in sorted(used.union(graph.links)):
+            count = counts.get((sender, receiver), LinkCounts())
+            receipt = receipts.get((sender, receiver), Receipt())
             entries.append(
                 LinkMetrics(
-                    sender=self._robot_ids[sender], receiver=self._robot_ids[receiver], sent_bytes=size, num_sent=sent,
-                    num_delivered=sent, num_lost=0, num_late=0, bytes_per_second=size / self._period_ns * 1e9,
+                    sender=self._robot_ids[sender], receiver=self._robot_ids[receiver],
+                    **dataclasses.asdict(count), num_stale=receipt.num_stale, num_gaps=receipt.num_gaps,
+                    num_damaged=receipt.num_damaged, bytes_per_second=count.sent_bytes / self._period_ns * 1e9,
                 )
             )  # fmt: skip
         return tuple(entries)
 
-    def _each(self, action: Callable[..., _Result], items: Iterable[object]) -> list[_Result]:
+    def _each(self, action: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
         """The action on every item, in parallel threads; results in the items' order."""
         return list(self._threads.map(action, items))
 
@@ -308,7 +402,7 @@ def replay_team(
                 raise InputError(f"{error}: {_causes(logs)}") from error
             raise
         counts = {log.robot_id: log.counts for log in logs}
-        warnings = _warnings(logs, recorder)
+        warnings = (*_rule_warnings(config), *_warnings(logs, recorder))
         with deferred_interrupts():
             summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
             if writer is not None:
@@ -331,6 +425,31 @@ def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
             f"publish_period: the logs span {(total_ns or 0) / 1e9:.6g} s, which takes {num_ticks:.3g} ticks of "
             f"{config.network.publish_period:g} s, more than {MAX_TICKS:,}; check clock_offset and publish_period"
         )
+
+
+def _rule_warnings(config: RunConfig) -> tuple[str, ...]:
+    """What a user should know of a rule on this network."""
+    rule, ids = config.consensus.rule, [robot.robot_id for robot in config.robots]
+    if rule == "merge":
+        return ("rule 'merge' adds up what it heard before again and again; it is a baseline, not a map to trust",)
+    if rule != "bayes":
+        return ()
+    links = [config.link_config(a, b) for a in ids for b in ids if a != b]
+    causes = {
+        "one-way links": bool(config.network.one_way) or any(e.robots_silent for e in config.network.schedule),
+        "losses": any(link.mean_loss > 0 or link.rate is not None for link in links),
+        "maps that arrive in a later tick": any(link.latency > 0 for link in links),
+        "robots that publish at different times": len({(r.publish_period, r.publish_phase) for r in config.robots}) > 1,
+        "robots that go off": any(entry.robots_off for entry in config.network.schedule),
+    }
+    found = [cause for cause, is_there in causes.items() if is_there]
+    if not found:
+        return ()
+    sentence = (
+        "rule 'bayes' keeps the team's sum only when both ends of a link hear each other in every tick; with"
+        f" {', '.join(found)} it drifts from the mean: rule 'ratio' or 'flood' does not"
+    )
+    return (sentence,)
 
 
 def _warnings(logs: Sequence[RobotLog], recorder: Recorder) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import RobotPose, TickMetrics
 from octoreplay.replay.graph import CommunicationGraph
-from octoreplay.replay.robot import PublishedMap
+from octoreplay.replay.robot import Publication
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +18,7 @@ class Tick:
     stamp_ns: int
     settling: bool
     graph: CommunicationGraph
-    published: tuple[PublishedMap | None, ...]
+    published: tuple[Publication | None, ...]
     maps: tuple[SemanticOctree, ...]
     oracle: SemanticOctree
     poses: tuple[RobotPose, ...]

@@ -19,10 +19,13 @@ _TEAM_COLUMNS = (
 )  # fmt: skip
 _ROBOT_COLUMNS = (
     "active", "num_scans", "num_iterations", "agreement", "agreement_occupied", "num_leaves", "num_cells",
-    "observed_volume", "entropy_bits", "memory_bytes", "packet_bytes", "octree_bytes", "grid_bytes", "unpruned_bytes",
-    "unpruned_compressed_bytes",
+    "observed_volume", "entropy_bits", "memory_bytes", "sent_bytes", "packet_bytes", "octree_bytes", "grid_bytes",
+    "unpruned_bytes", "unpruned_compressed_bytes",
 )  # fmt: skip
-_LINK_COLUMNS = ("num_sent", "num_delivered", "num_lost", "num_late", "sent_bytes")
+_LINK_COLUMNS = (
+    "num_sent", "sent_bytes", "num_delivered", "delivered_bytes", "num_lost", "num_dropped", "num_late", "num_stale",
+    "num_gaps", "num_damaged", "bytes_per_second",
+)  # fmt: skip
 
 _BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
 

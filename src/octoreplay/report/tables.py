@@ -18,7 +18,7 @@ from rich.text import Text
 
 from octoreplay.config import RobotConfig, RunConfig
 from octoreplay.io import posterior
-from octoreplay.records import ClassTable, FrameCounts, LeafTable, RunSummary, TickMetrics
+from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.io.discover import LogDescription, LogSummary
@@ -77,6 +77,8 @@ def instant(stamp_ns: int) -> str:
 def results(summary: RunSummary) -> RenderableType:
     """A finished run as tables: the team, each robot, and the frames that could not be used."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
+    if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
+        parts.append(_links_table(summary.links))
     if any(counts.skipped for counts in summary.frame_counts.values()):
         parts.append(_frames_table(summary.frame_counts))
     return _spaced(parts)
@@ -220,7 +222,8 @@ def _team_table(summary: RunSummary) -> Table:
         f"{number(last.total_distance_all)} at the end, {number(summary.peak_total_distance_all)} at most",
     )
     table.add_row("cells with different labels", share(last.label_disagreement))
-    worst = [min((getattr(r, name) for r in last.robots), default=math.nan) for name in _AGREEMENTS]
+    robots = [robot for robot in last.robots if robot.active] or last.robots
+    worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
@@ -229,6 +232,10 @@ def _team_table(summary: RunSummary) -> Table:
         grid += f" (sent: {share(summary.mean_packet_bytes / summary.mean_grid_bytes)} of it)"
     table.add_row("", grid)
     table.add_row("sent in total", size(summary.total_sent_bytes))
+    num_sent = sum(link.num_sent for link in summary.links)
+    if num_sent:
+        delivered = sum(link.num_delivered for link in summary.links) / num_sent
+        table.add_row("packets", f"{num_sent:,} over {len(summary.links)} links, {share(delivered)} delivered")
     return table
 
 
@@ -246,6 +253,25 @@ def _robots_table(last: TickMetrics) -> Table:
             robot.robot_id, f"{robot.num_scans:,}", share(robot.agreement), share(robot.agreement_occupied),
             f"{robot.num_leaves:,}", f"{number(robot.observed_volume)} m\u00b3", f"{robot.entropy_bits:.3f} bit",
             size(robot.packet_bytes),
+        )  # fmt: skip
+    return table
+
+
+_FATES = ("lost", "dropped", "late", "stale", "gaps", "damaged")
+"""What can happen to packets: fields of LinkMetrics, after num_."""
+
+
+def _links_table(links: Sequence[LinkMetrics]) -> Table:
+    """One row per directed link over the whole run."""
+    table = _table("Links, over the whole run")
+    table.add_column("link", no_wrap=True)
+    for name in ("packets", "delivered", *_FATES, "bytes/s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for link in links:
+        delivered = link.num_delivered / link.num_sent if link.num_sent else math.nan
+        table.add_row(
+            f"{link.sender} \u2192 {link.receiver}", f"{link.num_sent:,}", share(delivered),
+            *(f"{getattr(link, f'num_{fate}'):,}" for fate in _FATES), size(link.bytes_per_second),
         )  # fmt: skip
     return table
 

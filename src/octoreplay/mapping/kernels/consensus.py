@@ -22,7 +22,7 @@ from octoreplay.mapping.kernels.intrinsics import (
 )
 from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, collapse, load, octets_of, ones_below
 
-GRADIENT, NATURAL, BAYES, LOCAL = 0, 1, 2, 3
+GRADIENT, NATURAL, BAYES, MERGE, LOCAL = 0, 1, 2, 3, 4
 
 
 @inline_kernel
@@ -53,7 +53,7 @@ def prefetch(table, n, column):
 
 
 @inline_kernel
-def _rows_at(table, n, column, layout, known, m, scratch_at, num_classes):
+def rows_at(table, n, column, layout, known, m, scratch_at, num_classes):
     """Where a brick's values lie with the rows for ``known[m]`` and ``layout[m]``: in its block, or ``scratch_at``."""
     place = table.addresses[column, n]
     other = np.uint64(place == 0) | (table.masks[column, n, 0] ^ layout[m, 0])
@@ -153,8 +153,8 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 @kernel
 def team_step(
-    start, end, table, columns, first_columns, weights, gammas, rule, num_classes, layouts, known, is_awake, scratch,
-    int_scratch, changes, is_even,
+    start, end, table, columns, first_columns, weights, gammas, rule, num_classes, clamp_min, clamp_max, layouts, known,
+    is_awake, scratch, int_scratch, changes, is_even,
 ):  # fmt: skip
     """One iteration of a rule at R robots, brick by brick for all of them, in place in their own maps.
 
@@ -163,7 +163,7 @@ def team_step(
     their ``weights`` 2 epsilon A_ij at the same places. ``layouts`` (R n, W) and ``known`` (R n,) are the masks and the
     known cells of the own bricks, which hold those of all the robot's columns; an own brick is one value only where all
     others are. Only bricks that are awake (R, n) are worked on. ``changes`` (R, n) get their largest changes,
-    ``is_even`` (R, n) where all values are equal then; what is one value is left in the table.
+    ``is_even`` (R, n) where all values are equal then; what is one value is left in the table. Rule MERGE clamps.
 
     ``scratch`` float32 has room for NUM_SCRATCH_BLOCKS blocks with every row, one more for each of a robot's columns,
     and 3 x 64 values; ``int_scratch`` int64 for two numbers for each row of a block and each of a robot's columns.
@@ -186,9 +186,9 @@ def team_step(
             first = first_columns[robot]
             num_columns = first_columns[robot + 1] - first
             for k in range(num_columns):
-                if k == OLD_EVIDENCE and rule != BAYES:
+                if k == OLD_EVIDENCE and rule != BAYES and rule != MERGE:
                     continue
-                places[k] = _rows_at(table, b, columns[first + k], layouts, known, m, spare_at + k * room, num_classes)
+                places[k] = rows_at(table, b, columns[first + k], layouts, known, m, spare_at + k * room, num_classes)
             own_at, base_at = places[OWN], places[BASE]
             own = float_array(own_at, (size,))
             mixed = float_array(mixed_at, (size,))
@@ -207,10 +207,13 @@ def team_step(
             if rule == LOCAL:
                 for i in range(size):
                     mixed[i] = evidence[i]
-            elif rule == BAYES:
+            elif rule in (BAYES, MERGE):
                 old = float_array(places[OLD_EVIDENCE], (size,))
                 for i in range(size):
                     mixed[i] += own[i] + (evidence[i] - old[i])
+                if rule == MERGE:
+                    for i in range(size):
+                        mixed[i] = min(max(mixed[i], clamp_min), clamp_max)
             else:
                 for i in range(size):
                     mixed[i] += own[i]

@@ -45,6 +45,10 @@ NO_SIGN = np.float32(0.0)
 """Added to a value it makes 0 of -0, so that equal maps are equal bytes."""
 
 
+SLOTS = 256
+"""Slots for recent numbers; slot 0 stays empty."""
+
+
 class EncoderScratch(NamedTuple):
     """What encode_bricks works in.
 
@@ -599,3 +603,51 @@ def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_va
                 share_first_class(bricks.rows, block, entries.known[n], bricks.masks, index, num_classes)
         first_value += num_leaves
         first_leaf, first_own = next_leaf, next_own
+
+
+@kernel
+def _slot(number):
+    """The slot, 1 to SLOTS - 1, in which a number of at most 32 bits stands when it is a recent one."""
+    return max(np.int64((np.uint64(number) * np.uint64(0x9E3779B1)) >> np.uint64(24)) & (SLOTS - 1), 1)
+
+
+@kernel
+def write_codes(numbers, recent, codes, literals):
+    """Write the slot in which each number (n,) uint32 already stands as its code (n,), or 0 and its bytes as a literal.
+
+    ``recent`` (SLOTS,) uint32 are the numbers in the slots, from 0. ``literals`` (4, n) get their bytes, the lowest
+    first; returns their number. No branches: what is no literal is overwritten by the next.
+    """
+    count = 0
+    for i in range(numbers.size):
+        number = numbers[i]
+        slot = _slot(number)
+        is_new = recent[slot] != number
+        recent[slot] = number
+        codes[i] = 0 if is_new else slot
+        literals[0, count] = number & 0xFF
+        literals[1, count] = (number >> 8) & 0xFF
+        literals[2, count] = (number >> 16) & 0xFF
+        literals[3, count] = number >> 24
+        count += is_new
+    return count
+
+
+@kernel
+def read_codes(codes, literals, recent, numbers):
+    """The ``numbers`` (n,) uint32 of which ``write_codes`` made the codes (n,) and the literals.
+
+    ``recent`` is from 0, and ``literals`` (4, at least 1 + the codes that are 0).
+    """
+    count = 0
+    for i in range(codes.size):
+        is_new = codes[i] == 0
+        literal = (
+            np.uint32(literals[0, count]) | np.uint32(literals[1, count]) << np.uint32(8)
+            | np.uint32(literals[2, count]) << np.uint32(16) | np.uint32(literals[3, count]) << np.uint32(24)
+        )  # fmt: skip
+        recent_number = recent[codes[i]]
+        number = literal if is_new else recent_number
+        recent[_slot(number) if is_new else np.int64(codes[i])] = number
+        numbers[i] = number
+        count += is_new

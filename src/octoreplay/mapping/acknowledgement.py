@@ -1,0 +1,53 @@
+"""Acknowledgements: what a robot has of others' maps, as bytes. docs/packet-format.md describes every byte."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from octoreplay.errors import PacketError
+
+MAGIC = b"OCTA"
+VERSION = 1
+
+_HEADER = struct.Struct("<4sBBH")
+"""magic, version, 0, number of entries."""
+_ENTRY = struct.Struct("<HIBI")
+"""origin, epoch, whether there is a map, its version."""
+_CHECKSUM = struct.Struct("<I")
+
+
+class Possession(NamedTuple):
+    """Which version of a map a robot has: the map of robot ``origin`` in its life ``epoch``; None where it has none."""
+
+    origin: int
+    epoch: int
+    version: int | None
+
+
+def encode_acknowledgement(entries: Sequence[Possession]) -> bytes:
+    """The bytes of an acknowledgement."""
+    data = _HEADER.pack(MAGIC, VERSION, 0, len(entries)) + b"".join(
+        _ENTRY.pack(origin, epoch, version is not None, version or 0) for origin, epoch, version in entries
+    )
+    return data + _CHECKSUM.pack(zlib.crc32(data))
+
+
+def decode_acknowledgement(data: bytes) -> tuple[Possession, ...]:
+    """The entries of an acknowledgement. Raises PacketError for anything that is not a whole one."""
+    end = len(data) - _CHECKSUM.size
+    if end < _HEADER.size or data[:4] != MAGIC:
+        raise PacketError("not an acknowledgement")
+    if zlib.crc32(data[:end]) != _CHECKSUM.unpack_from(data, end)[0]:
+        raise PacketError("acknowledgement damaged: its checksum does not match")
+    _, version, zero, count = _HEADER.unpack_from(data)
+    if version != VERSION or zero or end != _HEADER.size + count * _ENTRY.size:
+        raise PacketError("acknowledgement of a format that this octoreplay does not know")
+    found = []
+    for origin, epoch, has_map, number in _ENTRY.iter_unpack(data[_HEADER.size : end]):
+        if has_map > 1:
+            raise PacketError("acknowledgement of a format that this octoreplay does not know")
+        found.append(Possession(origin, epoch, number if has_map else None))
+    return tuple(found)

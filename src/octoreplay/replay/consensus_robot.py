@@ -1,0 +1,96 @@
+"""The robots that mix their neighbours' maps into their own: rules gradient, natural, bayes, merge and local."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from octoreplay.config import RunConfig
+from octoreplay.mapping.consensus import Step, gamma_at, team_step
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.records import Float64Array
+from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder
+from octoreplay.replay.public_map import PublicMap
+from octoreplay.replay.robot import Arrival, Robot
+
+
+class ConsensusRobot(Robot):
+    """A robot that publishes h_i, and iterates on the h_j that arrive from its neighbours."""
+
+    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
+        super().__init__(index, config, num_classes, encoder, epoch)
+        self._rule = config.consensus.rule
+        self._clamp = (config.sensor.clamp_min, config.sensor.clamp_max)
+        self._public = PublicMap(config, encoder, self.source)
+        self._published: HeldMap | None = None
+        self._last_step_tick = -1
+        self._last_conditions: tuple[object, ...] = ()
+        self._nothing = SemanticOctree(config.map.resolution, num_classes)
+
+    def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
+        """The robot's map, for its neighbours; an empty packet where nothing changed says that it is still there."""
+        self._published = self._public.advance(self.map, self.map.revisions, tick)
+        self.exchange.held[self.source] = self._published
+        return self.exchange.outbox(receivers, [self.source], keep_alive=True)
+
+    def steps_with_team(self, arrived: Sequence[Arrival]) -> bool:
+        """True when the tick's iteration is one step, which the whole team does brick by brick."""
+        return self._config.consensus.mode == "sync" or not arrived
+
+    def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> Step:
+        """The one iteration of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
+        newest = {arrival.source: arrival for arrival in arrived}
+        arrived = [newest[source] for source in sorted(newest)]
+        self._update_log_likelihood(tick)
+        gamma = factor * gamma_at(self._config.consensus, self.num_iterations)
+        base = None
+        if self._published is not None and self._published.version == tick and not self._public.is_exact:
+            # Differences of published maps keep the sum over robots, whatever publishing rounds away.
+            base = self._published.octree
+        # Bricks rest where the same step, with maps that changed nowhere since, changed nothing.
+        conditions = (gamma, *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived))
+        is_steady = conditions == self._last_conditions and all(held.version == tick for _, held in arrived)
+        since = self._last_step_tick if is_steady and base is None else None
+        self._last_conditions, self._last_step_tick = conditions, tick
+        return self._step(arrived, step_weights, gamma, base, since)
+
+    def end_step(self, tick: int) -> None:
+        """Take note of the iteration that ``next_step`` described."""
+        self._finish_step(tick)
+        self._published = None
+        self._prune()
+
+    def iterate(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> float:
+        """One iteration for each of the maps that ``arrived``, in their order; the largest change of a log-odds."""
+        consensus = self._config.consensus
+        self._update_log_likelihood(tick)
+        # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
+        base = self._published.octree if self._published is not None and self._rule == "bayes" else None
+        share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
+        before = self.map.copy()
+        for arrival in arrived:
+            step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
+            team_step([step], rule=self._rule, revision=tick, clamp=self._clamp)
+            self._finish_step(tick)
+        self._published = None
+        self._prune()
+        # What one arrival changes another may undo; what counts is the change over the tick.
+        return self._change_since(before, tick)
+
+    def _step(
+        self, arrived: Sequence[Arrival], step_weights: Float64Array, gamma: float, base: SemanticOctree | None,
+        since: int | None = None,
+    ) -> Step:  # fmt: skip
+        """An iteration with some neighbours' maps; bricks at rest ``since`` the last one are skipped."""
+        if self._rule == "merge":
+            base = self._nothing
+        return Step(
+            self.map, [held.octree for _, held in arrived],
+            [float(step_weights[source.origin]) for source, _ in arrived], self._log_likelihood, gamma, base,
+            self._last_log_likelihood, since,
+        )  # fmt: skip
+
+    def _finish_step(self, tick: int) -> None:
+        """Count an iteration, and keep the evidence that it used."""
+        self.num_iterations += 1
+        if self._rule in ("bayes", "merge"):
+            self._keep_log_likelihood(tick)

@@ -1,0 +1,334 @@
+"""What robots send each other, and what each has of the others' maps.
+
+A map that a robot gives away has a linear history: its *version* is the tick in which it was published, and every brick
+carries as its revision the tick in which it got its value, so that the bricks with revisions from ``base`` on are those
+that changed after version ``base``. A delta from ``base`` to ``version`` holds all of them, whole. Applied to any state
+from ``base`` on it gives the map of ``version``, whatever was lost, repeated or overtaken before; applied to an older
+one it would not, and is refused: that is the gap after which only a delta with an older base, or a whole map, helps.
+A robot that forgot everything starts another life (``epoch``), whose maps are other maps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from octoreplay.config import PacketConfig
+from octoreplay.errors import PacketError
+from octoreplay.mapping import codec
+from octoreplay.mapping.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
+from octoreplay.mapping.codec import MapVersion, PacketFormat
+from octoreplay.mapping.octree import SemanticOctree
+
+NOTHING = 0
+"""The base of a delta that builds on nothing; versions are greater."""
+
+
+class Source(NamedTuple):
+    """Whose map: a robot's index, and which of its lives."""
+
+    origin: int
+    epoch: int
+
+
+@dataclass(frozen=True, eq=False)
+class HeldMap:
+    """A state of a robot's map, at the robot itself or at another; never changed once it is here.
+
+    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio'.
+    """
+
+    octree: SemanticOctree
+    version: int
+    weight: int = 0
+
+
+def _with_flipped_bit(data: bytes, place: int) -> bytes:
+    """A copy with the lowest bit of one byte flipped."""
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+@dataclass(frozen=True, eq=False)
+class MapPart:
+    """One packet of a message, and what a receiver that can use it has afterwards, decoded once for all receivers.
+
+    Without ``held`` the receiver decodes the packet itself.
+    """
+
+    data: bytes
+    source: Source
+    base: int | None
+    held: HeldMap | None
+
+
+@dataclass(frozen=True, eq=False)
+class MapMessage:
+    """Packets of one or more robots' maps that travel together."""
+
+    parts: tuple[MapPart, ...]
+
+    waits = True
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of its packets [bytes]."""
+        return sum(len(part.data) for part in self.parts)
+
+    def damaged(self, share: float) -> MapMessage:
+        """The same message with one bit flipped, ``share`` in [0, 1) of the way through."""
+        place = int(share * self.num_bytes)
+        parts = list(self.parts)
+        for index, part in enumerate(parts):
+            if place < len(part.data):
+                parts[index] = dataclasses.replace(part, data=_with_flipped_bit(part.data, place), held=None)
+                break
+            place -= len(part.data)
+        return MapMessage(tuple(parts))
+
+
+@dataclass(frozen=True)
+class Acknowledgement:
+    """What a robot has of some maps after a message."""
+
+    data: bytes
+
+    waits = False
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of the packet [bytes]."""
+        return len(self.data)
+
+    def damaged(self, share: float) -> Acknowledgement:
+        """The same with one bit flipped, ``share`` in [0, 1) of the way through."""
+        return Acknowledgement(_with_flipped_bit(self.data, int(share * len(self.data))))
+
+
+Content: TypeAlias = MapMessage | Acknowledgement
+
+
+@dataclass
+class Receipt:
+    """What became of a message's packets at its receiver, and the maps that it brought anything new of."""
+
+    fresh: list[Source] = dataclasses.field(default_factory=list)
+    num_stale: int = 0
+    num_gaps: int = 0
+    num_damaged: int = 0
+
+    def add(self, other: Receipt) -> None:
+        """Count another message's packets too."""
+        self.fresh += other.fresh
+        self.num_stale += other.num_stale
+        self.num_gaps += other.num_gaps
+        self.num_damaged += other.num_damaged
+
+
+class PacketEncoder:
+    """The team's packets: each is made once, however many robots send it to however many others."""
+
+    def __init__(self, config: PacketConfig) -> None:
+        self.format = PacketFormat(
+            content=config.content,
+            step=config.int8_step,
+            zstd_level=config.zstd_level if config.packet_compression == "zstd" else None,
+        )
+        # By the octree's identity, version and base; the octree is kept so that no other takes its place.
+        self._packets: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
+        self._older: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
+
+    def packet(self, source: Source, held: HeldMap, base: int | None) -> bytes:
+        """A whole map, or what changed in it after version ``base``."""
+        key = (id(held.octree), held.version, base)
+        entry = self._packets.get(key) or self._older.get(key) or (held.octree, self.encode(source, held, base))
+        self._packets[key] = entry
+        return entry[1]
+
+    def encode(self, source: Source, held: HeldMap, base: int | None, indices: np.ndarray | None = None) -> bytes:
+        """A packet made anew; with ``indices`` (n,) it holds those bricks in place of all that changed."""
+        version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
+        if base is None:
+            return codec.encode_packet(held.octree, packet_format=self.format, map_version=version)
+        if indices is None:
+            indices = np.flatnonzero(held.octree.revisions >= base)
+        return codec.encode_delta(held.octree, indices, packet_format=self.format, map_version=version)
+
+    def end_tick(self) -> None:
+        """Forget the packets that nobody sent in this tick."""
+        self._older, self._packets = self._packets, {}
+
+
+class Exchange:
+    """One robot's side of the exchange: the maps that it has, and what each neighbour is known to have.
+
+    Only newer states replace older ones, and only packets whose bases are here are applied. Without acknowledgements
+    a delta's base is what the last packet to that neighbour held, and every so many packets are whole maps.
+    """
+
+    def __init__(self, config: PacketConfig, encoder: PacketEncoder) -> None:
+        self.held: dict[Source, HeldMap] = {}
+        self._config = config
+        self._encoder = encoder
+        self._known: dict[tuple[int, Source], int] = {}
+        self._num_sent: dict[int, int] = {}
+
+    def outbox(
+        self, receivers: Sequence[int], sources: Sequence[Source], *, keep_alive: bool
+    ) -> list[tuple[tuple[int, ...], MapMessage]]:
+        """What to send to whom in this tick, of the maps ``sources``; the same message goes to several where it can.
+
+        A neighbour that is known to have a map's state gets nothing of it, or with ``keep_alive`` an empty delta.
+        """
+        if not receivers:
+            return []
+        for receiver in receivers:
+            self._num_sent[receiver] = self._num_sent.get(receiver, -1) + 1
+        groups: dict[tuple[tuple[Source, int | None], ...], list[int]] = {}
+        if self._config.cast == "broadcast":
+            bases = self._oldest([self._bases(receiver, sources, keep_alive) for receiver in receivers])
+            groups[tuple(bases.items())] = list(receivers)
+        else:
+            for receiver in receivers:
+                groups.setdefault(tuple(self._bases(receiver, sources, keep_alive).items()), []).append(receiver)
+        outgoing = []
+        for group_bases, group in groups.items():
+            message = MapMessage(tuple(self._parts(group_bases, self._num_sent[group[0]])))
+            if not message.parts:
+                continue
+            outgoing.append((tuple(group), message))
+            if self._config.packets == "delta" and not self._config.acknowledge:
+                for receiver in group:
+                    self._known.update({(receiver, p.source): self.held[p.source].version for p in message.parts})
+        return outgoing
+
+    def receive(self, sender: int, message: MapMessage) -> tuple[Receipt, Acknowledgement | None]:
+        """Take in a message; what became of its packets, and what to answer."""
+        receipt = Receipt()
+        answers: dict[Source, Possession] = {}
+        for part in message.parts:
+            try:
+                source, version, base = self._stamp(part)
+                mine = self.held.get(source)
+                if mine is not None and mine.version >= version:
+                    receipt.num_stale += 1
+                elif base is not None and (mine.version if mine else NOTHING) < base:
+                    receipt.num_gaps += 1
+                else:
+                    self.held[source] = part.held or self._decoded(part.data, version, mine)
+                    receipt.fresh.append(source)
+            except PacketError:
+                receipt.num_damaged += 1
+                continue
+            # Who sends a state has it.
+            self._learn(sender, source, version)
+            held = self.held.get(source)
+            answers[source] = Possession(*source, held.version if held else None)
+        if not answers or self._config.packets != "delta" or not self._config.acknowledge:
+            return receipt, None
+        return receipt, Acknowledgement(encode_acknowledgement(list(answers.values())))
+
+    def acknowledged(self, sender: int, answer: Acknowledgement) -> None:
+        """Take note of what a neighbour has; a damaged answer says nothing."""
+        with contextlib.suppress(PacketError):
+            for origin, epoch, version in decode_acknowledgement(answer.data):
+                if version is None:
+                    self._known.pop((sender, Source(origin, epoch)), None)
+                else:
+                    self._learn(sender, Source(origin, epoch), version)
+
+    def _learn(self, neighbour: int, source: Source, version: int) -> None:
+        """A neighbour has at least this version of a map."""
+        self._known[neighbour, source] = max(version, self._known.get((neighbour, source), version))
+
+    def _bases(self, receiver: int, sources: Sequence[Source], keep_alive: bool) -> dict[Source, int | None]:
+        """The maps to send a neighbour, and the version that each packet builds on (None: a whole map)."""
+        is_delta = self._config.packets == "delta"
+        is_key_frame = not self._config.acknowledge and self._num_sent[receiver] % self._config.key_frame_every == 0
+        bases: dict[Source, int | None] = {}
+        for source in sources:
+            known = self._known.get((receiver, source))
+            if known is None or not is_delta or is_key_frame:
+                bases[source] = None
+            else:
+                bases[source] = min(known, self.held[source].version)
+            is_there = known is not None and known >= self.held[source].version
+            if is_there and not keep_alive and not (is_delta and is_key_frame):
+                del bases[source]
+        return bases
+
+    def _oldest(self, bases: Iterable[Mapping[Source, int | None]]) -> dict[Source, int | None]:
+        """What serves all of several neighbours."""
+        merged: dict[Source, int | None] = {}
+        for of_receiver in bases:
+            for source, base in of_receiver.items():
+                other = merged.get(source, base)
+                merged[source] = None if base is None or other is None else min(base, other)
+        return merged
+
+    def _parts(self, bases: Sequence[tuple[Source, int | None]], turn: int) -> list[MapPart]:
+        """The packets of a message; where a budget leaves room for some only, the sources take turns."""
+        if self._config.budget is None:
+            return [
+                MapPart(self._encoder.packet(source, self.held[source], base), source, base, self.held[source])
+                for source, base in bases
+            ]
+        parts: list[MapPart] = []
+        left = self._config.budget
+        first = turn % max(len(bases), 1)
+        for source, base in (*bases[first:], *bases[:first]):
+            data = self._within(source, base or NOTHING, left)
+            if data is not None:
+                parts.append(MapPart(data, source, base or NOTHING, None))
+                left -= len(data)
+        return parts
+
+    def _within(self, source: Source, base: int, size: int) -> bytes | None:
+        """A packet of at most ``size`` bytes: all that changed after version ``base``, or else what changed first.
+
+        Bricks that got their values in the same tick stay together; they fitted into a packet when they were published.
+        """
+        held = self.held[source]
+        fitting = self._encoder.packet(source, held, base)
+        if len(fitting) <= size:
+            return fitting
+        revisions = held.octree.revisions
+        steps = np.unique(revisions[revisions >= base])
+        best = None
+        fits, fails = 0, steps.size
+        while fails - fits > 1:
+            middle = (fits + fails) // 2
+            version = int(steps[middle - 1]) + 1
+            chosen = np.flatnonzero((revisions >= base) & (revisions < version))
+            data = self._encoder.encode(source, HeldMap(held.octree, version), base, chosen)
+            if len(data) <= size:
+                best, fits = data, middle
+            else:
+                fails = middle
+        return best
+
+    @staticmethod
+    def _stamp(part: MapPart) -> tuple[Source, int, int | None]:
+        """Whose state a packet brings, its version, and its base. Raises PacketError for a damaged packet."""
+        if part.held is not None:
+            return part.source, part.held.version, part.base
+        header = codec.read_header(part.data)
+        stamp = header.map_version
+        is_delta = header.kind == codec.DELTA
+        return Source(stamp.origin, stamp.epoch), stamp.version, stamp.base if is_delta else None
+
+    @staticmethod
+    def _decoded(data: bytes, version: int, mine: HeldMap | None) -> HeldMap:
+        """The state that a packet brings. Raises PacketError, and leaves what is here as it was."""
+        header = codec.read_header(data)
+        if header.kind == codec.FULL:
+            octree = codec.decode_packet(data)
+            octree.revisions[:] = version - 1
+        else:
+            octree = mine.octree.copy() if mine else SemanticOctree(header.resolution, header.num_classes)
+            codec.apply_delta(octree, data, version - 1)
+        return HeldMap(octree, version, header.map_version.weight)

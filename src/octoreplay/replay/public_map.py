@@ -1,0 +1,85 @@
+"""A robot's map as it gives it to others: as exact as its packets are, and as new as its budget allows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from octoreplay.config import RunConfig
+from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.metrics import MapComparer
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
+from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.records import Int64Array
+from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
+
+FIT_TRIES = 6
+"""Packets that are encoded at most to find one that fits the budget."""
+
+
+class PublicMap:
+    """What others may know of a map; every version is a new octree, so that those who have an older one keep it.
+
+    ``is_exact`` says that it is the map itself, value by value and at once.
+    """
+
+    def __init__(self, config: RunConfig, encoder: PacketEncoder, source: Source) -> None:
+        self.is_exact = config.packet.is_exact and config.map.prune_tolerance == 0
+        self._packet = config.packet
+        self._tolerance = config.map.prune_tolerance
+        self._encoder = encoder
+        self._source = source
+        self._octree: SemanticOctree | None = None
+        self._comparer = MapComparer(2, 0.0)
+        self._filled = 0
+
+    def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, num_shares: int = 1) -> HeldMap:
+        """The next version of a map, whose bricks got their values in ``revisions`` (n,), all below ``version``.
+
+        ``num_shares`` maps share the budget.
+        """
+        octree = octree.copy()
+        octree.revisions[:] = revisions
+        if self.is_exact:
+            return HeldMap(octree, version)
+        target = self._rounded(octree)
+        if self._octree is None:
+            self._octree = SemanticOctree(octree.resolution, octree.num_classes)
+        public = self._octree.copy()
+        if self._packet.budget is None:
+            # What did not change keeps its revision, so that no delta holds it.
+            team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
+        else:
+            self._fill(public, target, version, self._packet.budget // num_shares)
+        self._octree = public
+        return HeldMap(public, version)
+
+    def _rounded(self, octree: SemanticOctree) -> SemanticOctree:
+        """A map as packets can hold it."""
+        if self._tolerance > 0:
+            octree = octree_from_streams(
+                octree.streams(tolerance=self._tolerance), octree.resolution, octree.num_classes
+            )
+        if self._packet.top_classes is not None:
+            octree = top_classes(octree, self._packet.top_classes)
+        return quantised(octree, self._packet.content, self._packet.int8_step)
+
+    def _fill(self, public: SemanticOctree, target: SemanticOctree, version: int, budget: int) -> None:
+        """Bring as many bricks up to date as fit into a packet, those first that change most."""
+        self._comparer.compare([public, target], target, [(0, 1)], self._filled - 1)
+        self._filled = version
+        codes, distances = self._comparer.brick_distances
+        # Cells that became known without any evidence, and bricks that the map does not have (yet).
+        here, there = target.find(codes), public.find(codes)
+        is_new = (here >= 0) & (target.known[here] != np.where(there >= 0, public.known[there], 0))
+        waiting = np.flatnonzero((here >= 0) & (is_new | (distances > 0)))
+        order = here[waiting[np.argsort(-distances[waiting], kind="stable")]]
+        best = 0
+        wanted = order.size
+        for _ in range(FIT_TRIES):
+            size = len(self._encoder.encode(self._source, HeldMap(target, version), version, order[:wanted]))
+            if size <= budget:
+                best = max(best, wanted)
+            if best == order.size or (size <= budget and size > 0.9 * budget):
+                break
+            wanted = min(max(int(wanted * 0.95 * budget / size), best + 1), order.size)
+        public.overwrite(target, order[:best], version - 1)

@@ -1,0 +1,104 @@
+"""Which links a team has by itself, before one-way pairs and the schedule: a fixed pattern, or by where robots are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from octoreplay.config import NetworkConfig
+from octoreplay.records import BoolArray, Float64Array
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+POSITION_TOPOLOGIES = ("nearest", "range")
+"""Topologies whose links follow the robots' positions; the others are fixed over a run."""
+
+
+class Topology:
+    """The undirected links among a team's robots from tick to tick.
+
+    Fixed topologies are drawn over the whole team and induced on the robots that are present: a ring without one robot
+    is a line, a star without its centre, the first robot, has no links. ``nearest`` and ``range`` are made anew among
+    the robots that are present and have a position; ``range`` remembers its links from call to call.
+    """
+
+    def __init__(self, network: NetworkConfig, robot_ids: Sequence[str]) -> None:
+        self._network = network
+        self._fixed: BoolArray | None = None
+        if network.topology not in POSITION_TOPOLOGIES:
+            self._fixed = _adjacency(_fixed_graph(network, robot_ids).edges, len(robot_ids))
+        self._in_range = np.zeros((len(robot_ids), len(robot_ids)), dtype=bool)
+
+    def links(self, present: BoolArray, positions: Float64Array) -> BoolArray:
+        """The links of a tick, (N, N) bool, symmetric, without diagonal.
+
+        ``present`` (N,); ``positions`` (N, 3) in metres in the team's frame, NaN for a robot without a pose, are looked
+        at by 'nearest' and 'range' only.
+        """
+        if self._fixed is not None:
+            return self._fixed & present & present[:, None]
+        # Robots without a distance have no links: NaN positions make NaN distances, and no comparison holds for them.
+        distances = _distances(np.where(present[:, None], positions, np.nan))
+        if self._network.topology == "nearest":
+            return _nearest_links(distances, self._network.num_nearest)
+        self._in_range = self._range_links(distances)
+        return self._in_range
+
+    def _range_links(self, distances: Float64Array) -> BoolArray:
+        """Links come up below radio_range and stand up to radio_range + range_hysteresis."""
+        network = self._network
+        stands = self._in_range & (distances <= network.radio_range + network.range_hysteresis)
+        links: BoolArray = stands | (distances < network.radio_range)
+        np.fill_diagonal(links, False)
+        return links
+
+
+def _fixed_graph(network: NetworkConfig, robot_ids: Sequence[str]) -> nx.Graph:
+    """A topology that does not depend on positions, over all robots; its nodes are their indices."""
+    import networkx as nx
+
+    num_robots = len(robot_ids)
+    if network.topology == "edges":
+        index_of = {robot_id: index for index, robot_id in enumerate(robot_ids)}
+        return nx.Graph((index_of[a], index_of[b]) for a, b, _ in network.edges)
+    if network.topology == "random":
+        return nx.gnp_random_graph(num_robots, network.link_prob, seed=network.network_seed)
+    if network.topology == "star":
+        return nx.star_graph(num_robots - 1)  # counts the leaves
+    if network.topology == "grid":
+        num_columns = math.isqrt(num_robots - 1) + 1  # the square root, rounded up
+        grid = nx.grid_2d_graph(-(-num_robots // num_columns), num_columns)
+        return nx.relabel_nodes(grid, {(y, x): y * num_columns + x for y, x in grid}).subgraph(range(num_robots))
+    make = {"complete": nx.complete_graph, "ring": nx.cycle_graph, "line": nx.path_graph}[network.topology]
+    return make(num_robots)
+
+
+def _adjacency(links: Iterable[tuple[int, int]], num_robots: int) -> BoolArray:
+    """Undirected links as a symmetric matrix."""
+    matrix = np.zeros((num_robots, num_robots), dtype=bool)
+    for i, j in links:
+        matrix[i, j] = matrix[j, i] = True
+    np.fill_diagonal(matrix, False)  # networkx closes a ring of one robot on itself
+    return matrix
+
+
+def _distances(positions: Float64Array) -> Float64Array:
+    """Distances (N, N) between positions (N, 3), NaN where one of them is."""
+    distances: Float64Array = np.sqrt(((positions[:, None] - positions) ** 2).sum(axis=2))
+    return distances
+
+
+def _nearest_links(distances: Float64Array, num_nearest: int) -> BoolArray:
+    """Links from each robot to its nearest ones, ties by index; a link stands where either end wants it."""
+    others = np.where(np.isnan(distances), np.inf, distances)
+    np.fill_diagonal(others, np.inf)
+    order = np.argsort(others, axis=1, kind="stable")[:, :num_nearest]
+    wanted = np.zeros(others.shape, dtype=bool)
+    np.put_along_axis(wanted, order, True, axis=1)
+    wanted &= np.isfinite(others)
+    symmetric: BoolArray = wanted | wanted.T
+    return symmetric
