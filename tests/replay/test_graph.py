@@ -124,7 +124,6 @@ def test_robots_that_are_off_take_no_part_and_silent_ones_hear():
     team = _team(4, "ring", schedule=schedule)
     off = team.at(5.0, [True] * 4, _nowhere(4))
     assert (off.active, off.pairs) == ((0, 2, 3), ((0, 3), (2, 3)))
-    assert team.schedule.at(5.0).forget.tolist() == [False, True, False, False]
     silent = team.at(6.0, [True] * 4, _nowhere(4))
     assert silent.active == (0, 1, 2, 3)
     assert (silent.senders(1), silent.receivers(1)) == ((0, 2), ())
@@ -393,9 +392,9 @@ def test_weights_that_are_no_numbers_are_refused(weight):
 
 
 def test_one_way_pairs_that_make_no_sense_are_refused():
-    with pytest.raises(ConfigError, match="^one_way: 'husky_1' cannot have a link to itself"):
+    with pytest.raises(ConfigError, match=r"^one_way: 'husky_1' cannot have a link to itself"):
         NetworkConfig(one_way=_name((0, 0)))
-    with pytest.raises(ConfigError, match="^one_way: husky_2 -> husky_1 and husky_1 -> husky_2 are both listed; keep"):
+    with pytest.raises(ConfigError, match=r"^one_way: husky_2 -> husky_1 and husky_1 -> husky_2 are both listed; keep"):
         NetworkConfig(one_way=_name((1, 0), (0, 1)))
 
 

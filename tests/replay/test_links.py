@@ -210,5 +210,5 @@ def test_every_packet_is_delivered_lost_or_dropped_once(sends, rate, queue, loss
 
 
 def test_jitter_above_the_latency_is_refused():
-    with pytest.raises(ConfigError, match="jitter: 0.2 is above latency 0.1; a delay cannot be negative"):
+    with pytest.raises(ConfigError, match=r"jitter: 0.2 is above latency 0.1; a delay cannot be negative"):
         _links(latency=0.1, jitter=0.2)

@@ -93,7 +93,6 @@ def test_robots_forget_when_they_go_off():
         ScheduleEntry(10.2, 10.7, robots_off=("spot",), forget=True),
         ScheduleEntry(10.2, 15.0, robots_off=("husky",)),
     )
-    assert schedule.at(10.5).forget.tolist() == [False, False, True, False]
     assert schedule.forgets(-math.inf, 0.0).tolist() == [False, True, False, False]
     assert schedule.forgets(0.0, 10.0).tolist() == [False] * 4
     assert schedule.forgets(10.0, 11.0).tolist() == [False, False, True, False]  # back before the tick sees it
@@ -208,7 +207,6 @@ def test_a_schedule_says_at_every_time_what_its_entries_say(entries):
         available, now = schedule.at(t), holding[t]
         assert available.robots_off[i] == any(name in entry.robots_off for entry in now)
         assert available.robots_silent[i] == any(name in entry.robots_silent for entry in now)
-        assert available.forget[i] == any(name in entry.robots_off and entry.forget for entry in now)
         for j, other in enumerate(NAMES):
             pair = frozenset((name, other))
             up = any(pair == frozenset(link) for entry in now for link in entry.links_up)

@@ -517,9 +517,7 @@ def _evidence_of_the_last_iteration_is_forgotten(monkeypatch):
 
 def _scans_of_the_tick_come_late(monkeypatch):
     right = Session._integrate
-    monkeypatch.setattr(
-        Session, "_integrate", lambda self, number, stamp_ns, is_off: right(self, number, stamp_ns - 10**9, is_off)
-    )
+    monkeypatch.setattr(Session, "_integrate", lambda self, number, stamp_ns: right(self, number, stamp_ns - 10**9))
 
 
 def _hits_add_too_little(monkeypatch):

@@ -11,7 +11,7 @@ from octoreplay.config import NetworkConfig
 from octoreplay.replay.topology import Topology
 from reference import graph as reference
 
-NAMES = tuple("abcdefghijkl")
+NAMES = tuple(f"robot_{number}" for number in range(64))
 NOWHERE = (math.nan,) * 3
 
 
@@ -34,7 +34,10 @@ def test_fixed_topologies():
     assert _links(4, "ring") == ((0, 1), (0, 3), (1, 2), (2, 3))
     assert _links(4, "line") == ((0, 1), (1, 2), (2, 3))
     assert _links(4, "star") == ((0, 1), (0, 2), (0, 3))
-    assert _links(4, "edges", edges=(("d", "b", None), ("a", "c", None), ("c", "a", None))) == ((0, 2), (1, 3))
+    assert _links(4, "edges", edges=tuple((NAMES[a], NAMES[b], None) for a, b in ((3, 1), (0, 2), (2, 0)))) == (
+        (0, 2),
+        (1, 3),
+    )
 
 
 def test_grids_are_as_square_as_can_be_and_their_last_row_may_be_short():
@@ -67,7 +70,7 @@ def test_fixed_topologies_are_induced_on_the_robots_that_are_present():
 
 
 def test_random_links_follow_the_seed_and_stand_over_the_run():
-    made = Topology(NetworkConfig(topology="random", link_prob=0.4, network_seed=3), NAMES)
+    made = Topology(NetworkConfig(topology="random", link_prob=0.4, network_seed=3), NAMES[:12])
     everybody, nowhere = np.ones(12, bool), np.full((12, 3), np.nan)
     first = made.links(everybody, nowhere)
     np.testing.assert_array_equal(made.links(everybody, nowhere), first)
@@ -93,6 +96,10 @@ def test_ties_of_the_nearest_go_to_the_lower_index():
     assert _links(5, "nearest", num_nearest=1, positions=around) == ((0, 1), (0, 2), (0, 3), (0, 4))
     same_place = [(1, 1, 1)] * 4
     assert _links(4, "nearest", num_nearest=1, positions=same_place) == ((0, 1), (0, 2), (0, 3))
+    # Many, since sorting a few keeps equals in order anyway.
+    crowd = np.random.default_rng(1).integers(0, 3, (64, 3)).astype(float)
+    expected = reference.topology_links(NetworkConfig(topology="nearest", num_nearest=5), NAMES, [crowd.tolist()])
+    assert _links(64, "nearest", num_nearest=5, positions=crowd) == expected
 
 
 def test_robots_without_a_pose_or_not_present_are_nobodys_nearest():

@@ -54,9 +54,11 @@ class FloodRobot(Robot):
             since = self._summed.get(source, -1)
             changed.append(held.octree.codes[held.octree.revisions >= since])
             self._summed[source] = held.version
-        others = [held.octree for source, held in sorted(self.exchange.held.items()) if source != self.source]
+        # The robot's own evidence is newer than what it published; equal sums need the same order everywhere.
+        octrees = {source: held.octree for source, held in self.exchange.held.items()}
+        octrees[self.source] = self._log_likelihood
         share = 1.0 / len(self._config.robots)
-        terms = [Evidence(octree, scale=share) for octree in (self._log_likelihood, *others)]
+        terms = [Evidence(octrees[source], scale=share) for source in sorted(octrees)]
         before = self.map.copy()
         sum_of_evidence(self.map, terms, np.unique(np.concatenate(changed)), tick)
         self.num_iterations += 1

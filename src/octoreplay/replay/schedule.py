@@ -23,14 +23,12 @@ from octoreplay.records import BoolArray
 class Availability:
     """What the schedule says at one time. All arrays are bool and read-only.
 
-    ``robots_off`` (N,) neither map nor talk, and those in ``forget`` (N,) come back without what they knew;
-    ``robots_silent`` (N,) hear and do not talk. ``links_down`` and ``links_up`` (N, N) are symmetric and name no link
-    both; a partition into groups is in ``links_down``.
+    ``robots_off`` (N,) neither map nor talk, ``robots_silent`` (N,) hear and do not talk. ``links_down`` and
+    ``links_up`` (N, N) are symmetric and name no link both; a partition into groups is in ``links_down``.
     """
 
     robots_off: BoolArray
     robots_silent: BoolArray
-    forget: BoolArray
     links_down: BoolArray
     links_up: BoolArray
 
@@ -97,22 +95,20 @@ class Schedule:
     def _availability(self, elapsed_s: float) -> Availability:
         """The entries that hold at a time, as arrays."""
         num_robots = len(self._robot_ids)
-        off, silent, forget = np.zeros((3, num_robots), dtype=bool)
+        off, silent = np.zeros((2, num_robots), dtype=bool)
         down, up = np.zeros((2, num_robots, num_robots), dtype=bool)
         for entry in self._entries:
             if not entry.start <= elapsed_s < entry.end:
                 continue
             off[self._indices(entry.robots_off)] = True
             silent[self._indices(entry.robots_silent)] = True
-            if entry.forget:
-                forget[self._indices(entry.robots_off)] = True
             for matrix, links in ((down, (*entry.links_down, *_cut_links(entry))), (up, entry.links_up)):
                 for a, b in links:
                     i, j = self._indices((a, b))
                     matrix[i, j] = matrix[j, i] = True
-        for array in (off, silent, forget, down, up):
+        for array in (off, silent, down, up):
             array.setflags(write=False)
-        return Availability(off, silent, forget, down, up)
+        return Availability(off, silent, down, up)
 
     def _indices(self, robot_ids: Sequence[str]) -> list[int]:
         """The indices of some robots."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import os
 import time
@@ -25,7 +24,6 @@ from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import (
-    BoolArray,
     Float64Array,
     FrameCounts,
     LinkMetrics,
@@ -133,10 +131,10 @@ class Session:
     def _tick(self, number: int, stamp_ns: int, gamma_factor: float = 1.0, *, settling: bool = False) -> Tick:
         """One tick, in the order of the paper: integrate, publish, deliver, iterate, measure."""
         if not settling:
-            elapsed = number * self._period_ns / 1e9
-            is_off = self._switch_off(elapsed)
-            self._integrate(number, stamp_ns, is_off)
-            self._graph = self._network.at(elapsed, self._active(stamp_ns, is_off), self._positions())
+            elapsed, before = number * self._period_ns / 1e9, (number - 1) * self._period_ns / 1e9
+            self._forget(before, elapsed)
+            self._integrate(number, stamp_ns)
+            self._graph = self._network.at(elapsed, self._active(stamp_ns), self._positions())
         graph = self._graph
         published = self._publish(graph, number, stamp_ns)
         receipts = self._deliver(graph, stamp_ns)
@@ -156,25 +154,22 @@ class Session:
         family = families.get(self.config.consensus.rule, ConsensusRobot)
         return family(index, self.config, self._num_classes, self._encoder, epoch)
 
-    def _switch_off(self, elapsed: float) -> BoolArray:
-        """Which robots (N,) are off; one that forgets starts another life."""
-        availability = self._network.schedule.at(elapsed)
-        for index in np.flatnonzero(availability.forget):
+    def _forget(self, after: float, until: float) -> None:
+        """A robot that went off and forgets, in (after, until] seconds since the start, begins another life."""
+        for index in np.flatnonzero(self._network.schedule.forgets(after, until)).tolist():
             robot = self._robots[index]
-            if robot.num_iterations > 0:
-                # What it saw was seen: the oracle does not forget.
-                self._past_lives.append(robot.evidence)
-                self._robots[index] = self._new_robot(int(index), robot.source.epoch + 1)
-                self._robots[index].T_team_sensor = robot.T_team_sensor
-        return availability.robots_off
+            # What it saw was seen: the oracle does not forget.
+            self._past_lives.append(robot.evidence)
+            self._robots[index] = self._new_robot(index, robot.source.epoch + 1)
+            self._robots[index].T_team_sensor = robot.T_team_sensor
 
-    def _active(self, stamp_ns: int, is_off: BoolArray) -> list[bool]:
-        """Which robots (N,) take part in the tick."""
+    def _active(self, stamp_ns: int) -> list[bool]:
+        """Which robots (N,) have begun and not left."""
         leaves = self.config.network.after_end == "leave"
 
         def is_active(index: int) -> bool:
             last_ns = self._timeline.last_stamp_ns(index)
-            if last_ns is None or is_off[index]:
+            if last_ns is None:
                 return False
             ended = self._timeline.has_ended(index) and last_ns < stamp_ns - self._period_ns
             return not (leaves and ended)
@@ -191,18 +186,18 @@ class Session:
 
     # --- the steps of a tick ------------------------------------------------------------------------------------------
 
-    def _integrate(self, number: int, stamp_ns: int, is_off: BoolArray) -> None:
+    def _integrate(self, number: int, stamp_ns: int) -> None:
         """Every scan with a stamp before the tick goes into its robot's evidence, read in the robot's thread.
 
         A robot that is off sees nothing.
         """
+        schedule, start_ns = self._network.schedule, stamp_ns - number * self._period_ns
 
         def integrate(index: int) -> None:
             frames = self._timeline.frames_before(index, stamp_ns)
-            if is_off[index]:
-                collections.deque(frames, maxlen=0)
-            else:
-                self._robots[index].integrate(frames, number)
+            now = (stamp_ns - start_ns) / 1e9
+            seen = (frame for frame in frames if schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, now))
+            self._robots[index].integrate(seen, number)
 
         self._each(integrate, range(len(self._robots)))
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from octoreplay.config import LinkConfig, RunConfig
-from octoreplay.replay.graph import CommunicationGraph, settle_ticks_max, step_size
+from octoreplay.replay.graph import STEP_SIZE_RULES, CommunicationGraph, settle_ticks_max, step_size
 
 QUIET_PROB = 1e-3
 """A link may be silent by chance for as long as settling has to be quiet with this probability."""
@@ -26,15 +26,18 @@ def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
 
 def num_settle_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
     """The most settling ticks: those of the graph with each weight times its link's share of packets that arrive."""
-    epsilon = step_size(graph, config.consensus)
+    consensus = config.consensus
+    if consensus.rule not in STEP_SIZE_RULES:
+        consensus = dataclasses.replace(consensus, epsilon=None)
+    epsilon = step_size(graph, consensus)
     links = _link_configs(graph, config)
     weights = graph.weights.copy()
     for (sender, receiver), link in links.items():
         weights[receiver, sender] *= 1.0 - link.mean_loss
-    most = settle_ticks_max(dataclasses.replace(graph, weights=weights), config.consensus, epsilon)
-    if config.consensus.settle == 0 or config.consensus.settle_max is not None:
+    most = settle_ticks_max(dataclasses.replace(graph, weights=weights), consensus, epsilon)
+    if consensus.settle == 0 or consensus.settle_max is not None:
         return most
-    ramp = config.consensus.settle
+    ramp = consensus.settle
     slower = _slowest(config) * (1 + _delay(list(links.values()), config))
     return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config) - 1
 
