@@ -42,7 +42,9 @@ class RatioRobot:
         self.evidence = now
 
     def share_out(self, num_receivers: int) -> None:
-        """Sigma += y / (1 + D), y -= D y / (1 + D), and the same of the weight."""
+        """Sigma += y / (1 + D), y -= D y / (1 + D), and the same of the weight; nothing where nobody listens."""
+        if num_receivers == 0:
+            return
         share, weight = share_of(self.mass, num_receivers), self.weight // (1 + num_receivers)
         self.total, self.total_weight = self.total + share, self.total_weight + weight
         self.mass, self.weight = self.mass - num_receivers * share, self.weight - num_receivers * weight

@@ -7,29 +7,35 @@ equal shares of both, and adds one to what it sends: the running sums sigma_i an
 receiver takes in what they grew by since it last heard of them, so the next packet brings what a lost one withheld.
 Nothing is ever created or lost, so all y_i / z_i tend to the mean of the evidence.
 
+A link that comes up later carries what came since: its receiver starts with the sums of that moment as the old ones.
+One that goes down and comes up again goes on where it stopped, without what was summed up while it was down.
+
 Masses and running sums are octrees, integers in units of UNIT modulo MODULUS, stored as the bits of the float32 values
-(kernels/running_sums.py). Sums may wrap around for ever: only their differences count, and these are exact modulo
-MODULUS. A mass is read as the number nearest to 0, so what matters is that |y_i| stays below MAX_MASS. With evidence
-within +-clamp it does: all z_i and the weight under way add up to the number of robots N, so |y_i| <= clamp N, and
-evidence that changes adds no more than a few times that.
+(kernels/running_sums.py). Sums may wrap around for ever: only differences count, and these are exact modulo MODULUS
+however large they are. A mass is read as the number nearest to 0, so |y_i| must stay below MAX_MASS. All weights and
+what is under way of them add up to the number of robots N, so |y_i| <= clamp N while evidence within +-clamp rests.
+Evidence that changes may add to that; with 4 clamp N below the limit there is room for it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.mapping.consensus import raise_to_columns, union_codes
+from octoreplay.mapping.consensus import NUM_PARTS, raise_to_columns, union_codes
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import running_sums as kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.kernels.running_sums import MODULUS, SOURCE, TARGET
 from octoreplay.mapping.kernels.storage import BrickTable
-from octoreplay.mapping.octree import SemanticOctree, brick_table, cache_aligned
+from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
+Arrival = tuple[SemanticOctree, SemanticOctree | None]
+"""A sender's running sum as it is now, and as the receiver last had it."""
 UNIT = 1.0 / float(kernels.UNITS_PER_LOG_ODDS)
 """Log-odds of one unit of a mass."""
 MAX_MASS = MODULUS // 2 - 1
@@ -44,21 +50,20 @@ units, and its new evidence 1 / z_i times too large. Its map is better left to i
 
 
 def share_weight(weight: int, num_receivers: int) -> tuple[int, int]:
-    """The share of a weight for each receiver, and what the robot keeps, which is at least as much [WEIGHT_UNIT]."""
-    share = weight // (1 + num_receivers)
+    """What each receiver gets of a weight, and what the robot keeps, which is more than 0 [WEIGHT_UNIT]."""
+    share = weight // (1 + num_receivers) if num_receivers else 0
     return share, weight - num_receivers * share
 
 
-def share_out(mass: SemanticOctree, total: SemanticOctree, num_receivers: int, revision: int) -> int:
+def share_out(mass: SemanticOctree, total: SemanticOctree, num_receivers: int, revision: int) -> None:
     """Move the shares of so many receivers from a mass, and add one of them to its running sum ``total``, in place.
 
     A share is mass / (1 + ``num_receivers``), rounded to nearest, ties to even; the robot keeps what the rounded shares
-    leave. Bricks that change get ``revision``. Returns the largest |share| [UNIT]: the sum of these over some ticks
-    bounds what any value of ``total`` grew by in them. Without receivers nothing changes.
+    leave. Bricks that change get ``revision``. Without receivers nothing changes.
     """
     if num_receivers == 0:
-        return 0
-    rows = _rows(total, [mass], mass.codes)
+        return
+    rows = _rows(total, mass, mass.codes)
     shares = np.empty(mass.num_bricks, np.int32)
     kernels.share_out(
         rows.table, rows.layout, rows.known, num_receivers, total.num_classes, _scratch(total.num_classes), shares
@@ -66,19 +71,33 @@ def share_out(mass: SemanticOctree, total: SemanticOctree, num_receivers: int, r
     is_changed = np.maximum(shares, rows.known_changed).astype(np.float32)
     _store(total, rows.indices, rows.table, TARGET, is_changed, revision)
     _store(mass, np.arange(mass.num_bricks), rows.table, SOURCE, is_changed, revision)
-    return int(shares.max(initial=0))
 
 
-def take_in(
-    mass: SemanticOctree, arrivals: Sequence[tuple[SemanticOctree, SemanticOctree | None]], revision: int
-) -> None:
+def take_in(mass: SemanticOctree, arrivals: Sequence[Arrival], revision: int) -> None:
     """Add to a mass, in place, what the running sums of some senders grew by: (new, old), old None for 0 everywhere.
 
     The new ones have all cells of the old ones; these become known. Bricks that change get ``revision``.
     """
-    nothing = SemanticOctree(mass.resolution, mass.num_classes)
-    columns = [nothing if octree is None else octree for arrival in arrivals for octree in arrival]
-    _add_differences(mass, columns, union_codes(columns[::2], None), revision, of_evidence=False)
+    team_take_in([(mass, arrivals)], revision)
+
+
+def team_take_in(
+    robots: Sequence[tuple[SemanticOctree, Sequence[Arrival]]], revision: int, threads: Executor | None = None
+) -> None:
+    """What ``take_in`` does for each of several robots' masses; sums that several of them heard are looked up once.
+
+    The result does not depend on ``threads``.
+    """
+    if not robots:
+        return
+    first = robots[0][0]
+    nothing = SemanticOctree(first.resolution, first.num_classes)
+    differences = [
+        (mass, [nothing if octree is None else octree for arrival in arrivals for octree in arrival])
+        for mass, arrivals in robots
+    ]
+    news = {id(octree): octree for _, columns in differences for octree in columns[::2]}
+    _add_differences(differences, union_codes(list(news.values()), None), revision, threads=threads)
 
 
 def add_evidence(
@@ -90,7 +109,7 @@ def add_evidence(
     the evidence from ``since`` on are looked at. Bricks that change get ``revision``.
     """
     codes = evidence.codes[evidence.revisions >= since]
-    _add_differences(mass, [evidence, last_evidence], codes, revision, of_evidence=True)
+    _add_differences([(mass, [evidence, last_evidence])], codes, revision, of_evidence=True)
 
 
 def difference(new: SemanticOctree, old: SemanticOctree) -> SemanticOctree:
@@ -107,7 +126,7 @@ def recovered(mass: SemanticOctree, weight: int, into: SemanticOctree, revision:
     Bricks that change get ``revision``, those of one value are pruned; bricks that the mass does not have stay as they
     are. Returns the largest change of a log-odds.
     """
-    rows = _rows(into, [mass], mass.codes)
+    rows = _rows(into, mass, mass.codes)
     changes, is_even = np.empty(rows.known.size, np.float32), np.zeros(rows.known.size, np.bool_)
     kernels.recover(
         rows.table, rows.layout, rows.known, UNIT / (weight * WEIGHT_UNIT), np.float32(tolerance), into.num_classes,
@@ -121,10 +140,10 @@ def recovered(mass: SemanticOctree, weight: int, into: SemanticOctree, revision:
 
 
 class _Rows(NamedTuple):
-    """The bricks (n,) of some octrees, of which the first holds the cells and rows of all.
+    """Bricks (n,) of an octree that holds the cells and rows of others, and where theirs lie, its own among them.
 
-    ``indices`` (n,) are those in the first octree, ``layout`` (n, W) and ``known`` (n,) its masks and known cells, and
-    ``known_changed`` (n,) says where it got new ones.
+    ``indices`` (n,) are those in the octree, -1 for none, ``layout`` (n, W) and ``known`` (n,) its masks and known
+    cells, and ``known_changed`` (n,) says where it got new ones.
     """
 
     table: BrickTable
@@ -134,12 +153,15 @@ class _Rows(NamedTuple):
     known_changed: BoolArray
 
 
-def _rows(target: SemanticOctree, others: Sequence[SemanticOctree], codes: Int64Array) -> _Rows:
-    """Give the ``target`` the cells, blocks and rows that it takes to hold the bricks ``codes`` (n,) of the others."""
-    octrees = [target, *others]
-    table = brick_table(octrees, codes)
-    raised = raise_to_columns(target, codes, table, np.arange(len(octrees)), np.ones(codes.size, np.bool_))
-    storage.fill_table(target.bricks, raised[0], 0, table, TARGET)
+def _rows(target: SemanticOctree, source: SemanticOctree, codes: Int64Array) -> _Rows:
+    """The bricks ``codes`` (n,) of a target that takes on those of a source."""
+    return _raised(target, codes, brick_table([target, source], codes), np.array([TARGET, SOURCE]))
+
+
+def _raised(target: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array) -> _Rows:
+    """Give a target, the first of the table's ``columns``, the cells, blocks and rows that hold those of all."""
+    raised = raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
+    storage.fill_table(target.bricks, raised[0], 0, table, columns[0])
     return _Rows(table, *raised)
 
 
@@ -149,15 +171,35 @@ def _scratch(num_classes: int) -> Float32Array:
 
 
 def _add_differences(
-    mass: SemanticOctree, columns: Sequence[SemanticOctree], codes: Int64Array, revision: int, *, of_evidence: bool
-) -> None:
-    """Add ``columns`` 0 - 1, 2 - 3, ... in the bricks ``codes`` (n,) to a mass."""
-    rows = _rows(mass, columns, codes)
-    is_changed = np.empty(codes.size, np.float32)
-    kernels.add_differences(
-        rows.table, of_evidence, rows.layout, rows.known, mass.num_classes, _scratch(mass.num_classes), is_changed
-    )
-    _store(mass, rows.indices, rows.table, TARGET, np.maximum(is_changed, rows.known_changed), revision)
+    robots: Sequence[tuple[SemanticOctree, Sequence[SemanticOctree]]], codes: Int64Array, revision: int, *,
+    of_evidence: bool = False, threads: Executor | None = None,
+) -> None:  # fmt: skip
+    """Add octrees 0 - 1, 2 - 3, ... in the bricks ``codes`` (n,) to each of the masses that they come with."""
+    run: Run = map if threads is None else threads.map
+    octrees = list({id(octree): octree for mass, others in robots for octree in (mass, *others)}.values())
+    column_of = {id(octree): column for column, octree in enumerate(octrees)}
+    table = brick_table(octrees, codes, run=run)
+    columns = [np.array([column_of[id(octree)] for octree in (mass, *others)], np.int64) for mass, others in robots]
+    rows = list(run(lambda n: _raised(robots[n][0], codes, table, columns[n]), range(len(robots))))
+    layouts, known = np.concatenate([of_robot.layout for of_robot in rows]), np.concatenate([r.known for r in rows])
+    all_columns, first_columns = np.concatenate(columns), np.cumsum([0, *(of_robot.size for of_robot in columns)])
+    is_changed = np.empty((len(robots), codes.size), np.float32)
+    num_classes = robots[0][0].num_classes
+
+    def work(part: Int64Array) -> None:
+        kernels.add_differences(
+            part[0], part[-1] + 1, table, all_columns, first_columns, of_evidence, layouts, known, num_classes,
+            _scratch(num_classes), is_changed,
+        )  # fmt: skip
+
+    parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
+    list(run(work, [part for part in parts if part.size]))
+
+    def finish(n: int) -> None:
+        changes = np.maximum(is_changed[n], rows[n].known_changed)
+        _store(robots[n][0], rows[n].indices, table, columns[n][0], changes, revision)
+
+    list(run(finish, range(len(robots))))
 
 
 def _store(

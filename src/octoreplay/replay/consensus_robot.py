@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Self
 
 from octoreplay.config import RunConfig
 from octoreplay.mapping.consensus import Step, gamma_at, team_step
@@ -10,7 +13,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
 from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder
 from octoreplay.replay.public_map import PublicMap
-from octoreplay.replay.robot import Arrival, Robot
+from octoreplay.replay.robot import Arrival, Robot, Turn
 
 
 class ConsensusRobot(Robot):
@@ -32,9 +35,22 @@ class ConsensusRobot(Robot):
         self.exchange.held[self.source] = self._published
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 
-    def steps_with_team(self, arrived: Sequence[Arrival]) -> bool:
-        """True when the tick's iteration is one step, which the whole team does brick by brick."""
-        return self._config.consensus.mode == "sync" or not arrived
+    @classmethod
+    def iterate_team(
+        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
+    ) -> list[float]:
+        """One iteration with all that arrived, which the team does brick by brick; on-arrival one for each map."""
+        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
+        is_sync = config.consensus.mode == "sync"
+        together = [turn for turn in turns if is_sync or not turn.arrived]
+        alone = [turn for turn in turns if not is_sync and turn.arrived]
+        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, factor, tick), together))
+        clamp = (config.sensor.clamp_min, config.sensor.clamp_max)
+        changes = team_step(steps, rule=config.consensus.rule, revision=tick, clamp=clamp, threads=threads)
+        list(threads.map(lambda turn: turn.robot.end_step(tick), together))
+        return changes + list(
+            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, factor, tick), alone)
+        )
 
     def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> Step:
         """The one iteration of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
@@ -59,7 +75,9 @@ class ConsensusRobot(Robot):
         self._published = None
         self._prune()
 
-    def iterate(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> float:
+    def iterate_on_arrival(
+        self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int
+    ) -> float:
         """One iteration for each of the maps that ``arrived``, in their order; the largest change of a log-odds."""
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
@@ -94,3 +112,13 @@ class ConsensusRobot(Robot):
         self.num_iterations += 1
         if self._rule in ("bayes", "merge"):
             self._keep_log_likelihood(tick)
+
+
+def _from_neighbours(turn: Turn[Robot]) -> list[Arrival]:
+    """What arrived over links that stand in this tick, without maps of a sender's earlier lives."""
+    lives = dict(sorted(arrival.source for arrival in turn.arrived))
+    return [
+        arrival
+        for arrival in turn.arrived
+        if turn.step_weights[arrival.source.origin] > 0 and arrival.source.epoch == lives[arrival.source.origin]
+    ]

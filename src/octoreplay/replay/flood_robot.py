@@ -8,16 +8,17 @@ the air where the consensus rules take one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Self
 
 import numpy as np
 
 from octoreplay.config import RunConfig
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import Float64Array
 from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder, Source
 from octoreplay.replay.public_map import PublicMap
-from octoreplay.replay.robot import Arrival, Robot
+from octoreplay.replay.robot import Arrival, Robot, Turn
 
 
 class FloodRobot(Robot):
@@ -45,9 +46,16 @@ class FloodRobot(Robot):
         sources = [source for source in sorted(held) if held[source].octree.num_bricks]
         return self.exchange.outbox(receivers, sources, keep_alive=False)
 
-    def iterate(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> float:
+    @classmethod
+    def iterate_team(
+        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
+    ) -> list[float]:
+        """Every robot sums up what it has."""
+        del factor, config
+        return list(threads.map(lambda turn: turn.robot.sum_up(turn.arrived, tick), turns))
+
+    def sum_up(self, arrived: Sequence[Arrival], tick: int) -> float:
         """Sum up what is there, where it changed; the largest change of a log-odds."""
-        del step_weights, factor
         self._update_log_likelihood(tick)
         changed = [self.changed_evidence(tick)]
         for source, held in arrived:

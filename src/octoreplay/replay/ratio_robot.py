@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Self
 
 from octoreplay.config import RunConfig
+from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
+from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import Float64Array
 from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder, Source
-from octoreplay.replay.robot import Arrival, Robot
+from octoreplay.replay.robot import Arrival, Robot, Turn
+
+REST = 8.0
+"""Units by which a map may be off: rounding moves masses by up to six in every tick for ever."""
+
+_HEADROOM = 4
+"""A mass stays below this many times the largest log-odds times the number of robots."""
 
 
 class RatioRobot(Robot):
@@ -21,7 +30,8 @@ class RatioRobot(Robot):
 
     def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
         super().__init__(index, config, num_classes, encoder, epoch)
-        self._mass = SemanticOctree(config.map.resolution, num_classes)
+        _check_range(config)
+        self.mass = SemanticOctree(config.map.resolution, num_classes)
         self._weight = running_sums.WHOLE_WEIGHT
         self._total = SemanticOctree(config.map.resolution, num_classes)
         self._total_weight = 0
@@ -36,7 +46,7 @@ class RatioRobot(Robot):
         self._pause(self._receivers.difference(receivers), tick)
         self._resume(frozenset(receivers).difference(self._receivers), tick)
         self._receivers = frozenset(receivers)
-        running_sums.share_out(self._mass, self._total, len(receivers), tick - 1)
+        running_sums.share_out(self.mass, self._total, len(receivers), tick - 1)
         share, self._weight = running_sums.share_weight(self._weight, len(receivers))
         self._total_weight += share if receivers else 0
         held = self.exchange.held
@@ -47,11 +57,19 @@ class RatioRobot(Robot):
             outgoing += self.exchange.outbox(group, [self.source], keep_alive=True)
         return outgoing
 
-    def iterate(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> float:
-        """Take in what the senders' sums grew by and the robot's own new evidence; the largest change of a log-odds."""
-        del step_weights, factor
-        self._update_log_likelihood(tick)
-        arrivals = []
+    @classmethod
+    def iterate_team(
+        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
+    ) -> list[float]:
+        """Every robot takes in what the sums that arrived grew by, and its own new evidence."""
+        del factor, config
+        masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
+        running_sums.team_take_in(masses, tick, threads)
+        return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
+
+    def growths(self, arrived: Sequence[Arrival]) -> list[running_sums.Arrival]:
+        """The newest sums that arrived, each with the one that was there before; their weights are taken in."""
+        growths: list[running_sums.Arrival] = []
         for source, new in sorted(dict(arrived).items()):
             old = self._taken.get(source)
             self._taken[source] = new
@@ -59,14 +77,23 @@ class RatioRobot(Robot):
                 # The shares that were sent to an earlier life are lost with it.
                 continue
             self._weight += new.weight - (old.weight if old else 0)
-            arrivals.append((new.octree, old.octree if old else None))
-        running_sums.take_in(self._mass, arrivals, tick)
+            growths.append((new.octree, old.octree if old else None))
+        return growths
+
+    def end_iteration(self, tick: int) -> float:
+        """Take in new evidence, and recover the map from the mass; the largest change of a log-odds."""
+        self._update_log_likelihood(tick)
         running_sums.add_evidence(
-            self._mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
+            self.mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
         )
+        if self._weight >= running_sums.LEAST_WEIGHT:
+            change = running_sums.recovered(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
+        else:
+            # Most of the mass is under way: what is left shows its rounding. New evidence is added to the last map.
+            step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
+            (change,) = team_step([step], rule="bayes", revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
-        change = running_sums.recovered(self._mass, self._weight, self.map, tick)
         self._prune()
         return change
 
@@ -96,4 +123,19 @@ class RatioRobot(Robot):
 
     def _octrees(self) -> list[SemanticOctree]:
         kept = [*self._offsets.values(), *self._paused.values(), *self._taken.values()]
-        return [*super()._octrees(), self._mass, self._total, *(held.octree for held in kept)]
+        return [*super()._octrees(), self.mass, self._total, *(held.octree for held in kept)]
+
+
+def _check_range(config: RunConfig) -> None:
+    """Refuse a team whose masses could become too large for the sums: raises ConfigError."""
+    sensor = config.sensor
+    numbers = [sensor.clamp_min, sensor.clamp_max]
+    if config.consensus.evidence != "sum":
+        numbers = [sensor.hit, sensor.miss, sensor.hit_other or 0.0]
+    most = running_sums.MAX_MASS * running_sums.UNIT / _HEADROOM / len(config.robots)
+    largest = max(abs(number) for number in numbers)
+    if largest > most:
+        raise ConfigError(
+            f"rule: 'ratio' holds log-odds of up to {most:.4g} for {len(config.robots)} robots, and this sensor model"
+            f" gives {largest:g}; lower clamp_min and clamp_max, or use rule 'flood'"
+        )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -29,6 +30,18 @@ class Arrival(NamedTuple):
 
     source: Source
     held: HeldMap
+
+
+RobotT = TypeVar("RobotT", bound="Robot", covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Turn(Generic[RobotT]):
+    """A robot's turn to iterate: what arrived, in order, and the 2 epsilon A_ij of its links, ``step_weights`` (N,)."""
+
+    robot: RobotT
+    arrived: Sequence[Arrival]
+    step_weights: Float64Array
 
 
 @dataclass(frozen=True)
@@ -166,11 +179,14 @@ class Robot(ABC):
 
     # --- iterations ---------------------------------------------------------------------------------------------------
 
+    @classmethod
     @abstractmethod
-    def iterate(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> float:
-        """One tick's iterations with what ``arrived``; returns the largest change of a log-odds.
+    def iterate_team(
+        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
+    ) -> list[float]:
+        """One tick's iterations of several robots; returns each one's largest change of a log-odds.
 
-        ``step_weights`` (N,) are the 2 epsilon A_ij of the robot's links, ``factor`` scales gamma.
+        ``factor`` scales gamma. The result does not depend on ``threads``.
         """
 
     def _change_since(self, before: SemanticOctree, tick: int) -> float:

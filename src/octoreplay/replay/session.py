@@ -19,7 +19,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.discover import resolve
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.io.robot_log import RobotLog
-from octoreplay.mapping.consensus import Evidence, sum_of_evidence, team_step
+from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.warm_up import second_compiler
@@ -40,7 +40,7 @@ from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.links import LinkCounts, Links
 from octoreplay.replay.ratio_robot import RatioRobot
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.robot import MapSizes, Publication, Robot
+from octoreplay.replay.robot import MapSizes, Publication, Robot, Turn
 from octoreplay.replay.settling import num_quiet_ticks, num_settle_ticks
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import FrameSource, Timeline
@@ -86,6 +86,8 @@ class Session:
         self._network = TeamNetwork(config.network, config.consensus, self._robot_ids)
         self._timeline = Timeline(sources)
         self._encoder = PacketEncoder(config.packet)
+        families: dict[str, type[Robot]] = {"flood": FloodRobot, "ratio": RatioRobot}
+        self._family = families.get(config.consensus.rule, ConsensusRobot)
         self._robots = [self._new_robot(index, 0) for index in range(len(self._robot_ids))]
         self._past_lives: list[Evidence] = []
         self._links: Links[Content] = Links(config)
@@ -150,9 +152,7 @@ class Session:
 
     def _new_robot(self, index: int, epoch: int) -> Robot:
         """A robot that knows nothing yet."""
-        families = {"flood": FloodRobot, "ratio": RatioRobot}
-        family = families.get(self.config.consensus.rule, ConsensusRobot)
-        return family(index, self.config, self._num_classes, self._encoder, epoch)
+        return self._family(index, self.config, self._num_classes, self._encoder, epoch)
 
     def _forget(self, after: float, until: float) -> None:
         """A robot that went off and forgets, in (after, until] seconds since the start, begins another life."""
@@ -247,22 +247,10 @@ class Session:
 
     def _iterate(self, graph: CommunicationGraph, factor: float, number: int) -> list[float]:
         """Every active robot's iterations with the maps that arrived; the largest changes."""
-        consensus = self.config.consensus
-        epsilon = step_size(graph, consensus)
-        step_weights = 2.0 * epsilon * graph.weights
+        step_weights = 2.0 * step_size(graph, self.config.consensus) * graph.weights
         robots = self._robots
-        arrived = {index: robots[index].take_arrivals() for index in graph.active}
-        # One iteration with all maps, also where none arrived; the others make one for each map.
-        together = {
-            i: r for i in graph.active if isinstance(r := robots[i], ConsensusRobot) and r.steps_with_team(arrived[i])
-        }
-        alone = [index for index in graph.active if index not in together]
-        steps = self._each(lambda i: together[i].next_step(arrived[i], step_weights[i], factor, number), together)
-        clamp = (self.config.sensor.clamp_min, self.config.sensor.clamp_max)
-        changes = team_step(steps, rule=consensus.rule, revision=number, clamp=clamp, threads=self._threads)
-        self._each(lambda i: together[i].end_step(number), together)
-        changes += self._each(lambda i: robots[i].iterate(arrived[i], step_weights[i], factor, number), alone)
-        return changes
+        turns = [Turn(robots[index], robots[index].take_arrivals(), step_weights[index]) for index in graph.active]
+        return self._family.iterate_team(turns, factor, number, self.config, self._threads)
 
     def _measure(
         self,

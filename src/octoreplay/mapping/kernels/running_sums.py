@@ -21,7 +21,7 @@ SIGN_SHIFT = np.int32(32 - NUM_BITS)
 UNITS_PER_LOG_ODDS = np.float32(1 << 17)
 
 TARGET, SOURCE = 0, 1
-"""Columns of the table: the octree whose layout the others take, and what it is made from."""
+"""Columns of a table with two: the octree whose layout the other takes, and what it is made from."""
 
 NUM_SCRATCH_BLOCKS = 3
 """Blocks that a kernel works in, one for each octree that may have another layout."""
@@ -48,10 +48,9 @@ def _integers(address, size):
 
 
 @inline_kernel
-def _prefetch_all(table, b):
-    """Ask for a brick that comes soon, in all octrees."""
-    for column in range(table.addresses.shape[0]):
-        prefetch(table, min(b + PREFETCH_AHEAD, table.known.shape[1] - 1), column)
+def _prefetch_ahead(table, b, column):
+    """Ask for a brick of an octree that comes soon."""
+    prefetch(table, min(b + PREFETCH_AHEAD, table.known.shape[1] - 1), column)
 
 
 @kernel
@@ -80,7 +79,8 @@ def share_out(table, layout, known, num_receivers, num_classes, scratch, shares)
     mass_scratch = np.int64(scratch.ctypes.data)
     total_scratch, unused_at = mass_scratch + room, mass_scratch + 2 * room
     for b in range(shares.size):
-        _prefetch_all(table, b)
+        _prefetch_ahead(table, b, SOURCE)
+        _prefetch_ahead(table, b, TARGET)
         shares[b] = 0
         if known[b] == 0:
             continue
@@ -118,30 +118,39 @@ def _add_rows(mass_at, new_at, old_at, size, of_evidence):
 
 
 @kernel
-def add_differences(table, of_evidence, layout, known, num_classes, scratch, is_changed):
-    """Add the differences of the table's columns 1 - 2, 3 - 4, ... to the mass in its TARGET, in place.
+def add_differences(
+    start, end, table, columns, first_columns, of_evidence, layouts, known, num_classes, scratch, is_changed
+):
+    """Add differences to the masses of R robots, brick by brick for all of them, in place.
 
-    They are running sums, or log-odds if ``of_evidence``. ``layout`` (n, W) and ``known`` (n,) are the mass's, which
-    hold those of all. ``is_changed`` (n,) float32 is 1 where a difference is not 0. What is one value is left in the
-    table.
+    ``table`` says where the bricks ``start`` to ``end`` lie. Robot r's ``columns`` of it are those from
+    ``first_columns[r]`` to ``first_columns[r + 1]``: its mass, then new, old, new, old, ..., which are running sums, or
+    log-odds if ``of_evidence``. ``layouts`` (R n, W) and ``known`` (R n,) are those of the masses, which hold those of
+    all the robot's columns. ``is_changed`` (R, n) float32 is 1 where a difference is not 0. What is one value is left
+    in the table.
     """
     room = (num_classes + 1) * BRICK_CELLS * 4
     mass_scratch = np.int64(scratch.ctypes.data)
     new_scratch, old_scratch = mass_scratch + room, mass_scratch + 2 * room
-    for b in range(is_changed.size):
-        _prefetch_all(table, b)
-        is_changed[b] = 0.0
-        if known[b] == 0:
-            continue
-        size = num_rows(known[b], layout, b) * OCTETS
-        mass_at = rows_at(table, b, TARGET, layout, known, b, mass_scratch, num_classes)
-        for column in range(SOURCE, table.addresses.shape[0], 2):
-            new_at = rows_at(table, b, column, layout, known, b, new_scratch, num_classes)
-            old_at = rows_at(table, b, column + 1, layout, known, b, old_scratch, num_classes)
-            if _add_rows(mass_at, new_at, old_at, size, of_evidence):
-                is_changed[b] = 1.0
-        if table.addresses[TARGET, b] == 0:
-            table.values[TARGET, b] = float_array(mass_at, (size,))[0]
+    robots, bricks = is_changed.shape
+    for b in range(start, end):
+        for column in range(table.addresses.shape[0]):
+            _prefetch_ahead(table, b, column)
+        for robot in range(robots):
+            m = robot * bricks + b
+            is_changed[robot, b] = 0.0
+            if known[m] == 0:
+                continue
+            size = num_rows(known[m], layouts, m) * OCTETS
+            own = columns[first_columns[robot]]
+            mass_at = rows_at(table, b, own, layouts, known, m, mass_scratch, num_classes)
+            for k in range(first_columns[robot] + 1, first_columns[robot + 1], 2):
+                new_at = rows_at(table, b, columns[k], layouts, known, m, new_scratch, num_classes)
+                old_at = rows_at(table, b, columns[k + 1], layouts, known, m, old_scratch, num_classes)
+                if _add_rows(mass_at, new_at, old_at, size, of_evidence):
+                    is_changed[robot, b] = 1.0
+            if table.addresses[own, b] == 0:
+                table.values[own, b] = float_array(mass_at, (size,))[0]
 
 
 @kernel
@@ -154,7 +163,8 @@ def recover(table, layout, known, scale, tolerance, num_classes, scratch, change
     room = (num_classes + 1) * BRICK_CELLS * 4
     map_scratch = np.int64(scratch.ctypes.data)
     for b in range(changes.size):
-        _prefetch_all(table, b)
+        _prefetch_ahead(table, b, SOURCE)
+        _prefetch_ahead(table, b, TARGET)
         changes[b] = 0.0
         if known[b] == 0:
             continue
