@@ -141,7 +141,7 @@ class ConsensusConfig:
     evidence: str = _parameter("sum", "reading of log q_i", choices=EVIDENCES)
     mode: str = _parameter("sync", "one iteration per tick, or one per arriving map", choices=MODES)
     epsilon: float | None = _parameter(
-        None, "consensus step size (default: 0.5; with preset paper min(0.5, 0.9 / lambda_max))", above=0.0
+        None, "consensus step size (default: 0.5, or 0.9 of the bound where that is less)", above=0.0
     )
     gamma: float = _parameter(0.5, "gradient step size", minimum=0.0)
     gamma_power: float = _parameter(0.0, "gamma_k = gamma / (1 + k / gamma_decay)^gamma_power", minimum=0.0)

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Self
 
+import numpy as np
+
 from octoreplay.config import RunConfig
 from octoreplay.mapping.consensus import Step, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
-from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder
+from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder, Source
 from octoreplay.replay.public_map import PublicMap
 from octoreplay.replay.robot import Arrival, Robot, Turn
 
@@ -25,6 +27,8 @@ class ConsensusRobot(Robot):
         self._clamp = (config.sensor.clamp_min, config.sensor.clamp_max)
         self._public = PublicMap(config, encoder, self.source)
         self._published: HeldMap | None = None
+        self._has_budget = config.packet.budget is not None
+        self._used: dict[Source, int] = {}
         self._last_step_tick = -1
         self._last_conditions: tuple[object, ...] = ()
         self._nothing = SemanticOctree(config.map.resolution, num_classes)
@@ -58,10 +62,8 @@ class ConsensusRobot(Robot):
         arrived = [newest[source] for source in sorted(newest)]
         self._update_log_likelihood(tick)
         gamma = factor * gamma_at(self._config.consensus, self.num_iterations)
-        base = None
-        if self._published is not None and self._published.version == tick and not self._public.is_exact:
-            # Differences of published maps keep the sum over robots, whatever publishing rounds away.
-            base = self._published.octree
+        # Differences of published maps keep the sum over robots, whatever publishing rounds away.
+        base = None if self._public.is_exact else self._published_octree(tick)
         # Bricks rest where the same step, with maps that changed nowhere since, changed nothing.
         conditions = (gamma, *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived))
         is_steady = conditions == self._last_conditions and all(held.version == tick for _, held in arrived)
@@ -72,7 +74,6 @@ class ConsensusRobot(Robot):
     def end_step(self, tick: int) -> None:
         """Take note of the iteration that ``next_step`` described."""
         self._finish_step(tick)
-        self._published = None
         self._prune()
 
     def iterate_on_arrival(
@@ -82,14 +83,13 @@ class ConsensusRobot(Robot):
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
         # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
-        base = self._published.octree if self._published is not None and self._rule == "bayes" else None
+        base = self._published_octree(tick) if self._rule == "bayes" else None
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
             team_step([step], rule=self._rule, revision=tick, clamp=self._clamp)
             self._finish_step(tick)
-        self._published = None
         self._prune()
         # What one arrival changes another may undo; what counts is the change over the tick.
         return self._change_since(before, tick)
@@ -99,13 +99,36 @@ class ConsensusRobot(Robot):
         since: int | None = None,
     ) -> Step:  # fmt: skip
         """An iteration with some neighbours' maps; bricks at rest ``since`` the last one are skipped."""
+        neighbours = [held.octree for _, held in arrived]
         if self._rule == "merge":
             base = self._nothing
+        elif base is not None and self._has_budget:
+            neighbours = [self._used_once(base, source, held) for source, held in arrived]
         return Step(
-            self.map, [held.octree for _, held in arrived],
+            self.map, neighbours,
             [float(step_weights[source.origin]) for source, _ in arrived], self._log_likelihood, gamma, base,
             self._last_log_likelihood, since,
         )  # fmt: skip
+
+    def _published_octree(self, tick: int) -> SemanticOctree | None:
+        """What the others know of this robot's map; None where they know nothing or, without budget, an older one."""
+        if self._published is None or (self._published.version < tick and not self._has_budget):
+            return None
+        return self._published.octree
+
+    def _used_once(self, own: SemanticOctree, source: Source, held: HeldMap) -> SemanticOctree:
+        """A neighbour's map, and this robot's ``own`` where neither has sent anything new since the last time.
+
+        Bricks that wait for the budget keep their difference for many ticks. Both ends use it once, when one of them
+        sends the brick anew: adding it again and again would never end.
+        """
+        since = self._used.get(source, 0)
+        self._used[source] = held.version
+        fresh = np.union1d(own.codes[own.revisions >= since], held.octree.codes[held.octree.revisions >= since])
+        mixed = SemanticOctree(own.resolution, own.num_classes)
+        mixed.overwrite(own, np.flatnonzero(~np.isin(own.codes, fresh)))
+        mixed.overwrite(held.octree, np.flatnonzero(np.isin(held.octree.codes, fresh)))
+        return mixed
 
     def _finish_step(self, tick: int) -> None:
         """Count an iteration, and keep the evidence that it used."""

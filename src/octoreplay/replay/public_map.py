@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from octoreplay.config import RunConfig
+from octoreplay.errors import ConfigError
+from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.kernels.storage import BRICK_CELLS
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, mask_bytes, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
@@ -31,6 +34,9 @@ class PublicMap:
         self._octree: SemanticOctree | None = None
         self._comparer = MapComparer(2, 0.0)
         self._filled = 0
+        self._bytes_per_brick = 100.0
+        if config.classes is not None and config.packet.budget is not None:
+            _check_budget(config.packet.budget, config.classes.num_classes)
 
     def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, num_shares: int = 1) -> HeldMap:
         """The next version of a map, whose bricks got their values in ``revisions`` (n,), all below ``version``.
@@ -70,16 +76,31 @@ class PublicMap:
         codes, distances = self._comparer.brick_distances
         # Cells that became known without any evidence, and bricks that the map does not have (yet).
         here, there = target.find(codes), public.find(codes)
-        is_new = (here >= 0) & (target.known[here] != np.where(there >= 0, public.known[there], 0))
+        known = np.zeros((2, codes.size), np.uint64)
+        for row, octree, indices in zip(known, (target, public), (here, there), strict=True):
+            row[indices >= 0] = octree.known[indices[indices >= 0]]
+        is_new = known[0] != known[1]
         waiting = np.flatnonzero((here >= 0) & (is_new | (distances > 0)))
         order = here[waiting[np.argsort(-distances[waiting], kind="stable")]]
-        best = 0
-        wanted = order.size
+        best, wanted = 0, self._guess(order.size, budget)
         for _ in range(FIT_TRIES):
             size = len(self._encoder.encode(self._source, HeldMap(target, version), version, order[:wanted]))
+            self._bytes_per_brick = size / max(wanted, 1)
             if size <= budget:
                 best = max(best, wanted)
-            if best == order.size or (size <= budget and size > 0.9 * budget):
+            if best == order.size or 0.9 * budget < size <= budget:
                 break
-            wanted = min(max(int(wanted * 0.95 * budget / size), best + 1), order.size)
+            wanted = max(self._guess(order.size, budget), best + 1)
         public.overwrite(target, order[:best], version - 1)
+
+    def _guess(self, num_bricks: int, budget: int) -> int:
+        """How many of some bricks may fit into a packet, by what the last packet's took."""
+        return min(int(0.95 * budget / self._bytes_per_brick), num_bricks)
+
+
+def _check_budget(budget: int, num_classes: int) -> None:
+    """Refuse a budget that some brick could not be sent with: raises ConfigError."""
+    # A value takes up to 4 bytes and its code; every class of every cell may have one.
+    least = codec.HEADER_BYTES + BRICK_CELLS * (5 * (num_classes + 1) + mask_bytes(num_classes)) + 128
+    if budget < least:
+        raise ConfigError(f"budget: {budget} bytes may be less than a single brick takes; give at least {least}")

@@ -14,6 +14,10 @@ QUIET_PROB = 1e-3
 """A link may be silent by chance for as long as settling has to be quiet with this probability."""
 
 
+BUDGET_TICKS = 100
+"""Ticks that a change may wait for the budget while a team settles."""
+
+
 def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
     """Ticks without any change after which a team has settled: 1 unless packets are lost or late.
 
@@ -39,6 +43,8 @@ def num_settle_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
         return most
     ramp = consensus.settle
     slower = _slowest(config) * (1 + _delay(list(links.values()), config))
+    if config.packet.budget is not None:
+        slower *= BUDGET_TICKS
     return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config) - 1
 
 
