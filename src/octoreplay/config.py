@@ -272,7 +272,7 @@ class PacketConfig:
         10, "deltas without acknowledgement: every so many packets a whole map", minimum=1
     )
     content: str = _parameter("float32", "numbers in packets", choices=("float32", "float16", "int8"))
-    int8_step: float = _parameter(0.05, "log-odds of one step of int8", above=0.0)
+    int8_step: float = _parameter(0.05, "log-odds of one step of int8", minimum=1e-6, maximum=1e6)
     top_classes: int | None = _parameter(
         None, "only so many of a cell's classes are sent, one value for the others (default: all)", minimum=1
     )

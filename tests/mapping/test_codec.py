@@ -354,15 +354,19 @@ def test_codes_and_literals_against_the_naive_ones_both_ways(numbers, width):
     assert again.tolist() == numbers.tolist()
 
 
+def _slot(value):
+    return max((int.from_bytes(struct.pack("<f", value), "little") * 2654435761 % 2**32) // 2**24, 1)
+
+
 def test_any_codes_are_read_as_the_format_says():
-    """A slot in which nothing stands holds 0; a literal enters its slot also where it stands there already."""
-    one, slot = struct.pack("<f", 1.0), max((0x3F800000 * 2654435761 % 2**32) // 2**24, 1)
-    codes = bytes([1, 255, 0, slot, 9, 0, slot, 0])
-    literals = b"".join(bytes(plane) for plane in zip(one, one, struct.pack("<f", 2.0), strict=True))
+    """A slot in which nothing stands holds 0; only literals enter a slot, also one in which they stand already."""
+    first = next(value for value in range(2, 10000) if _slot(value) == 1)  # in the slot of 0
+    codes = bytes([255, 0, 0, _slot(1.0), 0, 9, 1, _slot(1.0)])
+    literals = b"".join(bytes(plane) for plane in zip(*(struct.pack("<f", n) for n in (1.0, 1.0, first)), strict=True))
     packet = _compressed(_words(*CHAIN, 0xAAAA) + codes + literals, (19, 8, 0, 0))
     expected = {
         tuple(-LIMIT + (child >> axis & 1) for axis in range(3)): np.full(2, value, np.float32).tobytes()
-        for child, value in enumerate([0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 2.0])
+        for child, value in enumerate([0.0, 1.0, 1.0, 1.0, first, 0.0, first, 1.0])
     }
     assert cells_of(codec.decode_packet(packet)) == expected
 
@@ -502,6 +506,16 @@ def test_unknown_headers_are_refused(fields):
         codec.decode_packet(_forged(b"", **good | fields))
 
 
+def test_packets_of_other_versions_are_named_also_where_their_header_is_shorter():
+    with pytest.raises(PacketError, match="format version 2, this octoreplay reads version 3"):
+        codec.read_header(b"OCTM\x02" + bytes(39))
+    with pytest.raises(PacketError, match="cut: 67 bytes"):
+        codec.read_header(_forged(b"", counts=(0, 0, 0, 0))[:-1])
+    for data in (b"", b"OCT", b"OCTM", b"MTCO\x03" + bytes(63)):
+        with pytest.raises(PacketError, match="not a map packet"):
+            codec.read_header(data)
+
+
 def test_a_delta_goes_from_a_base_to_no_earlier_state():
     octree = octree_of({(0, 0, 0): [1.0, 2.0]})
     packet = _forged(b"", kind=1, map_version=(1, 0, 5, 5), counts=(0, 0, 0, 0))
@@ -611,6 +625,13 @@ def test_hostile_counts_take_no_memory(counts, compression, num_classes):
 def test_a_payload_that_unpacks_to_more_than_its_counts_is_refused(write_content_size):
     bomb = zstandard.ZstdCompressor(write_content_size=write_content_size).compress(bytes(100_000_000))
     _refused_without_memory(_forged(bomb, counts=(1, 1, 1, 1), compression=1))
+
+
+def test_a_frame_that_says_it_holds_more_than_it_can_takes_no_memory():
+    """A frame of one empty block, whose header names a gigabyte."""
+    frame = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**30) + b"\1\0\0"
+    assert zstandard.get_frame_parameters(frame).content_size == 2**30
+    _refused_without_memory(_forged(frame, counts=(0, 2**28, 0, 0), compression=1))
 
 
 def test_bytes_behind_the_compressed_payload_are_refused():

@@ -136,24 +136,29 @@ def test_a_quantised_map_holds_the_quantised_value_of_every_cell(cells, content,
     assert cells_of(octree) == before
 
 
+def test_bricks_that_are_one_value_are_quantised_too():
+    octree = octree_of(cube((0, 0, 0), 4, [0.8, 0.8]))
+    assert octree.bricks.blocks[0] < 0
+    assert set(cells_of(quantised(octree, "int8", 0.5)).values()) == {np.array([1.0, 1.0], np.float32).tobytes()}
+
+
 @pytest.mark.parametrize("content", ["float16", "int8"])
 def test_a_quantised_map_can_grow_where_the_map_had_unused_blocks(content):
     """The list of unused blocks is kept in their rows, whose values are none."""
-    octree = octree_of(cube((-8, -8, -8), 16, [1.0, 2.0]) | {(k, 0, 0): [k, 1.0] for k in range(-8, 8)})
-    one_value = octree_of(cube((-8, -8, -8), 16, [1.0, 1.0]))
+
+    def cells(x):
+        return cube((x, 0, 0), 8, [1.0, 2.0]) | {(x + k, k, 0): [1.5, k] for k in range(8)}
+
+    octree = octree_of(cells(0))
+    one_value = octree_of(cube((0, 0, 0), 8, [1.0, 1.0]))
     octree.overwrite(one_value, np.arange(one_value.num_bricks))
-    assert octree.bricks.counters[storage.NUM_FREE_ROWS] > 8
+    num_rows = octree.bricks.counters[storage.NUM_ROWS]
+    assert num_rows == octree.bricks.counters[storage.NUM_FREE_ROWS] > 0
     result = quantised(octree, content, 0.5)
-    later = octree_of({(k, j, 0): [k, j] for k in range(-8, 8) for j in range(-8, 8)} | {(40, 0, 0): [3.0, 4.0]})
+    # More blocks of each size than are unused.
+    later = octree_of(cells(0) | cells(8) | cells(64))
     result.overwrite(later, np.arange(later.num_bricks))
-    expected = cells_of(one_value)
-    codes = set(later.codes.tolist())
-    kept = {key: value for key, value in expected.items() if _brick(key) not in codes}
-    assert cells_of(result) == kept | cells_of(later)
-
-
-def _brick(key):
-    return int(storage.key_to_code(*key)) >> storage.CELL_BITS
+    assert cells_of(result) == cells_of(later)
 
 
 @pytest.mark.parametrize("content", ["float16", "int8"])

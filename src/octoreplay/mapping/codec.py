@@ -148,10 +148,13 @@ def pack(
 
 def read_header(data: bytes) -> PacketHeader:
     """The header of a packet whose checksum holds. Raises PacketError for anything else."""
-    if len(data) < HEADER_BYTES or data[:4] != MAGIC:
+    if data[:4] != MAGIC or len(data) == len(MAGIC):
         raise PacketError("not a map packet")
+    # Other versions have headers of other lengths.
     if data[4] != VERSION:
         raise PacketError(f"map packet of format version {data[4]}, this octoreplay reads version {VERSION}")
+    if len(data) < HEADER_BYTES:
+        raise PacketError(f"map packet cut: {len(data)} bytes, its header alone has {HEADER_BYTES}")
     _, _, kind, content, compression, resolution, weight, num_classes, origin, epoch, version, base, step, *sizes = (
         _HEADER.unpack_from(data)
     )

@@ -65,6 +65,9 @@ def _check_int8(content: str, step: float) -> None:
 def quantised(octree: SemanticOctree, content: str, step: float) -> SemanticOctree:
     """A copy in which every value is one that ``content`` can hold: what a receiver of such a packet has.
 
+    The number of a value is that of ``content_numbers``; the layout and the revisions stay, and equal leaves are merged
+    by the encoder.
+
     Raises ValueError as ``content_numbers`` does.
     """
     # A plain copy would keep unused blocks, whose rows hold no values but the list of them.

@@ -6,6 +6,9 @@ which all cells are known and only cell 0 starts a leaf is that one leaf.
 
 A vector leaf is one value and a mask of the classes with another one. The value is the one that most classes have (the
 lowest such class's where several have as many), so that equal maps are equal streams, however they are stored.
+
+Before they are compressed numbers become codes of one byte: the slot in which a recent number stands, or 0 for a new
+one, a literal.
 """
 
 from __future__ import annotations
