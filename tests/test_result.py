@@ -146,5 +146,5 @@ def test_a_map_that_cannot_be_read_is_named_with_its_file(tmp_path: Path) -> Non
     with open_result(path) as opened, pytest.raises(PacketError) as caught:
         opened.map("alpha")
     assert str(caught.value) == (
-        f"{path}: robot 'alpha': map packet of format version 1, this octoreplay reads version 2; run the logs again"
+        f"{path}: robot 'alpha': map packet of format version 1, this octoreplay reads version 3; run the logs again"
     )

@@ -104,16 +104,14 @@ def test_sharing_out_is_that_of_the_twin(seed, num_receivers, is_first):
     rng = np.random.default_rng(seed)
     masses, totals = _random_cells(rng), {} if is_first else _random_cells(rng)
     mass, total = _mass(masses), _mass(totals)
-    largest = share_out(mass, total, num_receivers, 7)
+    share_out(mass, total, num_receivers, 7)
     if num_receivers == 0:
         _assert_equal(_units(mass), masses)
         _assert_equal(_units(total), totals)
-        assert largest == 0
         return
     shares = {key: ratio.share_of(value, num_receivers) for key, value in masses.items()}
     _assert_equal(_units(mass), _sum((1, masses), (-num_receivers, shares)))
     _assert_equal(_units(total), _sum((1, totals), (1, shares)))
-    assert largest == max((int(abs(share).max()) for share in shares.values()), default=0)
     assert _revised(total, 7) == _changed_bricks(totals, _units(total))
 
 
@@ -343,7 +341,7 @@ class Robot:
 
     def __init__(self):
         self.mass, self.total, self.map = (_octree({}) for _ in range(3))
-        self.weight, self.total_weight, self.reach = WHOLE_WEIGHT, 0, 0
+        self.weight, self.total_weight = WHOLE_WEIGHT, 0
         self.evidence, self.last_evidence = _octree({}), _octree({})
         self.heard = {}
         self.twin = RatioRobot((len(KEYS), NUM_CLASSES))
@@ -355,7 +353,7 @@ class Robot:
         self.twin.observe(log_odds)
 
     def share_out(self, num_receivers):
-        self.reach += share_out(self.mass, self.total, num_receivers, 0)
+        share_out(self.mass, self.total, num_receivers, 0)
         share, self.weight = share_weight(self.weight, num_receivers)
         self.total_weight += share
         self.twin.share_out(num_receivers)
@@ -422,9 +420,7 @@ def test_nothing_is_lost_over_links_that_lose_delay_repeat_and_reorder(seed):
             if rng.random() < 0.3:
                 robot.observe(np.clip(rng.normal(size=(len(KEYS), NUM_CLASSES)) * 4, -5, 5).astype(np.float32))
         for sender, robot in enumerate(robots):
-            before = robot.twin.total, robot.reach
             robot.share_out(len(receivers[sender]))
-            assert abs(robot.twin.total - before[0]).max() == robot.reach - before[1]
             for receiver in receivers[sender]:
                 copies = rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])
                 packets += [(tick + rng.integers(0, 4), tick, sender, receiver, robot.sums()) for _ in range(copies)]
