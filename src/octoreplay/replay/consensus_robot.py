@@ -35,7 +35,7 @@ class ConsensusRobot(Robot):
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """The robot's map, for its neighbours; an empty packet where nothing changed says that it is still there."""
-        self._published = self._public.advance(self.map, self.map.revisions, tick)
+        self._published = self._public.advance(self.map, self.map.revisions, tick, streams=self.streams)
         self.exchange.held[self.source] = self._published
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 

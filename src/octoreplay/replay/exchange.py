@@ -23,7 +23,7 @@ from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
 from octoreplay.mapping.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
 from octoreplay.mapping.codec import MapVersion, PacketFormat
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams
 
 NOTHING = 0
 """The base of a delta that builds on nothing; versions are greater."""
@@ -40,12 +40,14 @@ class Source(NamedTuple):
 class HeldMap:
     """A state of a robot's map, at the robot itself or at another; never changed once it is here.
 
-    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio'.
+    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio',
+    ``streams`` are those of the octree where they are there already.
     """
 
     octree: SemanticOctree
     version: int
     weight: int = 0
+    streams: TreeStreams | None = None
 
 
 def _with_flipped_bit(data: bytes, place: int) -> bytes:
@@ -133,7 +135,7 @@ class PacketEncoder:
     """The team's packets: each is made once, however many robots send it to however many others."""
 
     def __init__(self, config: PacketConfig) -> None:
-        self.format = PacketFormat(
+        self._format = PacketFormat(
             content=config.content,
             step=config.int8_step,
             zstd_level=config.zstd_level if config.packet_compression == "zstd" else None,
@@ -153,10 +155,10 @@ class PacketEncoder:
         """A packet made anew; with ``indices`` (n,) it holds those bricks in place of all that changed."""
         version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
         if base is None:
-            return codec.encode_packet(held.octree, packet_format=self.format, map_version=version)
+            return codec.pack(held.octree, held.streams or held.octree.streams(), codec.FULL, self._format, version)
         if indices is None:
             indices = np.flatnonzero(held.octree.revisions >= base)
-        return codec.encode_delta(held.octree, indices, packet_format=self.format, map_version=version)
+        return codec.encode_delta(held.octree, indices, packet_format=self._format, map_version=version)
 
     def end_tick(self) -> None:
         """Forget the packets that nobody sent in this tick."""
@@ -176,6 +178,7 @@ class Exchange:
         self._encoder = encoder
         self._known: dict[tuple[int, Source], int] = {}
         self._num_sent: dict[int, int] = {}
+        self._epochs: dict[int, int] = {}
 
     def outbox(
         self, receivers: Sequence[int], sources: Sequence[Source], *, keep_alive: bool
@@ -224,6 +227,10 @@ class Exchange:
             except PacketError:
                 receipt.num_damaged += 1
                 continue
+            if source.origin == sender and source.epoch > self._epochs.get(sender, 0):
+                # The sender started anew, and has nothing of what it had.
+                self._epochs[sender] = source.epoch
+                self._known = {key: known for key, known in self._known.items() if key[0] != sender}
             # Who sends a state has it.
             self._learn(sender, source, version)
             held = self.held.get(source)

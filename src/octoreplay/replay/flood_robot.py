@@ -40,11 +40,10 @@ class FloodRobot(Robot):
         evidence = self._log_likelihood
         if self._is_behind(mine):
             # A scan of this tick is in before it is published: what changed after the last version is newer by one.
-            new = self._public.advance(evidence, evidence.revisions - 1, tick, max(len(held), 1))
+            new = self._public.advance(evidence, evidence.revisions - 1, tick, num_shares=max(len(held), 1))
             if mine is None or (new.octree.revisions >= mine.version).any():
                 held[self.source] = new
-        sources = [source for source in sorted(held) if held[source].octree.num_bricks]
-        return self.exchange.outbox(receivers, sources, keep_alive=False)
+        return self.exchange.outbox(receivers, sorted(held), keep_alive=False)
 
     @classmethod
     def iterate_team(

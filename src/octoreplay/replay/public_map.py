@@ -10,7 +10,7 @@ from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.kernels.storage import BRICK_CELLS
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, mask_bytes, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
@@ -38,15 +38,23 @@ class PublicMap:
         if config.classes is not None and config.packet.budget is not None:
             _check_budget(config.packet.budget, config.classes.num_classes)
 
-    def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, num_shares: int = 1) -> HeldMap:
+    def advance(
+        self,
+        octree: SemanticOctree,
+        revisions: Int64Array,
+        version: int,
+        *,
+        streams: TreeStreams | None = None,
+        num_shares: int = 1,
+    ) -> HeldMap:
         """The next version of a map, whose bricks got their values in ``revisions`` (n,), all below ``version``.
 
-        ``num_shares`` maps share the budget.
+        ``streams`` are the map's, where they are there already; ``num_shares`` maps share the budget.
         """
         octree = octree.copy()
         octree.revisions[:] = revisions
         if self.is_exact:
-            return HeldMap(octree, version)
+            return HeldMap(octree, version, streams=streams)
         target = self._rounded(octree)
         if self._octree is None:
             self._octree = SemanticOctree(octree.resolution, octree.num_classes)
