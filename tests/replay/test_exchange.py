@@ -21,7 +21,7 @@ from octoreplay.replay.exchange import (
     Receipt,
     Source,
 )
-from octree_factory import cells_of, octree_of
+from octree_factory import octree_of
 
 NUM_BRICKS = 6
 
@@ -34,6 +34,11 @@ CONFIGS = {
     "broadcast, key frames": PacketConfig(packets="delta", cast="broadcast", acknowledge=False, key_frame_every=3),
     "not compressed": PacketConfig(packets="delta", packet_compression="none"),
 }
+
+
+def _content(octree):
+    """Equal for equal maps, however they are stored: packets are canonical."""
+    return codec.encode_packet(octree)
 
 
 class Author:
@@ -55,7 +60,7 @@ class Author:
         changed = octree_of({key: v for key, v in self._cells.items() if key[0] // 4 in bricks})
         self._octree.overwrite(changed, np.arange(changed.num_bricks), tick - 1)
         self.exchange.held[self.source] = HeldMap(self._octree.copy(), tick)
-        self.versions[tick] = cells_of(self._octree)
+        self.versions[tick] = _content(self._octree)
 
 
 def _decoding(message):
@@ -67,7 +72,7 @@ def _check_held(robots):
     """Everything that anybody has is what its author had in that version."""
     for robot in robots:
         for source, held in robot.exchange.held.items():
-            assert cells_of(held.octree) == robots[source.origin].versions[held.version]
+            assert _content(held.octree) == robots[source.origin].versions[held.version]
             assert (held.octree.revisions < held.version).all()
 
 
@@ -122,7 +127,7 @@ TRIANGLE = [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)]
 CHAIN = [(0, 1), (1, 0), (1, 2), (2, 1)]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("decodes", [True, False])
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_map_that_arrived_is_always_one_that_was_published(name, decodes, seed):
@@ -134,14 +139,14 @@ def test_a_map_that_arrived_is_always_one_that_was_published(name, decodes, seed
     assert sum(receipt.num_damaged for receipt in receipts.values()) > 0
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("decodes", [True, False])
 @pytest.mark.parametrize("name", CONFIGS)
 def test_forwarded_maps_come_through_whole(name, decodes, seed):
     robots, _ = _run(CONFIGS[name], seed=seed, num_robots=3, links=CHAIN, decodes=decodes, forwards=True)
     for robot in robots:
         for other in robots:
-            assert cells_of(robot.exchange.held[other.source].octree) == other.versions[40]
+            assert _content(robot.exchange.held[other.source].octree) == other.versions[40]
 
 
 def test_without_acknowledgement_a_loss_is_a_gap_until_the_next_whole_map():
@@ -214,7 +219,7 @@ def test_a_damaged_acknowledgement_is_dropped():
 BUDGET = dataclasses.replace(DELTA, budget=512)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("cast", ["unicast", "broadcast"])
 def test_within_a_budget_everything_arrives_later(seed, cast):
     """A receiver that comes late to a map of many versions gets it version by version, in packets that fit."""
@@ -250,9 +255,9 @@ def test_within_a_budget_everything_arrives_later(seed, cast):
                 there = held.octree.find(octree.codes[settled])
                 assert (there >= 0).all()
                 actual.overwrite(held.octree, there)
-                assert cells_of(actual) == cells_of(expected)
+                assert _content(actual) == _content(expected)
     for receiver in receivers.values():
-        assert cells_of(receiver.held[source].octree) == cells_of(octree)
+        assert _content(receiver.held[source].octree) == _content(octree)
 
 
 def test_a_budget_goes_with_acknowledged_deltas():
