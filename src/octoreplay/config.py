@@ -258,7 +258,23 @@ class LinkConfig:
     def mean_loss(self) -> float:
         """Share of the packets that do not arrive whole, over a long time and without rate limit."""
         in_burst = self.burst_start / (self.burst_start + self.burst_end)
-        loss = self.loss + in_burst * (self.burst_loss - self.loss)
+        return (1.0 - in_burst) * self._missing(self.loss) + in_burst * self._missing(self.burst_loss)
+
+    @property
+    def repeated_loss(self) -> float:
+        """The factor by which one more packet lost in a row is rarer than one less, in long rows.
+
+        The largest eigenvalue of the two states' transitions, each times the loss in the state that it leads to.
+        """
+        good, bad = self._missing(self.loss), self._missing(self.burst_loss)
+        if self.burst_start == 0.0:
+            return good
+        stay_good, stay_bad = (1.0 - self.burst_start) * good, (1.0 - self.burst_end) * bad
+        change = self.burst_start * bad * self.burst_end * good
+        return (stay_good + stay_bad + math.sqrt((stay_good - stay_bad) ** 2 + 4.0 * change)) / 2.0
+
+    def _missing(self, loss: float) -> float:
+        """Share of the packets that are lost or damaged."""
         return 1.0 - (1.0 - loss) * (1.0 - self.corruption)
 
 

@@ -24,7 +24,7 @@ def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
     So many that a link on which every packet was lost in all of them is one in a thousand.
     """
     links = [link for link in _link_configs(graph, config).values() if link.mean_loss < 1.0]
-    num_losses = max((_num_losses(link.mean_loss) for link in links), default=1)
+    num_losses = max((_num_losses(link.repeated_loss) for link in links), default=1)
     return num_losses * _slowest(config) + _delay(links, config)
 
 
@@ -55,7 +55,7 @@ def _link_configs(graph: CommunicationGraph, config: RunConfig) -> dict[tuple[in
 
 
 def _num_losses(loss: float) -> int:
-    """Losses in a row that are as rare as QUIET_PROB."""
+    """Losses in a row, each so likely after the one before, that are as rare as QUIET_PROB."""
     return 1 if loss <= 0.0 else max(1, math.ceil(math.log(QUIET_PROB) / math.log(loss)))
 
 
