@@ -195,6 +195,106 @@ def test_bad_usage_is_one_sentence_and_a_code(
     assert list(tmp_path.iterdir()) == []
 
 
+HUSKIES = "husky_1:husky_2"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--one-way", "husky_1:spot"], "one_way: robot 'spot' is not in the team: husky_1, husky_2"),
+        (["--one-way", "husky_1"], "one_way: 'husky_1' is not A:B"),
+        (["--one-way", f"{HUSKIES}:0.5"], "one_way: 'husky_1:husky_2:0.5' is not A:B"),
+        (["--edges", f"{HUSKIES}:-0.5"], "edges: the weight of husky_1 - husky_2 must be a finite number from 0 on"),
+        (["--edges", f"{HUSKIES}:1.5"], "edges: the weights of robot 'husky_1' sum to 1.5; lower them to at most 1"),
+        (["--epsilon", "1.5"], r"epsilon: 1.5 is not below 1, the bound of this .*; use 0.9 or leave epsilon out"),
+        (["--jitter", "0.5", "--latency", "0.2"], "jitter: 0.5 is above latency 0.2; a delay cannot be negative"),
+        (["--budget", "5000"], "budget: goes with packets 'delta'; a whole map cannot be sent in parts"),
+        (["--budget", "5000", "--packets", "delta", "--no-acknowledge"], "budget: goes with acknowledge"),
+        (["--budget", "300", "--packets", "delta"], r"budget: 300 bytes may not hold one brick .* give at least \d+"),
+        (["--rule", "ratio", "--content", "int8"], "rule: 'ratio' sends running sums.* use packets 'full', content"),
+        (["--rule", "ratio", "--packets", "delta"], "rule: 'ratio' sends running sums.* use packets 'full', content"),
+        (["--rule", "flood", "--mode", "on-arrival"], "mode: rule 'flood' adds up .* use mode 'sync'"),
+        (["--rule", "flood", "--preset", "paper"], "mode: rule 'flood' adds up .* use mode 'sync'"),
+        (["--top-classes", "0"], "top_classes: 0 is below the least value 1"),
+        (["--loss", "1.5"], "loss: 1.5 is above the largest value 1"),
+        (["--corruption", "-0.1"], "corruption: -0.1 is below the least value 0"),
+        (["--burst-start", "nan"], "burst_start: nan is not a finite number"),
+        (["--schedule", "none.yaml"], r"none\.yaml: cannot be read: No such file"),
+        (["--schedule", FIXTURES], "fixtures: cannot be read: Is a directory"),
+        (["--schedule", FIXTURES / "pair" / "husky_1.mcap"], r"husky_1\.mcap: not a schedule file \(no UTF-8 text\)"),
+        (["--schedule", PAIR], r"team\.yaml: schedule: expects a list of entries, each with 'from'"),
+    ],
+)  # fmt: skip
+def test_what_the_network_cannot_do_is_one_sentence_and_nothing_is_written(
+    arguments: list[object], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert cli._exit_code([str(a) for a in ("run", PAIR, "-o", "x.mcap", *arguments)]) == 2
+    captured = capsys.readouterr()
+    assert re.search(sentence, captured.err), captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("entries", "sentence"),
+    [
+        ("- {from: 1, to: 5, robots_off: [husky_1]}\n- {from: 3, robots_off: [husky_1]}",
+         r"robot 'husky_1' is in it twice at 3 s \(from 1 s to 5 s, and from 3 s on\); end the one before"),
+        ("- {from: 1, links_down: [[husky_1, husky_2]], links_up: [[husky_2, husky_1]]}", "is in it twice at 1 s"),
+        ("- {from: 1}", "the entry from 1 s on says nothing; give it groups, links_down"),
+        ("- {from: 1, robots_off: [spot]}", "schedule: robot 'spot' is not in the team: husky_1, husky_2"),
+        ("- {from: 1, robot_off: [husky_1]}", r"schedule\.yaml: schedule: robot_off: unknown key; did you mean"),
+        ("- {from: 1\n", r"schedule\.yaml: not valid YAML \(line 2\)"), ("", "expects a list of entries"),
+        ("- {from: 5, to: 1, robots_off: [husky_1]}", "from 5 s to 1 s; 'from' must be first"),
+    ],
+)  # fmt: skip
+def test_a_bad_schedule_is_one_sentence_and_nothing_is_written(
+    entries: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "schedule.yaml"
+    path.write_text(entries)
+    arguments = ["run", str(PAIR), "-o", str(tmp_path / "x.mcap"), "--schedule", str(path)]
+    assert cli._exit_code(arguments) == 2
+    captured = capsys.readouterr()
+    assert re.search(sentence, captured.err), captured.err
+    assert captured.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_step_beyond_the_bound_of_a_graph_of_the_schedule_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three robots that all hear each other stand steps up to 2/3; the line that is left of them up to 1/2."""
+    path = tmp_path / "schedule.yaml"
+    path.write_text("- {from: 2, links_down: [[husky_1, husky_3]]}")
+    team = FIXTURES / "trio" / "team.yaml"
+    arguments = ["run", str(team), "-o", str(tmp_path / "x.mcap"), "--weights", "degree"]
+    arguments += ["--epsilon", "0.6", "--schedule", str(path)]
+    assert cli._exit_code(arguments) == 2
+    captured = capsys.readouterr()
+    assert re.search(r"schedule: at 2 s: epsilon: 0\.6 is not below 0\.5,.*; use 0\.45 or leave", captured.err), (
+        captured.err
+    )
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_team_file_with_every_kind_of_fault_runs(tmp_path: Path) -> None:
+    (tmp_path / "team.yaml").write_text(
+        PAIR.read_text().replace("log: ", f"publish_period: 1.0, log: {PAIR.parent}/")
+        + "rule: flood\npackets: delta\ntopology: line\npublish_period: 0.5\nlatency: 0.2\njitter: 0.1\nloss: 0.2\n"
+        + "links: [{from: husky_1, to: husky_2, corruption: 0.3}]\n"
+        + "schedule: [{from: 1, to: 2, robots_off: [husky_2], forget: true}]\n"
+    )
+    done = octoreplay("run", tmp_path / "team.yaml", "-o", tmp_path / "x.mcap")
+    assert done.returncode == 0, done.stderr
+    with open_result(tmp_path / "x.mcap") as opened:
+        assert opened.summary.last.robots[0].agreement > 0.9
+        assert sum(link.num_lost for link in opened.summary.links) > 0
+
+
 # --- the whole way ----------------------------------------------------------------------------------------------------
 
 

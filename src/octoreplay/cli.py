@@ -441,10 +441,18 @@ def _with_network(config: RunConfig, one_way: str | None, schedule: Path | None)
 
     changes: dict[str, Any] = {}
     if one_way is not None:
-        changes["one_way"] = tuple((a, b) for a, b, _ in _links(one_way))
+        changes["one_way"] = tuple(_pair(entry) for entry in one_way.split(","))
     if schedule is not None:
         changes["schedule"] = load_schedule(schedule)
     return dataclasses.replace(config, network=dataclasses.replace(config.network, **changes))
+
+
+def _pair(text: str) -> tuple[str, str]:
+    """A one-way link from A:B."""
+    sender, _, receiver = text.strip().partition(":")
+    if not sender or not receiver or ":" in receiver:
+        raise ConfigError(f"one_way: '{text}' is not A:B")
+    return sender, receiver
 
 
 def _links(text: str) -> tuple[tuple[str, str, float | None], ...]:

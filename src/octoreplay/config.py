@@ -435,11 +435,16 @@ class RunConfig:
             if robot_id not in seen:
                 raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
         for sender, receiver, _ in self.link_overrides:
-            self.link_config(sender, receiver)
+            if sender == receiver:
+                raise ConfigError(f"links: '{sender}' cannot have a link to itself")
+            try:
+                self.link_config(sender, receiver)
+            except ConfigError as error:
+                raise ConfigError(f"links: {sender} -> {receiver}: {error}") from error
         for robot in self.robots:
             for name, value in (("publish_period", robot.publish_period), ("publish_phase", robot.publish_phase)):
                 ticks = (value or 0.0) / self.network.publish_period
-                if abs(ticks - round(ticks)) > 1e-6:
+                if abs(ticks - round(ticks)) > 1e-6 or (value and round(ticks) == 0):
                     raise ConfigError(
                         f"robot '{robot.robot_id}': {name} {value:g} s is not a multiple of the team's publish_period"
                         f" {self.network.publish_period:g} s, the length of a tick"
@@ -456,16 +461,20 @@ class RunConfig:
 
         Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.
         """
-        changes: dict[str, dict[str, Any]] = {}
-        for name, value in values.items():
-            parameter = PARAMETERS.get(name)
-            if parameter is None:
-                raise ConfigError(f"{name}: unknown parameter{_suggestion(name, PARAMETERS)}")
-            changes.setdefault(parameter.section, {})[name] = parameter.coerce(value)
-        sections = {
-            section: dataclasses.replace(getattr(self, section), **fields) for section, fields in changes.items()
-        }
+        changes = _coerced(values)
+        sections = {name: dataclasses.replace(getattr(self, name), **fields) for name, fields in changes.items()}
         return dataclasses.replace(self, **sections)
+
+
+def _coerced(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Flat parameters in their types, by section. Raises ConfigError for an unknown name and a wrong type."""
+    changes: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        parameter = PARAMETERS.get(name)
+        if parameter is None:
+            raise ConfigError(f"{name}: unknown parameter{_suggestion(name, PARAMETERS)}")
+        changes.setdefault(parameter.section, {})[name] = parameter.coerce(value)
+    return changes
 
 
 def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
@@ -647,17 +656,20 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
     classes = None
     if content.get("classes") is not None:
         classes = class_table(content["classes"], content.get("ignored_raw_labels") or ())
-    parameters = {key: value for key, value in content.items() if key in PARAMETERS}
-    network = {key: parameters.pop(key) for key in ("topology", "weights") if key in parameters}
-    config = RunConfig(robots=robots, classes=classes).with_parameters(parameters)
-    section = dataclasses.replace(
-        config.network,
+    changes = _coerced({key: value for key, value in content.items() if key in PARAMETERS})
+    changes.setdefault("network", {}).update(
         edges=_edges(content.get("edges") or ()),
         one_way=_pairs("one_way", content.get("one_way") or ()),
         schedule=schedule(content.get("schedule") or ()),
-        **{key: PARAMETERS[key].coerce(value) for key, value in network.items()},
     )
-    return dataclasses.replace(config, network=section, link_overrides=_link_overrides(content.get("links") or ()))
+    # All at once: what one parameter may be depends on others.
+    defaults = {item.name: item.default for item in dataclasses.fields(RunConfig)}
+    return RunConfig(
+        robots=robots,
+        classes=classes,
+        link_overrides=_link_overrides(content.get("links") or ()),
+        **{name: dataclasses.replace(cast("Any", defaults[name]), **fields) for name, fields in changes.items()},
+    )
 
 
 def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
@@ -762,15 +774,22 @@ def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any]
         raise ConfigError("links: expects a list of links, each with 'from' and 'to' or 'between', and what differs")
     found = []
     for entry in entries:
-        if not isinstance(entry, Mapping) or ("between" in entry) == ("from" in entry and "to" in entry):
+        named = {"between", "from", "to"}.intersection(entry) if isinstance(entry, Mapping) else set()
+        if named not in ({"between"}, {"from", "to"}):
             raise ConfigError("links: every link names 'from' and 'to', or 'between' two robots for both directions")
         changes = {key: value for key, value in entry.items() if key not in ("between", "from", "to")}
         for key in changes:
             if key not in _LINK_KEYS:
                 raise ConfigError(f"links: {key}: unknown key{_suggestion(str(key), _LINK_KEYS)}")
-        values = tuple((key, PARAMETERS[key].coerce(value)) for key, value in changes.items())
+        try:
+            values = tuple((key, PARAMETERS[key].coerce(value)) for key, value in changes.items())
+        except ConfigError as error:
+            raise ConfigError(f"links: {error}") from error
         if "between" in entry:
-            ((a, b),) = _pairs("links: between", [entry["between"]])
+            pair = entry["between"]
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise ConfigError(f"links: between: expects [robot, robot], got {pair!r}")
+            a, b = (str(robot_id) for robot_id in pair)
             found += [(a, b, values), (b, a, values)]
         else:
             found.append((str(entry["from"]), str(entry["to"]), values))

@@ -46,6 +46,13 @@ def bayes_step(mixed: Float64Array, now: Float64Array, at_last_iteration: Float6
     return free_is_zero(mixed + (now - at_last_iteration))
 
 
+def merge_step(
+    mixed: Float64Array, now: Float64Array, at_last_iteration: Float64Array, clamp_min: float, clamp_max: float
+) -> Float64Array:
+    """h~ + (s now - s at the last iteration), clamped; h~ = h_i + 2 epsilon sum_j A_ij h_j."""
+    return np.clip(bayes_step(mixed, now, at_last_iteration), clamp_min, clamp_max)
+
+
 def free_is_zero(log_odds: Float64Array) -> Float64Array:
     """h[0] = 0, in a copy. Alg. 1, line 13."""
     result = log_odds.copy()

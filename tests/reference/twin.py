@@ -259,17 +259,22 @@ class Twin:
         consensus = self.config.consensus
         senders = [] if consensus.rule == "local" else team.neighbours(robot)
         if consensus.mode == "sync" or not senders:
-            differences = [(team.weights[robot, j], published[j] - published[robot]) for j in senders]
+            base = self._base(published[robot])
+            differences = [(team.weights[robot, j], published[j] - base) for j in senders]
             self._iterate(robot, differences, team.epsilon, gamma_factor)
         else:
             per_arrival = gamma_factor / len(senders) if consensus.gamma_per_arrival == "divided" else gamma_factor
             for j in senders:
                 # 'bayes' keeps the sum over robots only if both ends of a link add and subtract the same difference.
-                own = published[robot] if consensus.rule == "bayes" else self.maps[robot]
+                own = self._base(published[robot] if consensus.rule == "bayes" else self.maps[robot])
                 self._iterate(robot, [(team.weights[robot, j], published[j] - own)], team.epsilon, per_arrival)
         self.known[robot] |= self.touched[robot]
         for j in senders:
             self.known[robot] |= published_known[j]
+
+    def _base(self, own: Float64Array) -> Float64Array:
+        """What a neighbour's map is compared with: the robot's own; 'merge' adds the neighbour's map itself."""
+        return np.zeros_like(own) if self.config.consensus.rule == "merge" else own
 
     def _iterate(
         self, robot: int, differences: list[tuple[float, Float64Array]], epsilon: float, gamma_factor: float
@@ -286,6 +291,11 @@ class Twin:
             self.maps[robot] = rules.natural_step(mixed, log_q, gamma)
         elif consensus.rule == "bayes":
             self.maps[robot] = rules.bayes_step(mixed, log_q, self.log_q_used[robot])
+        elif consensus.rule == "merge":
+            sensor = self.config.sensor
+            self.maps[robot] = rules.merge_step(
+                mixed, log_q, self.log_q_used[robot], sensor.clamp_min, sensor.clamp_max
+            )
         else:
             self.maps[robot] = log_q
         self.log_q_used[robot] = log_q

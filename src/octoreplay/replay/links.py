@@ -75,7 +75,10 @@ class _Link(Generic[T]):
 
 
 class Links(Generic[T]):
-    """All links of a team, between robots given by their indices. Times are of the shared clock [ns]."""
+    """All links of a team, between robots given by their indices. Times are of the shared clock [ns].
+
+    ``longest_transmission`` is the longest time [s] that a packet kept a link with a rate busy.
+    """
 
     def __init__(self, config: RunConfig) -> None:
         self._config = config
@@ -83,6 +86,7 @@ class Links(Generic[T]):
         self._links: dict[tuple[int, int], _Link[T]] = {}
         self._on_air: list[tuple[int, int, int, int, Delivery[T]]] = []
         self._num_started = 0
+        self.longest_transmission = 0.0
 
     def send(self, sender: int, receiver: int, content: T, now_ns: int) -> None:
         """Hand something to a link. It is on its way, in the link's queue, or gone."""
@@ -156,7 +160,9 @@ class Links(Generic[T]):
         config = link.config
         turn, loss, delay, corruption, place = link.random.random(5)
         if config.rate is not None and content.waits:
-            link.busy_until_ns = start_ns + round(content.num_bytes / config.rate * 1e9)
+            seconds = content.num_bytes / config.rate
+            self.longest_transmission = max(self.longest_transmission, seconds)
+            link.busy_until_ns = start_ns + round(seconds * 1e9)
             start_ns = link.busy_until_ns
         link.in_burst = turn >= config.burst_end if link.in_burst else turn < config.burst_start
         if loss < (config.burst_loss if link.in_burst else config.loss):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoreplay.config import RunConfig
-from octoreplay.errors import ConfigError
+from octoreplay.config import PacketConfig, RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, team_step
-from octoreplay.mapping.kernels.storage import BRICK_CELLS
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
@@ -17,6 +16,17 @@ from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
 
 FIT_TRIES = 6
 """Packets that are encoded at most to find one that fits the budget."""
+
+
+ZSTD_FRAME_BYTES = 64
+"""More than zstd adds to parts that it cannot compress."""
+
+
+def least_budget(packet: PacketConfig, num_classes: int) -> int:
+    """Bytes in which any brick fits into a packet of its own: header, words, masks, and every value with its code."""
+    number_bytes = {"float32": 5, "float16": 3, "int8": 1}[packet.content]
+    per_cell = number_bytes * (num_classes + 1) + mask_bytes(num_classes)
+    return codec.HEADER_BYTES + 2 * (BRICK_DEPTH + 9) + BRICK_CELLS * per_cell + ZSTD_FRAME_BYTES
 
 
 class PublicMap:
@@ -35,8 +45,6 @@ class PublicMap:
         self._comparer = MapComparer(2, 0.0)
         self._filled = 0
         self._bytes_per_brick = 100.0
-        if config.classes is not None and config.packet.budget is not None:
-            _check_budget(config.packet.budget, config.classes.num_classes)
 
     def advance(
         self,
@@ -63,16 +71,19 @@ class PublicMap:
             # What did not change keeps its revision, so that no delta holds it.
             team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
         else:
-            self._fill(public, target, version, self._packet.budget // num_shares)
+            least = least_budget(self._packet, octree.num_classes)
+            self._fill(public, target, version, max(self._packet.budget // num_shares, least))
         self._octree = public
         return HeldMap(public, version)
 
     def _rounded(self, octree: SemanticOctree) -> SemanticOctree:
         """A map as packets can hold it."""
         if self._tolerance > 0:
-            octree = octree_from_streams(
+            pruned = octree_from_streams(
                 octree.streams(tolerance=self._tolerance), octree.resolution, octree.num_classes
             )
+            pruned.revisions[:] = octree.revisions[octree.find(pruned.codes)]
+            octree = pruned
         if self._packet.top_classes is not None:
             octree = top_classes(octree, self._packet.top_classes)
         return quantised(octree, self._packet.content, self._packet.int8_step)
@@ -104,11 +115,3 @@ class PublicMap:
     def _guess(self, num_bricks: int, budget: int) -> int:
         """How many of some bricks may fit into a packet, by what the last packet's took."""
         return min(int(0.95 * budget / self._bytes_per_brick), num_bricks)
-
-
-def _check_budget(budget: int, num_classes: int) -> None:
-    """Refuse a budget that some brick could not be sent with: raises ConfigError."""
-    # A value takes up to 4 bytes and its code; every class of every cell may have one.
-    least = codec.HEADER_BYTES + BRICK_CELLS * (5 * (num_classes + 1) + mask_bytes(num_classes)) + 128
-    if budget < least:
-        raise ConfigError(f"budget: {budget} bytes may be less than a single brick takes; give at least {least}")

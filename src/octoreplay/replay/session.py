@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from octoreplay.config import RunConfig
+from octoreplay.config import PacketConfig, RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.discover import resolve
 from octoreplay.io.result_writer import ResultWriter
@@ -38,6 +38,7 @@ from octoreplay.replay.flood_robot import FloodRobot
 from octoreplay.replay.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.links import LinkCounts, Links
+from octoreplay.replay.public_map import least_budget
 from octoreplay.replay.ratio_robot import RatioRobot
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.robot import MapSizes, Publication, Robot, Turn
@@ -82,6 +83,7 @@ class Session:
         self.stop_reason = ""
         self._num_classes = config.classes.num_classes
         self._robot_ids = tuple(robot.robot_id for robot in config.robots)
+        _check_budget(config.packet, self._num_classes)
         check_team_graph(config.network, config.consensus, self._robot_ids)
         self._network = TeamNetwork(config.network, config.consensus, self._robot_ids)
         self._timeline = Timeline(sources)
@@ -116,8 +118,9 @@ class Session:
         if consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
-        quiet_ticks = num_quiet_ticks(self._graph, self.config)
-        most = num_settle_ticks(self._graph, self.config)
+        slowest = self._links.longest_transmission
+        quiet_ticks = num_quiet_ticks(self._graph, self.config, slowest)
+        most = num_settle_ticks(self._graph, self.config, slowest)
         num_quiet = 0
         for n in range(1, most + 1):
             factor = max(0.0, 1.0 - n / consensus.settle)
@@ -410,6 +413,16 @@ def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
         )
 
 
+def _check_budget(packet: PacketConfig, num_classes: int) -> None:
+    """Refuse a budget that some brick would never fit into."""
+    least = least_budget(packet, num_classes)
+    if packet.budget is not None and packet.budget < least:
+        raise ConfigError(
+            f"budget: {packet.budget} bytes may not hold one brick of {num_classes} classes; give at least {least}, or"
+            " a smaller content"
+        )
+
+
 def _rule_warnings(config: RunConfig) -> tuple[str, ...]:
     """What a user should know of a rule on this network."""
     rule, ids = config.consensus.rule, [robot.robot_id for robot in config.robots]
@@ -423,6 +436,7 @@ def _rule_warnings(config: RunConfig) -> tuple[str, ...]:
         "losses": any(link.mean_loss > 0 or link.rate is not None for link in links),
         "maps that arrive in a later tick": any(link.latency > 0 for link in links),
         "robots that publish at different times": len({(r.publish_period, r.publish_phase) for r in config.robots}) > 1,
+        "maps that a budget holds back": config.packet.budget is not None,
         "robots that go off": any(entry.robots_off for entry in config.network.schedule),
     }
     found = [cause for cause, is_there in causes.items() if is_there]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,17 +19,24 @@ BUDGET_TICKS = 100
 """Ticks that a change may wait for the budget while a team settles."""
 
 
-def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
+FLOOD_TICKS = 10_000
+"""Most ticks that settling waits for evidence that a budget holds back."""
+
+
+def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
     """Ticks without any change after which a team has settled: 1 unless packets are lost or late.
 
-    So many that a link on which every packet was lost in all of them is one in a thousand.
+    So many that a link on which every packet was lost in all of them is one in a thousand. ``transmission`` is the
+    longest time that a packet keeps a link busy [s].
     """
     links = [link for link in _link_configs(graph, config).values() if link.mean_loss < 1.0]
     num_losses = max((_num_losses(link.repeated_loss) for link in links), default=1)
-    return num_losses * _slowest(config) + _delay(links, config)
+    slower = _repeats(config, links) * _turns(config) * _slowest(config)
+    # A packet that found a link busy waits for one transmission, and takes another.
+    return num_losses * slower + _delay(links, config, 2.0 * transmission)
 
 
-def num_settle_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
+def num_settle_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
     """The most settling ticks: those of the graph with each weight times its link's share of packets that arrive."""
     consensus = config.consensus
     if consensus.rule not in STEP_SIZE_RULES:
@@ -41,11 +49,14 @@ def num_settle_ticks(graph: CommunicationGraph, config: RunConfig) -> int:
     most = settle_ticks_max(dataclasses.replace(graph, weights=weights), consensus, epsilon)
     if consensus.settle == 0 or consensus.settle_max is not None:
         return most
-    ramp = consensus.settle
-    slower = _slowest(config) * (1 + _delay(list(links.values()), config))
-    if config.packet.budget is not None:
-        slower *= BUDGET_TICKS
-    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config) - 1
+    ramp, has_budget = consensus.settle, config.packet.budget is not None
+    all_links = list(links.values())
+    slower = _repeats(config, all_links) * _slowest(config) * (1 + _delay(all_links, config, 2.0 * transmission))
+    if has_budget and consensus.rule == "flood":
+        # How long what waits takes is not known; it ends, since nothing new comes.
+        return max(most, FLOOD_TICKS)
+    slower *= BUDGET_TICKS if has_budget else 1
+    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1
 
 
 def _link_configs(graph: CommunicationGraph, config: RunConfig) -> dict[tuple[int, int], LinkConfig]:
@@ -65,7 +76,20 @@ def _slowest(config: RunConfig) -> int:
     return max(round((robot.publish_period or period) / period) for robot in config.robots)
 
 
-def _delay(links: list[LinkConfig], config: RunConfig) -> int:
-    """The most ticks that a packet comes late by its link's delay."""
+def _repeats(config: RunConfig, links: Sequence[LinkConfig]) -> int:
+    """Packets to a robot until one makes up for a loss: the next, or the next whole map."""
+    packet = config.packet
+    waits = packet.packets == "delta" and not packet.acknowledge and any(link.mean_loss > 0.0 for link in links)
+    return packet.key_frame_every if waits else 1
+
+
+def _turns(config: RunConfig) -> int:
+    """Ticks in which every robot's evidence has its turn, where a budget leaves room for some only."""
+    takes_turns = config.consensus.rule == "flood" and config.packet.budget is not None
+    return len(config.robots) if takes_turns else 1
+
+
+def _delay(links: Sequence[LinkConfig], config: RunConfig, waiting: float) -> int:
+    """The most ticks that a packet comes late, with so many seconds of ``waiting``."""
     delays = np.array([link.latency + link.jitter for link in links])
-    return math.ceil(float(delays.max(initial=0.0)) / config.network.publish_period)
+    return math.ceil((float(delays.max(initial=0.0)) + waiting) / config.network.publish_period)

@@ -1,0 +1,162 @@
+"""How long settling may take and how long it has to be quiet, where packets are lost or late."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.config import LinkConfig, RobotConfig, RunConfig
+from octoreplay.replay.graph import TeamNetwork, settle_ticks_max, step_size
+from octoreplay.replay.settling import QUIET_PROB, num_quiet_ticks, num_settle_ticks
+
+IDS = ("a", "b", "c", "d")
+
+RAMP = 20
+
+
+def _team(*, periods=None, link_overrides=(), **parameters):
+    """A graph of four robots and the configuration that it is from."""
+    robots = tuple(RobotConfig(name, (Path(f"{name}.mcap"),), publish_period=(periods or {}).get(name)) for name in IDS)
+    config = RunConfig(robots=robots).with_parameters(parameters)
+    config = dataclasses.replace(config, link_overrides=link_overrides)
+    network = TeamNetwork(config.network, config.consensus, IDS)
+    return network.at(0.0, [True] * len(IDS), np.full((len(IDS), 3), np.nan)), config
+
+
+def _on(sender, receiver, **values):
+    return (sender, receiver, tuple(values.items()))
+
+
+def _ticks(rate):
+    """Ticks that shrink a disagreement by 1e12 when each leaves ``rate`` of it."""
+    return math.ceil(12.0 / -math.log10(rate))
+
+
+# --- without faults ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "ratio", "flood", "merge"])
+@pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
+def test_without_faults_one_quiet_tick_is_enough_and_the_graph_says_how_long(topology, rule):
+    graph, config = _team(topology=topology, rule=rule)
+    assert num_quiet_ticks(graph, config) == 1
+    expected = settle_ticks_max(graph, config.consensus, step_size(graph, config.consensus))
+    assert num_settle_ticks(graph, config) == expected > RAMP
+
+
+def test_what_is_given_counts_whatever_the_links_do():
+    for loss in (0.0, 0.5):
+        assert num_settle_ticks(*_team(settle_max=7, loss=loss, latency=3.0)) == 7
+        assert num_settle_ticks(*_team(settle=0, loss=loss, latency=3.0)) == 0
+
+
+@pytest.mark.parametrize("rule", ["ratio", "flood", "merge", "local"])
+def test_a_step_size_that_a_rule_does_not_use_changes_nothing(rule):
+    expected = num_settle_ticks(*_team(rule=rule, topology="line"))
+    assert num_settle_ticks(*_team(rule=rule, topology="line", epsilon=5.0)) == expected
+
+
+# --- losses -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", [0.0005, 0.002, 0.01, 0.3, 0.5, 0.9, 0.99])
+def test_a_link_is_hardly_ever_silent_for_as_long_as_it_has_to_be_quiet(loss):
+    num_quiet = num_quiet_ticks(*_team(loss=loss))
+    assert loss**num_quiet <= QUIET_PROB * (1 + 1e-9)
+    assert num_quiet == 1 or loss ** (num_quiet - 1) > QUIET_PROB
+
+
+@pytest.mark.parametrize(("loss", "num_quiet"), [(0.3, 6), (0.99, 688)])
+def test_losses_slow_the_team_down(loss, num_quiet):
+    """In a complete graph of four each link has the weight (1 - loss) / 4: a tick leaves ``loss`` of a difference."""
+    graph, config = _team(loss=loss)
+    assert num_quiet_ticks(graph, config) == num_quiet
+    assert num_settle_ticks(graph, config) == RAMP + _ticks(loss) + num_quiet - 1
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{"loss": 0.3}, {"corruption": 0.3}, {"loss": 0.125, "corruption": 0.2}],
+    ids=str,
+)
+def test_what_is_lost_and_what_is_damaged_counts_alike(parameters):
+    assert LinkConfig(**parameters).mean_loss == pytest.approx(0.3)
+    graph, config = _team(**parameters)
+    assert num_quiet_ticks(graph, config) == 6
+    assert num_settle_ticks(graph, config) == num_settle_ticks(*_team(loss=0.3))
+
+
+def test_a_burst_that_goes_on_is_waited_for():
+    """In a burst that goes on with 0.65, 17 lost packets in a row are one in a thousand."""
+    graph, config = _team(burst_start=0.15, burst_end=0.35)
+    assert LinkConfig(burst_start=0.15, burst_end=0.35).mean_loss == pytest.approx(0.3)
+    assert num_quiet_ticks(graph, config) == 17
+    assert num_settle_ticks(graph, config) == num_settle_ticks(*_team(loss=0.3)) + 17 - 6
+
+
+@pytest.mark.parametrize(("loss", "start", "end", "burst_loss"), [(0.1, 0.2, 0.3, 0.9), (0.4, 0.05, 0.5, 0.6)])
+def test_losses_in_a_row_are_as_rare_as_the_links_make_them(loss, start, end, burst_loss):
+    link = LinkConfig(loss=loss, burst_start=start, burst_end=end, burst_loss=burst_loss)
+    lost = np.array([1.0 - start / (start + end), start / (start + end)])
+    steps = np.array([[1.0 - start, start], [end, 1.0 - end]])
+    chances = []
+    for _ in range(40):
+        lost = (lost @ steps) * [loss, burst_loss]
+        chances.append(lost.sum())
+    assert chances[0] == pytest.approx(link.mean_loss)
+    assert chances[-1] / chances[-2] == pytest.approx(link.repeated_loss)
+
+
+def test_the_worst_link_counts():
+    graph, config = _team(loss=0.01, link_overrides=(_on("a", "b", loss=0.3),))
+    assert num_quiet_ticks(graph, config) == 6
+    # A link that is not there does not.
+    graph, config = _team(topology="line", loss=0.01, link_overrides=(_on("a", "d", loss=0.9),))
+    assert num_quiet_ticks(graph, config) == num_quiet_ticks(*_team(topology="line", loss=0.01)) == 2
+
+
+def test_links_that_carry_nothing_are_not_waited_for():
+    graph, config = _team(loss=1.0)
+    assert num_quiet_ticks(graph, config) == 1
+    assert num_settle_ticks(graph, config) == RAMP + 1
+    graph, config = _team(loss=0.3, link_overrides=(_on("a", "b", loss=1.0),))
+    assert num_quiet_ticks(graph, config) == 6
+    # Without any packet from a to b the others still bring it there, in a few ticks more.
+    assert num_settle_ticks(*_team(loss=0.3)) < num_settle_ticks(graph, config) < 200
+
+
+def test_without_acknowledgements_a_loss_lasts_until_the_next_whole_map():
+    key_frames = {"packets": "delta", "acknowledge": False, "key_frame_every": 10}
+    assert num_quiet_ticks(*_team(**key_frames)) == 1
+    assert num_quiet_ticks(*_team(loss=0.3, **key_frames)) == 60
+    assert num_settle_ticks(*_team(loss=0.3, **key_frames)) == RAMP + 10 * _ticks(0.3) + 59
+    acknowledged = {**key_frames, "acknowledge": True}
+    assert num_quiet_ticks(*_team(loss=0.3, **acknowledged)) == 6
+
+
+# --- delays and slow robots -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "delay"),
+    [({"latency": 0.2}, 1), ({"latency": 1.0}, 1), ({"latency": 2.5, "jitter": 0.5}, 3), ({"latency": 2.5}, 3),
+     ({"latency": 0.5, "publish_period": 0.25}, 2), ({"latency": 0.2, "publish_period": 0.05}, 4)],
+    ids=str,
+)  # fmt: skip
+def test_what_is_on_its_way_is_waited_for(parameters, delay):
+    graph, config = _team(**parameters)
+    assert num_quiet_ticks(graph, config) == 1 + delay
+    assert num_settle_ticks(graph, config) == RAMP + (1 + delay) + delay
+
+
+def test_the_robot_that_publishes_least_often_counts():
+    graph, config = _team(periods={"b": 3.0, "c": 2.0})
+    assert num_quiet_ticks(graph, config) == 3
+    assert num_settle_ticks(graph, config) == RAMP + 3 + 2
+    graph, config = _team(periods={"b": 3.0}, loss=0.3, latency=1.5)
+    assert num_quiet_ticks(graph, config) == 6 * 3 + 2
+    assert num_settle_ticks(graph, config) == RAMP + _ticks(0.3) * 3 * 3 + 19
