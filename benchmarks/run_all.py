@@ -16,6 +16,7 @@ from rounds import Row
 HERE = Path(__file__).parent
 FULL: dict[str, list[str]] = {
     "insertion": [], "consensus": [], "replay": [], "memory": [], "cold_start": [], "roofline": [],
+    "packets": [],
 }  # fmt: skip
 QUICK: dict[str, list[str]] = {
     "insertion": ["--frames", "10", "--rounds", "2"],
@@ -24,6 +25,7 @@ QUICK: dict[str, list[str]] = {
     "memory": ["--frames", "20"],
     "cold_start": ["--rounds", "2", "--compilations", "1"],
     "roofline": ["--frames", "20", "--rounds", "2"],
+    "packets": ["--duration", "20", "--only", "delta", "--only", "ring"],
 }
 
 

@@ -402,7 +402,7 @@ def _packets(tick):
 def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
     scenario = _scenario(1, SMALL)
     config = scenario.config(rule=rule, topology=topology, settle=3)
-    right, since_of_steps = session_module.team_step, []
+    right, since_of_steps = consensus_module.team_step, []
 
     def recorded(steps, **kwargs):
         since_of_steps.extend(step.since for step in steps)
@@ -413,7 +413,7 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
 
     runs = []
     for function in (recorded, whole):
-        monkeypatch.setattr(session_module, "team_step", function)
+        monkeypatch.setattr(consensus_module, "team_step", function)
         session = Session(config, _sources(config, scenario.frames))
         runs.append([_packets(tick) for tick in session.ticks()])
     assert runs[0] == runs[1]
@@ -425,15 +425,12 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
 
 def _change_steps(monkeypatch, change):
     """Every robot's iterations are done as ``change`` describes them."""
-    right = session_module.team_step
+    right = consensus_module.team_step
 
     def wrong(steps, *, rule, **kwargs):
-        # The step over copies of the maps measures the change over a tick; it is no iteration.
-        measures = rule == "local"
-        return right([step if measures else change(step) for step in steps], rule=rule, **kwargs)
+        return right([change(step) for step in steps], rule=rule, **kwargs)
 
-    for module in (consensus_module, session_module):
-        monkeypatch.setattr(module, "team_step", wrong)
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
 
 
 def _wrong_sign(monkeypatch):
@@ -482,11 +479,9 @@ def _maps_of_the_tick_before(monkeypatch):
 
 def _free_is_not_reset(monkeypatch):
     """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
-    right = session_module.team_step
+    right = consensus_module.team_step
 
     def wrong(steps, *, rule, **kwargs):
-        if rule == "local":
-            return right(steps, rule=rule, **kwargs)
         mixed = [dataclasses.replace(step, own=step.own.copy(), gamma=0.0) for step in steps]
         right(mixed, rule=rule, **kwargs)
         changes = right(steps, rule=rule, **kwargs)
@@ -500,8 +495,7 @@ def _free_is_not_reset(monkeypatch):
             own.bricks.rows[rows[is_there]] = after[is_there]
         return changes
 
-    for module in (consensus_module, session_module):
-        monkeypatch.setattr(module, "team_step", wrong)
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
 
 
 def _free_is_not_reset_in_the_twin(monkeypatch):

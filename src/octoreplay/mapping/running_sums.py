@@ -44,9 +44,10 @@ WEIGHT_UNIT = 2.0**-40
 """One unit of a weight."""
 WHOLE_WEIGHT = 1 << 40
 """Units of the weight with which every robot starts."""
-LEAST_WEIGHT = WHOLE_WEIGHT // 8
+LEAST_WEIGHT = WHOLE_WEIGHT // 4
 """Units below which a weight says that the robot gave much and heard little: y_i / z_i shows its rounding, about D / 2
-units, and its new evidence 1 / z_i times too large. Its map is better left to its own evidence until it hears more."""
+units, and its new evidence 1 / z_i times too large. It should give nothing more until it hears more, and leave its map
+to its own evidence meanwhile."""
 
 
 def share_weight(weight: int, num_receivers: int) -> tuple[int, int]:

@@ -46,9 +46,11 @@ class RatioRobot(Robot):
         self._pause(self._receivers.difference(receivers), tick)
         self._resume(frozenset(receivers).difference(self._receivers), tick)
         self._receivers = frozenset(receivers)
-        running_sums.share_out(self.mass, self._total, len(receivers), tick - 1)
-        share, self._weight = running_sums.share_weight(self._weight, len(receivers))
-        self._total_weight += share if receivers else 0
+        # Who hears little keeps what it has: giving on and on would leave it nothing to divide by.
+        num_shares = len(receivers) if self._weight >= running_sums.LEAST_WEIGHT else 0
+        running_sums.share_out(self.mass, self._total, num_shares, tick - 1)
+        share, self._weight = running_sums.share_weight(self._weight, num_shares)
+        self._total_weight += share
         held = self.exchange.held
         outgoing = []
         together = tuple(receiver for receiver in receivers if receiver not in self._offsets)
