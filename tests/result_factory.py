@@ -13,12 +13,12 @@ from octoreplay.records import (
     FrameCounts,
     LeafTable,
     LinkMetrics,
+    LinkTotals,
     MapState,
     RobotMetrics,
     RobotPose,
     RunSummary,
     TickMetrics,
-    link_totals,
 )
 
 SECOND = 1_000_000_000
@@ -66,11 +66,14 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
 
 def summary(metrics: Sequence[TickMetrics]) -> RunSummary:
     """What a run over some ticks came to."""
+    links = LinkTotals()
+    for tick in metrics:
+        links.add(tick.links)
     return RunSummary(
         num_ticks=len(metrics), num_settling_ticks=sum(tick.settling for tick in metrics), stop_reason="it was over",
         log_seconds=12.5, wall_seconds=3.25, last=metrics[-1], peak_total_distance=77.0, peak_total_distance_all=88.0,
         mean_packet_bytes=150.5, mean_octree_bytes=250.25, mean_grid_bytes=6000.125, total_sent_bytes=9999,
-        links=link_totals(link for tick in metrics for link in tick.links),
+        links=links.totals(),
         frame_counts={
             "alpha": FrameCounts(used=7, no_pose=2, unknown_label_pixels={42: 3}),
             "beta": FrameCounts(used=9, truncated_files=["beta.bag"]),

@@ -60,7 +60,7 @@ CONFIGS = {
         )
     },
     "range": {"network": NetworkConfig(topology="range", radio_range=12.5, range_hysteresis=0.5)},
-    "random": {"network": NetworkConfig(topology="random", link_prob=0.25)},
+    "random": {"network": NetworkConfig(topology="random", prob_link=0.25)},
     "links": {
         "link": LinkConfig(
             latency=0.5, jitter=0.25, loss=0.1, burst_start=0.2, burst_end=0.3, burst_loss=0.9, corruption=0.01,
@@ -220,7 +220,7 @@ def test_what_a_team_file_cannot_say_is_one_sentence(text, sentence):
     assert "\n" not in message
 
 
-@pytest.mark.parametrize("name", ["loss", "burst_start", "burst_end", "burst_loss", "corruption", "link_prob"])
+@pytest.mark.parametrize("name", ["loss", "burst_start", "burst_end", "burst_loss", "corruption", "prob_link"])
 @pytest.mark.parametrize("value", [-0.1, 1.5, math.nan])
 def test_probabilities_are_from_0_to_1(name, value):
     with pytest.raises(ConfigError, match=rf"^{name}: (-0.1|1.5|nan) (is|must be)"):

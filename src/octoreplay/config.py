@@ -90,6 +90,11 @@ class SensorConfig:
         if self.min_range >= self.max_range:
             raise ConfigError("min_range: must be below max_range")
 
+    @property
+    def clamp(self) -> tuple[float, float]:
+        """The least and the largest log-odds of a class."""
+        return self.clamp_min, self.clamp_max
+
 
 @dataclass(frozen=True)
 class MapConfig:
@@ -135,7 +140,7 @@ class MapConfig:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """The consensus rule and its steps (ALGORITHM: Rules, Settling)."""
+    """The consensus rule and its steps (docs/algorithm.md)."""
 
     rule: str = _parameter("gradient", "consensus rule", choices=RULES)
     evidence: str = _parameter("sum", "reading of log q_i", choices=EVIDENCES)
@@ -197,7 +202,7 @@ class NetworkConfig:
     range_hysteresis: float = _parameter(
         3.0, "topology range: a link breaks this much beyond radio_range [m]", minimum=0.0
     )
-    link_prob: float = _parameter(
+    prob_link: float = _parameter(
         0.5, "topology random: probability of each link (Erdos-Renyi)", minimum=0.0, maximum=1.0
     )
     network_seed: int = _parameter(0, "seed of the random graph, losses and jitter", minimum=0)
@@ -295,7 +300,7 @@ class PacketConfig:
     packet_compression: str = _parameter("zstd", "compression of the packets", choices=("zstd", "none"))
     zstd_level: int = _parameter(1, "zstd's level: higher is smaller and slower", minimum=1, maximum=22)
     budget: int | None = _parameter(
-        None, "most bytes of a robot's packet in a tick; what changes most goes first (default: no limit)", minimum=256
+        None, "most bytes of a packet to one receiver; what changes most goes first (default: no limit)", minimum=256
     )
     cast: str = _parameter(
         "unicast", "one packet for each receiver, or one for all of them", choices=("unicast", "broadcast")

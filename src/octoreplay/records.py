@@ -5,8 +5,8 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import astuple, dataclass, field, fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -188,13 +188,6 @@ class LinkMetrics:
     num_damaged: int
     bytes_per_second: float
 
-    @classmethod
-    def total(cls, entries: Sequence[LinkMetrics]) -> LinkMetrics:
-        """The sums over several ticks of one link (at least one), with the mean of ``bytes_per_second``."""
-        counts = {f.name: sum(getattr(entry, f.name) for entry in entries) for f in fields(cls)[2:-1]}
-        rate = sum(entry.bytes_per_second for entry in entries) / len(entries)
-        return cls(entries[0].sender, entries[0].receiver, **counts, bytes_per_second=rate)
-
 
 @dataclass(frozen=True)
 class TickMetrics:
@@ -214,12 +207,31 @@ class TickMetrics:
     links: tuple[LinkMetrics, ...]
 
 
-def link_totals(links: Iterable[LinkMetrics]) -> tuple[LinkMetrics, ...]:
-    """Each directed link over all ticks, in the order in which they first occur."""
-    entries: dict[tuple[str, str], list[LinkMetrics]] = {}
-    for link in links:
-        entries.setdefault((link.sender, link.receiver), []).append(link)
-    return tuple(LinkMetrics.total(of_link) for of_link in entries.values())
+class LinkTotals:
+    """Each directed link over many ticks: sums, and the mean of ``bytes_per_second``."""
+
+    def __init__(self) -> None:
+        self._sums: dict[tuple[str, str], list[float]] = {}
+        self._num_ticks: dict[tuple[str, str], int] = {}
+
+    def add(self, links: Iterable[LinkMetrics]) -> None:
+        """Add the links of one tick."""
+        for link in links:
+            ends = (link.sender, link.receiver)
+            values = astuple(link)[2:]
+            sums = self._sums.get(ends, [0] * len(values))
+            self._sums[ends] = [a + b for a, b in zip(sums, values, strict=True)]
+            self._num_ticks[ends] = self._num_ticks.get(ends, 0) + 1
+
+    def totals(self) -> tuple[LinkMetrics, ...]:
+        """The links in the order in which they first occurred."""
+        names = [item.name for item in fields(LinkMetrics)]
+
+        def total(ends: tuple[str, str], sums: list[float]) -> LinkMetrics:
+            values: list[Any] = [*ends, *map(int, sums[:-1]), sums[-1] / self._num_ticks[ends]]
+            return LinkMetrics(**dict(zip(names, values, strict=True)))
+
+        return tuple(total(ends, sums) for ends, sums in self._sums.items())
 
 
 @dataclass(frozen=True)

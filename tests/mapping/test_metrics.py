@@ -172,3 +172,13 @@ def test_updating_changed_bricks_gives_what_a_fresh_comparison_gives(seed):
         for name in vars(fresh):
             # The bricks are summed in the order in which they came up.
             np.testing.assert_allclose(getattr(updated, name), getattr(fresh, name), rtol=1e-12, err_msg=name)
+
+
+def test_a_map_that_was_replaced_is_compared_anew():
+    octree, nothing = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({})
+    comparer = MapComparer(2, 0.0)
+    assert comparer.compare([octree, octree], octree, [(0, 1)], 0).num_cells.tolist() == [1, 1]
+    comparer.forget()
+    comparison = comparer.compare([octree, nothing], octree, [(0, 1)], 9)
+    assert comparison.num_cells.tolist() == [1, 0]
+    assert comparison.total_distance == 5.0

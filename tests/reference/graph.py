@@ -130,7 +130,7 @@ def topology_links(
         ]
     elif network.topology == "random":
         chance = random.Random(network.network_seed)
-        pairs = [pair for pair in itertools.combinations(range(n), 2) if chance.random() < network.link_prob]
+        pairs = [pair for pair in itertools.combinations(range(n), 2) if chance.random() < network.prob_link]
     elif network.topology == "nearest":
         pairs = [(i, j) for i in range(n) for j in _nearest(i, history[-1], network.num_nearest)]
     elif network.topology == "range":

@@ -41,8 +41,8 @@ def test_more_topologies_by_hand():
     # d e
     assert _team("grid").links == ((0, 1), (0, 3), (1, 2), (1, 4), (3, 4))
     assert _team("grid", robots=("a", "b")).links == ((0, 1),)
-    assert _team("random", link_prob=0.0).links == ()
-    assert len(_team("random", link_prob=1.0).links) == 10
+    assert _team("random", prob_link=0.0).links == ()
+    assert len(_team("random", prob_link=1.0).links) == 10
     assert _team("random", network_seed=7).links == _team("random", network_seed=7).links
     here = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)]
     # b is as near to a as e is; the lower index counts.

@@ -260,6 +260,39 @@ def test_within_a_budget_everything_arrives_later(seed, cast):
         assert _content(receiver.held[source].octree) == _content(octree)
 
 
+def test_what_is_forwarded_in_pieces_lacks_nothing_after_a_late_answer():
+    """A delta that overlaps what is there must not make a brick look newer than one that changed after it."""
+    rng = np.random.default_rng(0)
+    source, octree = Source(0, 0), SemanticOctree(0.25, 2)
+    author, forwarder, last = (Exchange(BUDGET, PacketEncoder(BUDGET)) for _ in range(3))
+
+    def publish(brick, version):
+        keys = [(4 * brick + x, y, z) for x in range(4) for y in range(2) for z in range(2)]
+        octree.overwrite(octree_of({key: rng.normal(size=2) for key in keys}), np.arange(1), version - 1)
+        author.held[source] = HeldMap(octree.copy(), version)
+
+    def send(sender, number, receiver, to):
+        for _, message in sender.outbox([to], [source], keep_alive=False):
+            receiver.receive(number, message)
+
+    publish(brick=0, version=5)
+    send(author, 0, forwarder, 1)
+    publish(brick=1, version=7)
+    send(author, 0, forwarder, 1)
+    # Only now does the answer to version 5 arrive: the next packet holds brick 1 again, and brick 0 no more.
+    author.acknowledged(1, _acknowledgement(source, 5))
+    publish(brick=2, version=10)
+    send(author, 0, forwarder, 1)
+    assert forwarder.held[source].version == 10
+    send(forwarder, 1, last, 2)
+    assert last.held[source].version < 10
+    for _ in range(3):
+        author.acknowledged(2, _acknowledgement(source, last.held[source].version))
+        send(author, 0, last, 2)
+    assert last.held[source].version == 10
+    assert _content(last.held[source].octree) == _content(octree)
+
+
 def test_a_budget_goes_with_acknowledged_deltas():
     with pytest.raises(ConfigError, match="budget: goes with packets 'delta'"):
         PacketConfig(budget=1000)

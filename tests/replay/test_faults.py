@@ -15,6 +15,7 @@ from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.replay.exchange import Source
 from octoreplay.replay.session import Session, _rule_warnings, replay_team
+from octoreplay.result import open_result
 from reference.comparison import compare_map
 from reference.scenarios import START_NS, TeamShape, make_scenario
 from reference.twin import Twin, record
@@ -147,7 +148,7 @@ def test_flood_brings_evidence_one_hop_per_tick(topology, name):
 
 @pytest.mark.parametrize("parameters", [
     {"topology": "complete"}, {"topology": "star"}, {"topology": "grid"}, {"topology": "ring", "one_way": ONE_WAY_RING},
-    {"topology": "random", "link_prob": 0.6}, {"topology": "nearest", "num_nearest": 1},
+    {"topology": "random", "prob_link": 0.6}, {"topology": "nearest", "num_nearest": 1},
     {"topology": "edges", "edges": (("robot_2", "robot_0", None), ("robot_0", "robot_3", None),
                                     ("robot_3", "robot_1", None))},
 ], ids=str)  # fmt: skip
@@ -312,15 +313,14 @@ def test_a_run_says_what_its_rule_cannot_do(parameters, sentence):
 
 @pytest.mark.parametrize("rule", ["bayes", "ratio", "flood", "gradient"])
 def test_a_run_without_faults_warns_of_no_rule(rule):
-    assert _rule_warnings(_config(rule=rule)) == ()
+    assert _rule_warnings(_config(rule=rule), is_symmetric=True) == ()
 
 
 @pytest.mark.parametrize(
     ("parameters", "cause"),
     [
-        ({"one_way": ONE_WAY_RING[:1]}, "one-way links"), ({"corruption": 0.1}, "losses"),
+        ({"corruption": 0.1}, "losses"),
         ({"burst_start": 0.1}, "losses"), ({"loss": 0.1}, "losses"),
-        ({"schedule": (ScheduleEntry(1.0, robots_silent=("robot_0",)),)}, "one-way links"),
         ({"schedule": (ScheduleEntry(1.0, robots_off=("robot_0",)),)}, "robots that go off"),
         ({"robots": {"robot_0": {"publish_period": 2.0}}}, "robots that publish at different times"),
         ({"link_overrides": (("robot_0", "robot_1", (("loss", 0.1),)),)}, "losses"),
@@ -328,9 +328,46 @@ def test_a_run_without_faults_warns_of_no_rule(rule):
     ],
 )  # fmt: skip
 def test_bayes_is_warned_of_by_its_cause(parameters, cause):
-    (warning,) = _rule_warnings(_config(rule="bayes", **parameters))
+    (warning,) = _rule_warnings(_config(rule="bayes", **parameters), is_symmetric=True)
     assert f"with {cause} it drifts" in warning
-    assert _rule_warnings(_config(rule="natural", **parameters)) == ()
+    assert _rule_warnings(_config(rule="natural", **parameters), is_symmetric=True) == ()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "is_symmetric"),
+    [
+        ({}, True),
+        ({"topology": "line"}, True),
+        ({"topology": "line", "weights": "degree"}, False),
+        ({"one_way": ONE_WAY_RING[:1]}, False),
+        ({"schedule": (ScheduleEntry(1.0, robots_silent=("robot_0",)),)}, False),
+    ],
+)
+def test_bayes_is_warned_of_links_that_do_not_carry_the_same_both_ways(parameters, is_symmetric):
+    config = _config(rule="bayes", settle=0, **parameters)
+    session = _session(config)
+    for _ in session.ticks():
+        pass
+    assert session.is_symmetric == is_symmetric
+    assert len(_rule_warnings(config, session.is_symmetric)) == (not is_symmetric)
+
+
+@pytest.mark.parametrize("rule", ["flood", "bayes"])
+def test_what_is_stored_of_a_robot_that_forgot_is_what_it_has(rule, tmp_path):
+    """A delta takes no bricks away: the first state of a new life is a whole map, and its metrics are its own."""
+    schedule = (ScheduleEntry(2.0, 3.0, robots_off=("husky_1",), forget=True),)
+    config = load_team_file(PAIR)
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, schedule=schedule))
+    config = config.with_parameters({"rule": rule, "state_every": 1.0, "loss": 1.0, "settle": 0})
+    replay_team(config, tmp_path / "result.mcap")
+    with open_result(tmp_path / "result.mcap") as result:
+        assert len(result.metrics) > 3
+        for metrics in result.metrics:
+            for robot in metrics.robots:
+                stored = result.map(robot.robot_id, tick=metrics.tick).leaves()
+                volume = (stored.sizes**3).sum()
+                assert volume == pytest.approx(robot.observed_volume, abs=1e-6)
+                assert robot.active == (metrics.tick > 0 and (robot.robot_id, metrics.tick) != ("husky_1", 2))
 
 
 # --- merge -----------------------------------------------------------------------------------------------------------

@@ -556,10 +556,10 @@ def test_the_default_step_size_is_stable_on_every_graph(tick):
 @given(_ticks())
 def test_a_partition_leaves_the_parts_of_the_graph_that_lie_within_groups(tick):
     network, robot_ids, active, _ = tick
-    whole = NetworkConfig(topology="random", link_prob=0.7, network_seed=network.network_seed)
+    whole = NetworkConfig(topology="random", prob_link=0.7, network_seed=network.network_seed)
     cuts = (robot_ids[::2], robot_ids[1::2]) if len(robot_ids) > 1 else ()
     schedule = (ScheduleEntry(1.0, groups=cuts),) if cuts else ()
-    split = NetworkConfig(topology="random", link_prob=0.7, network_seed=network.network_seed, schedule=schedule)
+    split = NetworkConfig(topology="random", prob_link=0.7, network_seed=network.network_seed, schedule=schedule)
     before = nx.Graph(TeamNetwork(whole, ConsensusConfig(), robot_ids).at(9.0, active, _nowhere(len(active))).pairs)
     after = nx.Graph(TeamNetwork(split, ConsensusConfig(), robot_ids).at(9.0, active, _nowhere(len(active))).pairs)
     groups = [before.subgraph(i for i in range(len(robot_ids)) if i % 2 == side) for side in (0, 1)]

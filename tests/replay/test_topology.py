@@ -58,8 +58,8 @@ def test_grids_are_as_square_as_can_be_and_their_last_row_may_be_short():
 
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star", "grid", "random", "nearest", "range"])
 def test_one_robot_has_no_link_and_two_have_one(topology):
-    assert _links(1, topology, link_prob=1.0, positions=[(0, 0, 0)]) == ()
-    assert _links(2, topology, link_prob=1.0, positions=[(0, 0, 0), (1, 0, 0)]) == ((0, 1),)
+    assert _links(1, topology, prob_link=1.0, positions=[(0, 0, 0)]) == ()
+    assert _links(2, topology, prob_link=1.0, positions=[(0, 0, 0), (1, 0, 0)]) == ((0, 1),)
 
 
 def test_fixed_topologies_are_induced_on_the_robots_that_are_present():
@@ -70,16 +70,16 @@ def test_fixed_topologies_are_induced_on_the_robots_that_are_present():
 
 
 def test_random_links_follow_the_seed_and_stand_over_the_run():
-    made = Topology(NetworkConfig(topology="random", link_prob=0.4, network_seed=3), NAMES[:12])
+    made = Topology(NetworkConfig(topology="random", prob_link=0.4, network_seed=3), NAMES[:12])
     everybody, nowhere = np.ones(12, bool), np.full((12, 3), np.nan)
     first = made.links(everybody, nowhere)
     np.testing.assert_array_equal(made.links(everybody, nowhere), first)
     fewer = np.arange(12) != 5
     np.testing.assert_array_equal(made.links(fewer, nowhere), first & fewer & fewer[:, None])
     assert 10 < len(_pairs(first)) < 45
-    assert _pairs(first) != _links(12, "random", link_prob=0.4, network_seed=4)
-    assert _links(5, "random", link_prob=0.0) == ()
-    assert len(_links(5, "random", link_prob=1.0)) == 10
+    assert _pairs(first) != _links(12, "random", prob_link=0.4, network_seed=4)
+    assert _links(5, "random", prob_link=0.0) == ()
+    assert len(_links(5, "random", prob_link=1.0)) == 10
 
 
 def test_nearest_links_stand_where_either_end_wants_them():
@@ -148,7 +148,7 @@ def test_every_tick_of_every_topology_is_that_of_the_reference(data):
         num_nearest=data.draw(st.integers(1, 4)),
         radio_range=data.draw(st.sampled_from([3.0, 5.0])),
         range_hysteresis=data.draw(st.sampled_from([0.0, 1.0, 3.0])),
-        link_prob=data.draw(st.sampled_from([0.0, 0.3, 0.7, 1.0])),
+        prob_link=data.draw(st.sampled_from([0.0, 0.3, 0.7, 1.0])),
         network_seed=data.draw(st.integers(0, 2**31)),
     )
     made = Topology(network, NAMES[:num_robots])

@@ -27,11 +27,11 @@ from octoreplay.records import (
     Float64Array,
     FrameCounts,
     LinkMetrics,
+    LinkTotals,
     MapState,
     RobotMetrics,
     RunSummary,
     TickMetrics,
-    link_totals,
 )
 
 
@@ -255,6 +255,9 @@ def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> R
     def mean(name: str) -> float:
         return float(np.mean([getattr(robot, name) for robot in published])) if published else 0.0
 
+    links = LinkTotals()
+    for tick in metrics:
+        links.add(tick.links)
     return RunSummary(
         num_ticks=len(metrics),
         num_settling_ticks=sum(tick.settling for tick in metrics),
@@ -268,7 +271,7 @@ def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> R
         mean_octree_bytes=mean("octree_bytes"),
         mean_grid_bytes=mean("grid_bytes"),
         total_sent_bytes=sum(robot.sent_bytes for tick in metrics for robot in tick.robots),
-        links=link_totals(link for tick in metrics for link in tick.links),
+        links=links.totals(),
         frame_counts={},
         warnings=(),
     )

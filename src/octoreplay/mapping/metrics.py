@@ -80,6 +80,10 @@ class MapComparer:
         list(map(refresh, parts) if threads is None else threads.map(refresh, parts))
         return self._result()
 
+    def forget(self) -> None:
+        """Compare all bricks anew the next time: a map was replaced by another."""
+        self._links = None
+
     @property
     def brick_distances(self) -> tuple[Int64Array, Float64Array]:
         """Of the last comparison: the bricks' codes (n,), and each one's part of ``total_distance`` (n,)."""

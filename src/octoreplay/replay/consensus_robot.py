@@ -24,7 +24,6 @@ class ConsensusRobot(Robot):
     def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
         super().__init__(index, config, num_classes, encoder, epoch)
         self._rule = config.consensus.rule
-        self._clamp = (config.sensor.clamp_min, config.sensor.clamp_max)
         self._public = PublicMap(config, encoder, self.source)
         self._published: HeldMap | None = None
         self._has_budget = config.packet.budget is not None
@@ -49,8 +48,9 @@ class ConsensusRobot(Robot):
         together = [turn for turn in turns if is_sync or not turn.arrived]
         alone = [turn for turn in turns if not is_sync and turn.arrived]
         steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, factor, tick), together))
-        clamp = (config.sensor.clamp_min, config.sensor.clamp_max)
-        changes = team_step(steps, rule=config.consensus.rule, revision=tick, clamp=clamp, threads=threads)
+        changes = team_step(
+            steps, rule=config.consensus.rule, revision=tick, clamp=config.sensor.clamp, threads=threads
+        )
         list(threads.map(lambda turn: turn.robot.end_step(tick), together))
         return changes + list(
             threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, factor, tick), alone)
@@ -74,7 +74,7 @@ class ConsensusRobot(Robot):
     def end_step(self, tick: int) -> None:
         """Take note of the iteration that ``next_step`` described."""
         self._finish_step(tick)
-        self._prune()
+        self._update_streams()
 
     def iterate_on_arrival(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int
@@ -83,14 +83,15 @@ class ConsensusRobot(Robot):
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
         # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
-        base = self._published_octree(tick) if self._rule == "bayes" else None
+        needs_base = self._rule == "bayes" or not self._public.is_exact
+        base = self._published_octree(tick) if needs_base else None
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], rule=self._rule, revision=tick, clamp=self._clamp)
+            team_step([step], rule=self._rule, revision=tick, clamp=self._config.sensor.clamp)
             self._finish_step(tick)
-        self._prune()
+        self._update_streams()
         # What one arrival changes another may undo; what counts is the change over the tick.
         return self._change_since(before, tick)
 
@@ -139,9 +140,9 @@ class ConsensusRobot(Robot):
 
 def _from_neighbours(turn: Turn[Robot]) -> list[Arrival]:
     """What arrived over links that stand in this tick, without maps of a sender's earlier lives."""
-    lives = dict(sorted(arrival.source for arrival in turn.arrived))
+    epoch_of = turn.robot.exchange.epoch_of
     return [
         arrival
         for arrival in turn.arrived
-        if turn.step_weights[arrival.source.origin] > 0 and arrival.source.epoch == lives[arrival.source.origin]
+        if turn.step_weights[arrival.source.origin] > 0 and arrival.source.epoch == epoch_of(arrival.source.origin)
     ]

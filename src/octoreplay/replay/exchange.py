@@ -24,6 +24,7 @@ from octoreplay.mapping import codec
 from octoreplay.mapping.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.records import Int64Array
 
 NOTHING = 0
 """The base of a delta that builds on nothing; versions are greater."""
@@ -151,7 +152,7 @@ class PacketEncoder:
         self._packets[key] = entry
         return entry[1]
 
-    def encode(self, source: Source, held: HeldMap, base: int | None, indices: np.ndarray | None = None) -> bytes:
+    def encode(self, source: Source, held: HeldMap, base: int | None, indices: Int64Array | None = None) -> bytes:
         """A packet made anew; with ``indices`` (n,) it holds those bricks in place of all that changed."""
         version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
         if base is None:
@@ -227,17 +228,22 @@ class Exchange:
             except PacketError:
                 receipt.num_damaged += 1
                 continue
-            if source.origin == sender and source.epoch > self._epochs.get(sender, 0):
+            if source.origin == sender and source.epoch > self.epoch_of(sender):
                 # The sender started anew, and has nothing of what it had.
                 self._epochs[sender] = source.epoch
                 self._known = {key: known for key, known in self._known.items() if key[0] != sender}
-            # Who sends a state has it.
-            self._learn(sender, source, version)
+            if source.origin != sender or source.epoch == self.epoch_of(sender):
+                # Who sends a state has it.
+                self._learn(sender, source, version)
             held = self.held.get(source)
             answers[source] = Possession(*source, held.version if held else None)
         if not answers or self._config.packets != "delta" or not self._config.acknowledge:
             return receipt, None
         return receipt, Acknowledgement(encode_acknowledgement(list(answers.values())))
+
+    def epoch_of(self, robot: int) -> int:
+        """The newest life of a robot that was heard of from itself."""
+        return self._epochs.get(robot, 0)
 
     def acknowledged(self, sender: int, answer: Acknowledgement) -> None:
         """Take note of what a neighbour has; a damaged answer says nothing."""
@@ -337,5 +343,8 @@ class Exchange:
             octree.revisions[:] = version - 1
         else:
             octree = mine.octree.copy() if mine else SemanticOctree(header.resolution, header.num_classes)
+            # What is not in the delta did not change after its base, whatever an earlier packet made of it.
+            base = header.map_version.base
+            octree.revisions[octree.revisions >= base] = base - 1
             codec.apply_delta(octree, data, version - 1)
         return HeldMap(octree, version, header.map_version.weight)

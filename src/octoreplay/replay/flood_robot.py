@@ -69,7 +69,7 @@ class FloodRobot(Robot):
         before = self.map.copy()
         sum_of_evidence(self.map, terms, np.unique(np.concatenate(changed)), tick)
         self.num_iterations += 1
-        self._prune()
+        self._update_streams()
         return self._change_since(before, tick)
 
     def _is_behind(self, mine: HeldMap | None) -> bool:

@@ -105,13 +105,14 @@ class PublicMap:
         for _ in range(FIT_TRIES):
             size = len(self._encoder.encode(self._source, HeldMap(target, version), version, order[:wanted]))
             self._bytes_per_brick = size / max(wanted, 1)
-            if size <= budget:
+            # Some room is left: the same bricks may take more when others of their packet have changed again.
+            if size <= 0.95 * budget:
                 best = max(best, wanted)
-            if best == order.size or 0.9 * budget < size <= budget:
+            if best == order.size or 0.85 * budget < size <= 0.95 * budget:
                 break
             wanted = max(self._guess(order.size, budget), best + 1)
         public.overwrite(target, order[:best], version - 1)
 
     def _guess(self, num_bricks: int, budget: int) -> int:
         """How many of some bricks may fit into a packet, by what the last packet's took."""
-        return min(int(0.95 * budget / self._bytes_per_brick), num_bricks)
+        return min(int(0.9 * budget / self._bytes_per_brick), num_bricks)

@@ -96,7 +96,7 @@ class RatioRobot(Robot):
             (change,) = team_step([step], rule="bayes", revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
-        self._prune()
+        self._update_streams()
         return change
 
     def _sum_for(self, receiver: int, tick: int) -> HeldMap:

@@ -11,7 +11,7 @@ from octoreplay.config import RunConfig
 from octoreplay.io.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import FrameCounts, LeafTable, LinkMetrics, MapState, RunSummary, TickMetrics, link_totals
+from octoreplay.records import FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
@@ -28,6 +28,7 @@ class Recorder:
         self._writer = writer
         self._threads = threads
         self._num_states = {robot.robot_id: 0 for robot in config.robots}
+        self._stored: dict[str, SemanticOctree] = {}
         self._state_tick = -1
         self._view_tick = -1
         self._num_settling = 0
@@ -36,7 +37,7 @@ class Recorder:
         self._bytes = np.zeros(3)
         self._num_published = 0
         self._sent_bytes = 0
-        self._links: list[LinkMetrics] = []
+        self._links = LinkTotals()
 
     def record(self, tick: Tick) -> None:
         """Take one tick in."""
@@ -86,7 +87,7 @@ class Recorder:
             mean_octree_bytes=float(means[1]),
             mean_grid_bytes=float(means[2]),
             total_sent_bytes=self._sent_bytes,
-            links=link_totals(self._links),
+            links=self._links.totals(),
             frame_counts=counts,
             warnings=warnings,
         )
@@ -100,7 +101,7 @@ class Recorder:
             if robot.packet_bytes:
                 self._bytes += (robot.packet_bytes, robot.octree_bytes, robot.grid_bytes)
                 self._num_published += 1
-        self._links += metrics.links
+        self._links.add(metrics.links)
         self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
 
     def _is_due(self, tick: Tick, every: float) -> bool:
@@ -115,7 +116,8 @@ class Recorder:
 
         def encode(robot_id: str, octree: SemanticOctree) -> MapState:
             sequence = self._num_states[robot_id]
-            is_key_frame = sequence % STATES_PER_KEY_FRAME == 0
+            # A robot that forgot has another octree, and a delta takes no bricks away.
+            is_key_frame = sequence % STATES_PER_KEY_FRAME == 0 or self._stored.get(robot_id) is not octree
             if is_key_frame:
                 data = codec.encode_packet(octree)
             else:
@@ -126,6 +128,7 @@ class Recorder:
         for state in self._threads.map(encode, tick.graph.robot_ids, tick.maps):
             self._writer.write_state(state)
             self._num_states[state.robot_id] += 1
+        self._stored = dict(zip(tick.graph.robot_ids, tick.maps, strict=True))
         self._state_tick = tick.number
 
     def _write_views(self, tick: Tick) -> None:

@@ -193,6 +193,6 @@ class Robot(ABC):
         """The largest change of a log-odds since ``before``, which is overwritten."""
         return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
 
-    def _prune(self) -> None:
+    def _update_streams(self) -> None:
         """The map's streams, with its leaves merged."""
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)

@@ -73,7 +73,8 @@ class Session:
 
     ``config`` is resolved and has a class table; ``sources`` give each robot's frames, in the order of
     ``config.robots``. Raises ConfigError where epsilon is above the bound of a graph that occurs, and InputError where
-    no robot has a frame. The result does not depend on ``num_threads``.
+    no robot has a frame. The result does not depend on ``num_threads``. ``is_symmetric`` says whether on all graphs so
+    far every link carried both ways, with the same weight.
     """
 
     def __init__(self, config: RunConfig, sources: Sequence[FrameSource], *, num_threads: int | None = None) -> None:
@@ -81,6 +82,7 @@ class Session:
             raise InputError("a session needs a class table")
         self.config = config
         self.stop_reason = ""
+        self.is_symmetric = True
         self._num_classes = config.classes.num_classes
         self._robot_ids = tuple(robot.robot_id for robot in config.robots)
         _check_budget(config.packet, self._num_classes)
@@ -141,6 +143,7 @@ class Session:
             self._integrate(number, stamp_ns)
             self._graph = self._network.at(elapsed, self._active(stamp_ns), self._positions())
         graph = self._graph
+        self.is_symmetric &= graph.is_symmetric
         published = self._publish(graph, number, stamp_ns)
         receipts = self._deliver(graph, stamp_ns)
         changes = self._iterate(graph, gamma_factor, number)
@@ -165,6 +168,7 @@ class Session:
             self._past_lives.append(robot.evidence)
             self._robots[index] = self._new_robot(index, robot.source.epoch + 1)
             self._robots[index].T_team_sensor = robot.T_team_sensor
+            self._comparer.forget()
 
     def _active(self, stamp_ns: int) -> list[bool]:
         """Which robots (N,) have begun and not left."""
@@ -388,7 +392,7 @@ def replay_team(
                 raise InputError(f"{error}: {_causes(logs)}") from error
             raise
         counts = {log.robot_id: log.counts for log in logs}
-        warnings = (*_rule_warnings(config), *_warnings(logs, recorder))
+        warnings = (*_rule_warnings(config, session.is_symmetric), *_warnings(logs, recorder))
         with deferred_interrupts():
             summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
             if writer is not None:
@@ -423,8 +427,8 @@ def _check_budget(packet: PacketConfig, num_classes: int) -> None:
         )
 
 
-def _rule_warnings(config: RunConfig) -> tuple[str, ...]:
-    """What a user should know of a rule on this network."""
+def _rule_warnings(config: RunConfig, is_symmetric: bool) -> tuple[str, ...]:
+    """What a user should know of a rule on this network, whose links carried the same both ways or did not."""
     rule, ids = config.consensus.rule, [robot.robot_id for robot in config.robots]
     if rule == "merge":
         return ("rule 'merge' adds up what it heard before again and again; it is a baseline, not a map to trust",)
@@ -432,7 +436,7 @@ def _rule_warnings(config: RunConfig) -> tuple[str, ...]:
         return ()
     links = [config.link_config(a, b) for a in ids for b in ids if a != b]
     causes = {
-        "one-way links": bool(config.network.one_way) or any(e.robots_silent for e in config.network.schedule),
+        "links that do not carry the same both ways": not is_symmetric,
         "losses": any(link.mean_loss > 0 or link.rate is not None for link in links),
         "maps that arrive in a later tick": any(link.latency > 0 for link in links),
         "robots that publish at different times": len({(r.publish_period, r.publish_phase) for r in config.robots}) > 1,

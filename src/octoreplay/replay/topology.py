@@ -66,7 +66,7 @@ def _fixed_graph(network: NetworkConfig, robot_ids: Sequence[str]) -> nx.Graph:
         index_of = {robot_id: index for index, robot_id in enumerate(robot_ids)}
         return nx.Graph((index_of[a], index_of[b]) for a, b, _ in network.edges)
     if network.topology == "random":
-        return nx.gnp_random_graph(num_robots, network.link_prob, seed=network.network_seed)
+        return nx.gnp_random_graph(num_robots, network.prob_link, seed=network.network_seed)
     if network.topology == "star":
         return nx.star_graph(num_robots - 1)  # counts the leaves
     if network.topology == "grid":
