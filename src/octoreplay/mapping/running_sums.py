@@ -7,8 +7,8 @@ equal shares of both, and adds one to what it sends: the running sums sigma_i an
 receiver takes in what they grew by since it last heard of them, so the next packet brings what a lost one withheld.
 Nothing is ever created or lost, so all y_i / z_i tend to the mean of the evidence.
 
-A link that comes up later carries what came since: its receiver starts with the sums of that moment as the old ones.
-One that goes down and comes up again goes on where it stopped, without what was summed up while it was down; who sends keeps these differences.
+A link that comes up later carries what came since, and one that was down goes on where it stopped: what was summed up
+meanwhile is not for its receiver. The sender takes it off (``difference``).
 
 Masses and running sums are octrees, integers in units of UNIT modulo MODULUS, stored as the bits of the float32 values
 (kernels/running_sums.py). Sums may wrap around for ever: only differences count, and these are exact modulo MODULUS
