@@ -380,20 +380,20 @@ def replay_team(
         recorder = Recorder(config, writer, threads)
         total_ns = _total_ns(logs)
         _check_num_ticks(config, total_ns)
-        try:
-            for tick in session.ticks():
-                with deferred_interrupts():
+        with deferred_interrupts() as deliver_interrupts:
+            try:
+                for tick in session.ticks():
                     recorder.record(tick)
-                if progress is not None:
-                    log_ns = tick.stamp_ns - recorder.start_ns
-                    progress(Progress(log_ns, total_ns, tick.number, tick.metrics.total_distance, tick.settling))
-        except InputError as error:
-            if recorder.last is None:
-                raise InputError(f"{error}: {_causes(logs)}") from error
-            raise
-        counts = {log.robot_id: log.counts for log in logs}
-        warnings = (*_rule_warnings(config, session.is_symmetric), *_warnings(logs, recorder))
-        with deferred_interrupts():
+                    if progress is not None:
+                        log_ns = tick.stamp_ns - recorder.start_ns
+                        progress(Progress(log_ns, total_ns, tick.number, tick.metrics.total_distance, tick.settling))
+                    deliver_interrupts()
+            except InputError as error:
+                if recorder.last is None:
+                    raise InputError(f"{error}: {_causes(logs)}") from error
+                raise
+            counts = {log.robot_id: log.counts for log in logs}
+            warnings = (*_rule_warnings(config, session.is_symmetric), *_warnings(logs, recorder))
             summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
             if writer is not None:
                 writer.complete(summary)
