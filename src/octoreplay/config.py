@@ -183,7 +183,9 @@ class ScheduleEntry:
     forget: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.start < self.end:
+        if not self.start >= 0:
+            raise ConfigError(f"schedule: from: {self.start:g} s is before the run's start; it must be at least 0")
+        if not self.start < self.end:
             raise ConfigError(f"schedule: an entry lasts from {self.start:g} s to {self.end:g} s; 'from' must be first")
         if self.forget and not self.robots_off:
             raise ConfigError("schedule: 'forget' goes with robots_off")

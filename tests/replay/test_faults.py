@@ -299,9 +299,14 @@ PAIR = FIXTURES / "pair" / "team.yaml"
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
-        ({"rule": "bayes", "loss": 0.2}, "with losses it drifts from the mean: rule 'ratio' or 'flood' does not"),
+        ({"rule": "bayes", "loss": 0.2}, "with losses it drifts from the mean; rule 'ratio' or 'flood' does not"),
         ({"rule": "bayes", "latency": 0.3}, "with maps that arrive in a later tick it drifts"),
-        ({"rule": "bayes", "rate": 1e6}, "with losses it drifts"),
+        ({"rule": "bayes", "rate": 1e6}, "with maps that arrive in a later tick it drifts"),
+        (
+            {"rule": "bayes", "loss": 0.2, "latency": 0.3},
+            "with losses and maps that arrive in a later tick it drifts",
+        ),
+        ({"rule": "bayes", "packets": "delta", "budget": 9000}, "drifts from the mean; rule 'flood' does not"),
         ({"rule": "merge"}, "rule 'merge' adds up what it heard before again and again"),
     ],
 )

@@ -437,8 +437,8 @@ def _rule_warnings(config: RunConfig, is_symmetric: bool) -> tuple[str, ...]:
     links = [config.link_config(a, b) for a in ids for b in ids if a != b]
     causes = {
         "links that do not carry the same both ways": not is_symmetric,
-        "losses": any(link.mean_loss > 0 or link.rate is not None for link in links),
-        "maps that arrive in a later tick": any(link.latency > 0 for link in links),
+        "losses": any(link.mean_loss > 0 for link in links),
+        "maps that arrive in a later tick": any(link.latency > 0 or link.rate is not None for link in links),
         "robots that publish at different times": len({(r.publish_period, r.publish_phase) for r in config.robots}) > 1,
         "maps that a budget holds back": config.packet.budget is not None,
         "robots that go off": any(entry.robots_off for entry in config.network.schedule),
@@ -446,9 +446,11 @@ def _rule_warnings(config: RunConfig, is_symmetric: bool) -> tuple[str, ...]:
     found = [cause for cause, is_there in causes.items() if is_there]
     if not found:
         return ()
+    # What a robot that is gone held is gone with 'ratio' too, and that rule knows no budget.
+    others = "'flood' does" if causes["robots that go off"] or config.packet.budget else "'ratio' or 'flood' does"
     sentence = (
         "rule 'bayes' keeps the team's sum only when both ends of a link hear each other in every tick; with"
-        f" {', '.join(found)} it drifts from the mean: rule 'ratio' or 'flood' does not"
+        f" {', '.join([*found[:-2], ' and '.join(found[-2:])])} it drifts from the mean; rule {others} not"
     )
     return (sentence,)
 
