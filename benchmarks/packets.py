@@ -123,11 +123,9 @@ def _play(config: RunConfig, duration: float, watch: Watcher | None = None, blan
         frames = tuple(tuple(_blanked(f, start_ns + round(blank_after * 1e9)) for f in part) for part in frames)
     session = Session(config, [_Stored(part) for part in frames], num_threads=2)
     ticks = []
-    running = session.ticks()
-    for tick in running:
+    for tick in session.ticks():
         ticks.append(tick.metrics)
         if watch is not None and watch(session, tick):
-            running.close()  # type: ignore[attr-defined]
             break
     return Watched(tuple(ticks), session.stop_reason)
 
@@ -183,7 +181,7 @@ def _ids(config: RunConfig) -> tuple[str, ...]:
 
 def _robots(session: Session) -> list[Robot]:
     """The robots themselves: what they hold is in no metric."""
-    return session._robots  # noqa: SLF001
+    return session._robots  # noqa: SLF001 (users have no need of them, so there is no public way)
 
 
 def _worst(tick: TickMetrics) -> tuple[float, float]:

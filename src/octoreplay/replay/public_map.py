@@ -17,7 +17,6 @@ from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
 FIT_TRIES = 6
 """Packets that are encoded at most to find one that fits the budget."""
 
-
 ZSTD_FRAME_BYTES = 64
 """More than zstd adds to parts that it cannot compress."""
 

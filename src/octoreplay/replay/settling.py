@@ -14,10 +14,8 @@ from octoreplay.replay.graph import STEP_SIZE_RULES, CommunicationGraph, settle_
 QUIET_PROB = 1e-3
 """A link may be silent by chance for as long as settling has to be quiet with this probability."""
 
-
 BUDGET_TICKS = 100
 """Ticks that a change may wait for the budget while a team settles."""
-
 
 FLOOD_TICKS = 10_000
 """Most ticks that settling waits for evidence that a budget holds back."""
@@ -31,7 +29,7 @@ def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig, transmission: 
     """
     links = [link for link in _link_configs(graph, config).values() if link.mean_loss < 1.0]
     num_losses = max((_num_losses(link.repeated_loss) for link in links), default=1)
-    slower = _repeats(config, links) * _turns(config) * _slowest(config)
+    slower = _repeats(config, links) * _sources_in_turn(config) * _slowest(config)
     # A packet that found a link busy waits for one transmission, and takes another.
     return num_losses * slower + _delay(links, config, 2.0 * transmission)
 
@@ -83,7 +81,7 @@ def _repeats(config: RunConfig, links: Sequence[LinkConfig]) -> int:
     return packet.key_frame_every if waits else 1
 
 
-def _turns(config: RunConfig) -> int:
+def _sources_in_turn(config: RunConfig) -> int:
     """Ticks in which every robot's evidence has its turn, where a budget leaves room for some only."""
     takes_turns = config.consensus.rule == "flood" and config.packet.budget is not None
     return len(config.robots) if takes_turns else 1
