@@ -26,8 +26,8 @@ import zstandard
 from rounds import Report, Row, arguments, measured
 
 from octoreplay.config import MapConfig, RunConfig, ScheduleEntry, load_team_file
-from octoreplay.io.discover import resolve
-from octoreplay.io.robot_log import RobotLog
+from octoreplay.io.robots.discover import resolve
+from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import PacketFormat
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence

@@ -23,9 +23,9 @@ from rounds import Report, Row, arguments, interleave, measured
 from scenes import cache_folder
 
 from octoreplay.config import RunConfig, load_team_file
-from octoreplay.io.discover import resolve
-from octoreplay.io.result_writer import ResultWriter
-from octoreplay.io.robot_log import RobotLog
+from octoreplay.io.results.result_writer import ResultWriter
+from octoreplay.io.robots.discover import resolve
+from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import RunSummary
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import Progress, Session, replay_team

@@ -154,9 +154,9 @@ def lidar_scene(num_frames: int = 100, seed: int = 0, track: int = 0, tracks: in
 
 def seven_scenes(folder: Path, num_frames: int = 100) -> Scene:
     """Real frames of a 7-Scenes sequence (``frame-NNNNNN.depth.png`` and ``.pose.txt``); they carry no labels."""
-    from octoreplay.io.discover import discover
-    from octoreplay.io.rgbd_folder import import_rgbd
-    from octoreplay.io.robot_log import RobotLog
+    from octoreplay.io.datasets.rgbd_folder import import_rgbd
+    from octoreplay.io.robots.discover import discover
+    from octoreplay.io.robots.robot_log import RobotLog
 
     log_path = cache_folder() / f"seven-scenes-{folder.resolve().name}-{num_frames}.mcap"
     if not log_path.exists():

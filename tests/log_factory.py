@@ -13,8 +13,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from octoreplay.io.mcap_writer import RosMcapWriter
-from octoreplay.io.messages import typestore
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.messages.ros_types import typestore
 
 SECOND = 1_000_000_000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from octoreplay.config import RobotConfig, RunConfig, class_table
-from octoreplay.io.result_writer import ResultWriter
+from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import (
     FrameCounts,
     LeafTable,

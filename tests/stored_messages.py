@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from octoreplay.io.messages import typestore
+from octoreplay.io.messages.ros_types import typestore
 
 DEPTH_TYPES = {"16UC1": "<u2", "32FC1": "<f4"}
 LABEL_TYPES = {"mono8": "<u1", "mono16": "<u2"}

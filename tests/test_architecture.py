@@ -25,8 +25,8 @@ ignore_imports = ["octoreplay -> octoreplay.**"]
 
 BREACHES = {
     "octoreplay.errors imports octoreplay.cli": ("errors.py", "from octoreplay import cli"),
-    "octoreplay.mapping imports octoreplay.io": ("mapping/__init__.py", "from octoreplay.io import poses"),
-    "octoreplay.io imports octoreplay.mapping": ("io/poses.py", "from octoreplay.mapping import kernels"),
+    "octoreplay.mapping imports octoreplay.io": ("mapping/__init__.py", "from octoreplay.io.robots import poses"),
+    "octoreplay.io imports octoreplay.mapping": ("io/robots/poses.py", "from octoreplay.mapping import kernels"),
     "octoreplay.mapping imports mcap": ("mapping/__init__.py", "import mcap"),
 }
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from octoreplay import cli
-from octoreplay.io.messages import OCTOREPLAY_MSGS
-from octoreplay.io.result_writer import VIEW_DTYPE
+from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
+from octoreplay.io.results.result_writer import VIEW_DTYPE
 from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
 
 DOCS = Path(__file__).parents[1] / "docs"

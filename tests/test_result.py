@@ -9,7 +9,7 @@ import pytest
 
 import leaf_list
 from octoreplay.errors import InputError, PacketError
-from octoreplay.io.result_writer import ResultWriter
+from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.result import Result, open_result
 from result_factory import CLASSES, SECOND, START, leaf_table, state, summary, team, tick_metrics, write_result

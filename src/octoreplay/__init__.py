@@ -12,8 +12,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from octoreplay.config import RobotConfig, RunConfig, load_team_file
     from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
-    from octoreplay.io.discover import discover, resolve
-    from octoreplay.io.logs import open_log
+    from octoreplay.io.containers.logs import open_log
+    from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
     from octoreplay.replay.session import Progress, replay_team
     from octoreplay.report.export import export_ply
@@ -38,13 +38,13 @@ _HOMES = {
     "SimulationConfig": "simulate.team",
     "StoredMap": "result",
     "TickMetrics": "records",
-    "discover": "io.discover",
+    "discover": "io.robots.discover",
     "export_ply": "report.export",
     "load_team_file": "config",
-    "open_log": "io.logs",
+    "open_log": "io.containers.logs",
     "open_result": "result",
     "replay_team": "replay.session",
-    "resolve": "io.discover",
+    "resolve": "io.robots.discover",
     "simulate_team": "simulate.team",
 }
 """The module that each public name comes from."""

@@ -119,7 +119,7 @@ def run(
     Give a team file, or logs (MCAP, ROS 1 bags, rosbag2 folders) in which robots and topics are found by themselves.
     What was found is shown, and --save-team saves it.
     """
-    from octoreplay.io import discover
+    from octoreplay.io.robots import discover
     from octoreplay.report import tables
 
     if output is None and save_team is None:
@@ -184,7 +184,7 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
     Takes under two minutes. Says what it made and how to look at it.
     """
     from octoreplay.config import load_team_file
-    from octoreplay.io import discover
+    from octoreplay.io.robots import discover
     from octoreplay.report import export, plots, tables
     from octoreplay.result import open_result
 
@@ -270,7 +270,7 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
 @click.argument("logs", nargs=-1, required=True, type=_existing, metavar="LOG...")
 def info(logs: tuple[Path, ...]) -> int:
     """Show what logs hold: robots, topics, types, rates, spans, and what is missing for a run."""
-    from octoreplay.io import discover
+    from octoreplay.io.robots import discover
     from octoreplay.report import tables
 
     description = discover.describe(logs)
@@ -341,7 +341,7 @@ def query(
 def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, **options: Any) -> int:
     """Write a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) as a robot's log."""
     from octoreplay.config import load_team_file
-    from octoreplay.io import rgbd_folder
+    from octoreplay.io.datasets import rgbd_folder
 
     _check_output(output, ".mcap")
     numbers = None if intrinsics is None else _numbers("intrinsics", intrinsics, 4)
@@ -399,8 +399,8 @@ def _is_team_file(inputs: Sequence[Path]) -> bool:
 def _base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console) -> RunConfig:
     """The configuration before any option: of a stored result, of a team file, or found in logs."""
     from octoreplay.config import load_team_file
-    from octoreplay.io import discover
-    from octoreplay.io.result_reader import ResultReader
+    from octoreplay.io.results.result_reader import ResultReader
+    from octoreplay.io.robots import discover
 
     if config_from is not None:
         if inputs:
@@ -519,7 +519,7 @@ def _save_team(config: RunConfig, path: Path) -> None:
 
 def _replay(config: RunConfig, output: Path) -> RunSummary:
     """Run with a progress bar; says where the finished part is when interrupted."""
-    from octoreplay.io.result_writer import partial_path
+    from octoreplay.io.results.result_writer import partial_path
     from octoreplay.replay.session import replay_team
 
     with _progress("replay") as update:

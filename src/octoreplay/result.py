@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from octoreplay.config import RunConfig
 from octoreplay.errors import InputError, PacketError
-from octoreplay.io import posterior
-from octoreplay.io.result_reader import ResultReader
+from octoreplay.io.results import posterior
+from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.mapping.codec import apply_delta, decode_packet
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (

@@ -9,7 +9,7 @@ from plyfile import PlyData
 import leaf_list
 from octoreplay.config import PALETTE
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.result_writer import ResultWriter
+from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.report.export import FREE_COLOR, export_ply
 from result_factory import leaf_table, state, write_result

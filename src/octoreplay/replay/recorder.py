@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from octoreplay.config import RunConfig
-from octoreplay.io.result_writer import ResultWriter
+from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics

@@ -16,9 +16,9 @@ import numpy as np
 
 from octoreplay.config import PacketConfig, RunConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.discover import resolve
-from octoreplay.io.result_writer import ResultWriter
-from octoreplay.io.robot_log import RobotLog
+from octoreplay.io.results.result_writer import ResultWriter
+from octoreplay.io.robots.discover import resolve
+from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree

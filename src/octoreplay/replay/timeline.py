@@ -9,7 +9,7 @@ from octoreplay.records import Frame
 
 
 class FrameSource(Protocol):
-    """A robot's frames in the order of their stamps (``io.robot_log.RobotLog``)."""
+    """A robot's frames in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
 
     def frames(self) -> Iterator[Frame]:
         """The frames from the beginning."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from octoreplay.config import PALETTE
 from octoreplay.errors import ConfigError
-from octoreplay.io import ply, posterior
+from octoreplay.io.results import ply, posterior
 from octoreplay.records import BoolArray, ClassTable, Float64Array, FloatArray, LeafTable, UInt8Array
 from octoreplay.result import Result, StoredMap, open_result
 

@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from octoreplay.config import RobotConfig, RunConfig
-from octoreplay.io import posterior
+from octoreplay.io.results import posterior
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
-    from octoreplay.io.discover import LogDescription, LogSummary
+    from octoreplay.io.robots.discover import LogDescription, LogSummary
     from octoreplay.result import PointQuery
 
 _YEAR_2000_NS = 946_684_800_000_000_000

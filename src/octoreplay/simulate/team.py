@@ -11,7 +11,7 @@ import numpy as np
 
 from octoreplay.config import MapConfig, RobotConfig, RunConfig, dump_team
 from octoreplay.errors import ConfigError, OutputError
-from octoreplay.io.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
+from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
 from octoreplay.records import CameraModel, Float64Array
 from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore

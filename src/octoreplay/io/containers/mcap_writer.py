@@ -1,0 +1,91 @@
+"""MCAP files of ROS 2 CDR messages with embedded schemas, as rosbag2 writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.writer import CompressionType, Writer
+
+from octoreplay import __version__
+from octoreplay.errors import OutputError
+from octoreplay.io.messages.ros_types import typestore
+
+
+class RosMcapWriter:
+    """Writes one MCAP file with profile ``ros2``; a context manager that finishes the file.
+
+    The same calls give the same bytes: nothing of the clock or the machine is written.
+    Raises OutputError where the file cannot be created or written.
+    """
+
+    def __init__(self, path: Path, *, chunk_size: int = 1 << 20) -> None:
+        self.path = path
+        try:
+            self._file = path.open("wb")
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+        self._writer = Writer(self._file, chunk_size=chunk_size, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library=f"octoreplay {__version__}")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequences: dict[int, int] = {}
+        self._finished = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.finish()
+
+    def write(self, topic: str, type_name: str, value: Any, stamp_ns: int) -> None:
+        """Append one message of a registered type; ``stamp_ns`` is its log and publish time."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._register(topic, type_name)
+        sequence = self._sequences.get(channel, 0)
+        self._sequences[channel] = sequence + 1
+        data = bytes(typestore().serialize_cdr(value, type_name))
+        self._guard(
+            lambda: self._writer.add_message(
+                channel_id=channel, log_time=stamp_ns, publish_time=stamp_ns, sequence=sequence, data=data
+            )
+        )
+
+    def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Append one metadata record."""
+        self._guard(lambda: self._writer.add_metadata(name, dict(values)))
+
+    def finish(self) -> None:
+        """Write summary and footer and close the file; a second call does nothing."""
+        if self._finished:
+            return
+        self._finished = True
+        try:
+            self._guard(self._writer.finish)
+        finally:
+            self._guard(self._file.close)
+
+    def _register(self, topic: str, type_name: str) -> int:
+        """The channel of a topic, new."""
+        if type_name not in self._schemas:
+            definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
+            self._schemas[type_name] = self._writer.register_schema(
+                name=type_name, encoding="ros2msg", data=definition.encode()
+            )
+        self._channels[topic] = self._writer.register_channel(
+            topic=topic, message_encoding="cdr", schema_id=self._schemas[type_name],
+            metadata={"offered_qos_profiles": ""},
+        )  # fmt: skip
+        return self._channels[topic]
+
+    def _guard(self, action: Any) -> None:
+        """Run one writing step; a full disk or the like becomes one sentence."""
+        try:
+            action()
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error

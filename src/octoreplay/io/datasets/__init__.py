@@ -1,0 +1,1 @@
+"""Folders of other people's data, written as logs."""

@@ -1,0 +1,474 @@
+"""Folders of depth pictures with poses, turned into ordinary logs.
+
+Three layouts are told apart by what is in the folder:
+
+* 7-Scenes: ``frame-NNNNNN.depth.png`` (millimetres) with ``frame-NNNNNN.pose.txt`` (4x4, camera to world), and the 3x3
+  matrix K in ``camera-intrinsics.txt`` here or one folder up; without it fx = fy = 585, cx = 320, cy = 240.
+* TUM RGB-D: ``depth.txt`` (stamp, file; 1/5000 m) and ``groundtruth.txt`` (stamp, position, quaternion of the camera),
+  fx = fy = 525, cx = 319.5, cy = 239.5. Poses are interpolated at the depth stamps.
+* ScanNet: ``depth/N.png`` (millimetres), ``pose/N.txt`` (4x4, camera to world), ``intrinsic/intrinsic_depth.txt`` and,
+  where it was exported, ``label/N.png`` or ``label-filt/N.png``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.errors import ConfigError, InputError, OutputError
+from octoreplay.io.robots.poses import PoseTrack, inverse, pose_matrix
+from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
+from octoreplay.records import CameraModel, ClassTable, Float64Array
+
+MILLIMETRE = 0.001
+
+_POSE_GAP_NS = 200_000_000
+_INVALID = 65535
+
+
+@dataclass(frozen=True)
+class ImportSummary:
+    """What was imported. ``num_without_pose`` frames were left out because their pose is missing or not finite."""
+
+    path: Path
+    robot_id: str
+    layout: str
+    camera: CameraModel
+    depth_unit: float
+    num_frames: int
+    num_labelled: int
+    num_without_pose: int
+    duration: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One picture of the folder: its files, its stamp where the folder has one, and how to get its pose."""
+
+    depth_file: Path
+    label_file: Path | None
+    stamp_ns: int | None
+    read_pose: Callable[[], Float64Array | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """What the folder is: its frames in order, its camera (fx, fy, cx, cy) and the metres in one unit of depth.
+
+    ``assumed`` intrinsics are not the folder's own but what the dataset says of its 640x480 pictures.
+    """
+
+    name: str
+    frames: list[_Frame]
+    intrinsics: tuple[float, float, float, float]
+    assumed: bool
+    depth_unit: float
+
+
+def import_rgbd(
+    folder: Path,
+    output: Path,
+    *,
+    rate: float | None = None,
+    times: Path | None = None,
+    robot_id: str | None = None,
+    intrinsics: Sequence[float] | None = None,
+    depth_unit: float | None = None,
+    labels: Path | None = None,
+    class_table: ClassTable | None = None,
+    first: int = 0,
+    last: int | None = None,
+    every: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> ImportSummary:
+    """Write the depth pictures and poses of a folder as one robot's log (MCAP).
+
+    Frames ``first`` to ``last`` (both included, counted from 0 in the folder's order) are taken, of them each
+    ``every``-th. They are stamped from 0 on at ``rate`` Hz; or with the seconds that the text file ``times`` lists, one
+    line for each frame of the folder or for each one taken; or, in a TUM folder without either, with their own stamps.
+    Depth in millimetres is written as 16UC1 with 0 where nothing was measured (0 or 65535 in the files), other units
+    as 32FC1 metres with NaN there. ``intrinsics`` (fx, fy, cx, cy) in pixels and ``depth_unit`` in metres take the
+    place of the folder's. ``labels`` is a folder of label PNGs named like the depth ones; ``class_table`` names their
+    values. The log's name gives ``robot_id`` where it is None. The same input gives the same bytes.
+
+    Raises InputError for what is missing or damaged, ConfigError for options that do not fit, OutputError where the log
+    cannot be written; then nothing is left behind.
+    """
+    _check_options(rate, times, first, every, intrinsics, depth_unit)
+    robot_id = _robot_id(output) if robot_id is None else robot_id
+    if not robot_id or "/" in robot_id:
+        raise ConfigError(f"robot id '{robot_id}': must not be empty or contain '/'")
+    layout = _find_layout(folder)
+    frames = layout.frames if labels is None else _with_labels(layout.frames, labels)
+    chosen = range(first, len(frames) if last is None else min(last + 1, len(frames)), every)
+    if not chosen:
+        raise ConfigError(f"{folder}: no frame between first {first} and last {last}; the folder has {len(frames)}")
+    stamps = _stamps(folder, [frames[k] for k in chosen], chosen, len(frames), rate, times)
+    partial = output.with_name(f"{output.stem}.partial.mcap")
+    job = _Import(
+        frames=[frames[k] for k in chosen],
+        stamps=stamps,
+        camera=_camera(
+            frames[chosen[0]].depth_file, intrinsics or layout.intrinsics, assumed=layout.assumed and intrinsics is None
+        ),
+        depth_unit=layout.depth_unit if depth_unit is None else depth_unit,
+    )
+    try:
+        job.write(partial, robot_id, class_table, progress)
+        if job.num_frames == 0:
+            raise InputError(f"{folder}: none of the {len(chosen)} frames has a usable pose")
+        partial.replace(output)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
+        raise
+    return ImportSummary(
+        output, robot_id, layout.name, job.camera, job.depth_unit, job.num_frames, job.num_labelled,
+        job.num_without_pose, (stamps[-1] - stamps[0]) / 1e9,
+    )  # fmt: skip
+
+
+@dataclass
+class _Import:
+    """One import under way, and what it counts."""
+
+    frames: list[_Frame]
+    stamps: list[int]
+    camera: CameraModel
+    depth_unit: float
+    num_frames: int = 0
+    num_labelled: int = 0
+    num_without_pose: int = 0
+
+    def write(
+        self, path: Path, robot_id: str, class_table: ClassTable | None, progress: Callable[[float], None] | None
+    ) -> None:
+        """Write the log."""
+        T_body_sensor = np.eye(4)
+        T_body_sensor[:3, :3] = OPTICAL_IN_BODY
+        T_sensor_body = inverse(T_body_sensor)
+        with RobotLogWriter(
+            path, robot_id, self.camera, class_table, T_body_sensor=T_body_sensor, start_ns=self.stamps[0]
+        ) as log:
+            for index, (frame, stamp_ns) in enumerate(zip(self.frames, self.stamps, strict=True)):
+                T_map_sensor = frame.read_pose()
+                if T_map_sensor is None:
+                    self.num_without_pose += 1
+                    continue
+                depth = self._depth_image(frame.depth_file)
+                label_image = None if frame.label_file is None else self._label_image(frame.label_file)
+                log.write_pose(stamp_ns, T_map_sensor @ T_sensor_body)
+                log.write_frame(stamp_ns, depth, label_image)
+                self.num_frames += 1
+                self.num_labelled += label_image is not None
+                if progress is not None:
+                    progress((index + 1) / len(self.frames))
+
+    def _depth_image(self, path: Path) -> npt.NDArray[Any]:
+        """A depth picture as the log holds it: uint16 millimetres, or float32 metres."""
+        raw = _read_png(path)
+        if raw.dtype != np.uint16:
+            raise InputError(f"{path}: a depth picture must be a 16-bit grey PNG, this one has {_kind(raw)}")
+        self._check_size(path, raw)
+        measured = (raw != 0) & (raw != _INVALID)
+        if abs(self.depth_unit - MILLIMETRE) < 1e-12:
+            return np.where(measured, raw, np.uint16(0))
+        metres = (raw * self.depth_unit).astype(np.float32)
+        return np.where(measured, metres, np.float32(np.nan))
+
+    def _label_image(self, path: Path) -> npt.NDArray[Any]:
+        """A label picture, uint8 or uint16."""
+        raw = _read_png(path)
+        if raw.ndim != 2:
+            raise InputError(f"{path}: a label picture must be an 8-bit or 16-bit grey PNG, this one has {_kind(raw)}")
+        self._check_size(path, raw)
+        return raw
+
+    def _check_size(self, path: Path, image: npt.NDArray[Any]) -> None:
+        if image.shape != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"{path}: is {image.shape[1]}x{image.shape[0]} pixels, but the depth pictures are "
+                f"{self.camera.width}x{self.camera.height}; resize it without interpolation"
+            )
+
+
+def _check_options(
+    rate: float | None,
+    times: Path | None,
+    first: int,
+    every: int,
+    intrinsics: Sequence[float] | None,
+    depth_unit: float | None,
+) -> None:
+    """Refuse options that make no sense whatever the folder holds."""
+    if rate is not None and times is not None:
+        raise ConfigError("rate and times: give one of them, not both")
+    if rate is not None and not 0 < rate <= 1e6:
+        raise ConfigError(f"rate: {rate:g} must be greater than 0 and at most 1000000")
+    if first < 0:
+        raise ConfigError(f"first: {first} is below the least value 0")
+    if every < 1:
+        raise ConfigError(f"every: {every} is below the least value 1")
+    if intrinsics is not None and (
+        len(intrinsics) != 4 or not np.isfinite(intrinsics).all() or min(intrinsics[:2]) <= 0
+    ):
+        raise ConfigError("intrinsics: expects 4 numbers fx, fy, cx, cy in pixels, fx and fy greater than 0")
+    if depth_unit is not None and not 0 < depth_unit < 1000:
+        raise ConfigError(f"depth_unit: {depth_unit:g} must be greater than 0 and below 1000 metres")
+
+
+def _robot_id(output: Path) -> str:
+    """A robot id that is good in topic names, from the log's file name."""
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", output.stem).strip("_") or "robot"
+    return f"robot_{name}" if name[0].isdigit() else name
+
+
+# --- layouts ---------------------------------------------------------------------------------------------------------
+
+
+def _find_layout(folder: Path) -> _Layout:
+    """Tell the layout by what is in the folder."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder")
+    pictures = sorted(folder.glob("frame-*.depth.png"), key=_number)
+    if pictures:
+        return _seven_scenes(folder, pictures)
+    if (folder / "depth.txt").is_file() and (folder / "groundtruth.txt").is_file():
+        return _tum(folder)
+    pictures = sorted((folder / "depth").glob("*.png"), key=_number)
+    if pictures and (folder / "pose").is_dir():
+        return _scannet(folder, pictures)
+    raise InputError(
+        f"{folder}: no RGB-D sequence found; looked for frame-*.depth.png with frame-*.pose.txt (7-Scenes), depth.txt "
+        "with groundtruth.txt (TUM RGB-D), depth/*.png with pose/*.txt (ScanNet)"
+    )
+
+
+def _number(path: Path) -> tuple[int, str]:
+    """Sorts frames by the number in their name, so that 10 comes after 9."""
+    digits = re.search(r"\d+", path.name)
+    return (int(digits.group()) if digits else -1, path.name)
+
+
+def _seven_scenes(folder: Path, pictures: list[Path]) -> _Layout:
+    intrinsics, assumed = (585.0, 585.0, 320.0, 240.0), True
+    for place in (folder, folder.parent):
+        if (place / "camera-intrinsics.txt").is_file():
+            intrinsics, assumed = _read_camera_matrix(place / "camera-intrinsics.txt"), False
+            break
+    frames = [
+        _Frame(picture, None, None, _matrix_reader(picture.with_name(f"{_stem(picture)}.pose.txt")))
+        for picture in pictures
+    ]
+    return _Layout("7-Scenes", frames, intrinsics, assumed, MILLIMETRE)
+
+
+def _scannet(folder: Path, pictures: list[Path]) -> _Layout:
+    path = folder / "intrinsic" / "intrinsic_depth.txt"
+    if not path.is_file():
+        raise InputError(f"{path}: not found; a ScanNet folder holds the depth camera's matrix there")
+    frames = [_Frame(p, None, None, _matrix_reader(folder / "pose" / f"{p.stem}.txt")) for p in pictures]
+    for name in ("label", "label-filt"):
+        if (folder / name).is_dir():
+            frames = _with_labels(frames, folder / name)
+            break
+    return _Layout("ScanNet", frames, _read_camera_matrix(path), False, MILLIMETRE)
+
+
+def _tum(folder: Path) -> _Layout:
+    track = PoseTrack(_POSE_GAP_NS)
+    for where, fields in _rows(folder / "groundtruth.txt"):
+        if len(fields) != 8:
+            raise InputError(f"{where}: expects a stamp, a position and a quaternion, 8 numbers, got {len(fields)}")
+        values = _floats(where, fields[1:])
+        track.add(_seconds_to_ns(where, fields[0]), values[:3], values[3:])
+    frames = []
+    for where, fields in _rows(folder / "depth.txt"):
+        if len(fields) != 2:
+            raise InputError(f"{where}: expects a stamp and a file name, got {len(fields)} words")
+        stamp_ns = _seconds_to_ns(where, fields[0])
+        frames.append(_Frame(folder / fields[1], None, stamp_ns, _track_reader(track, stamp_ns)))
+    if not frames:
+        raise InputError(f"{folder / 'depth.txt'}: lists no depth pictures")
+    frames.sort(key=lambda frame: frame.stamp_ns or 0)
+    return _Layout("TUM RGB-D", frames, (525.0, 525.0, 319.5, 239.5), True, 1 / 5000)
+
+
+def _with_labels(frames: list[_Frame], folder: Path) -> list[_Frame]:
+    """The frames with the label pictures of the same name; a frame may have none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder of label pictures")
+    by_name = {_stem(path): path for path in sorted(folder.glob("*.png"))}
+    matched = [
+        _Frame(frame.depth_file, by_name.get(_stem(frame.depth_file)), frame.stamp_ns, frame.read_pose)
+        for frame in frames
+    ]
+    if all(frame.label_file is None for frame in matched):
+        raise InputError(
+            f"{folder}: no label picture is named like a depth picture such as '{frames[0].depth_file.name}'"
+        )
+    return matched
+
+
+def _stem(path: Path) -> str:
+    """A picture's name without its endings: frame-000001.depth.png -> frame-000001."""
+    return re.sub(r"(\.(depth|label|labels))?\.png$", "", path.name)
+
+
+# --- times -----------------------------------------------------------------------------------------------------------
+
+
+def _stamps(
+    folder: Path, frames: list[_Frame], chosen: range, total: int, rate: float | None, times: Path | None
+) -> list[int]:
+    """Stamps of the chosen frames, strictly ascending."""
+    if rate is not None:
+        return [round(k * 1e9 / rate) for k in range(len(frames))]
+    if times is not None:
+        stamps = _read_times(times, chosen, total)
+    else:
+        stamps = [frame.stamp_ns for frame in frames if frame.stamp_ns is not None]
+        if len(stamps) < len(frames):
+            raise ConfigError(f"{folder}: the frames have no times; give a rate or a file of times")
+    if any(later <= earlier for earlier, later in pairwise(stamps)):
+        raise InputError(f"{times or folder}: the frames' times do not ascend")
+    if stamps[0] < 0:
+        raise InputError(f"{times or folder}: times must not be negative")
+    return stamps
+
+
+def _read_times(path: Path, chosen: range, total: int) -> list[int]:
+    """Stamps from a text file that holds one for every frame of the folder, or for every chosen one."""
+    stamps = [_seconds_to_ns(where, fields[0]) for where, fields in _rows(path)]
+    if len(stamps) == total:
+        return [stamps[k] for k in chosen]
+    if len(stamps) == len(chosen):
+        return stamps
+    raise InputError(
+        f"{path}: has {len(stamps)} times; the folder has {total} frames, of which {len(chosen)} are taken"
+    )
+
+
+def _seconds_to_ns(where: str, text: str) -> int:
+    """Integer nanoseconds of a decimal number of seconds, without going through a float."""
+    try:
+        return int((Decimal(text) * 1_000_000_000).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError):
+        raise InputError(f"{where}: '{text}' is not a time in seconds") from None
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The rows of a text table as words, with 'file line N' for messages; comments and empty lines are left out."""
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if fields:
+            yield f"{path} line {number}", fields
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file") from error
+
+
+def _floats(where: str, fields: list[str]) -> list[float]:
+    """Numbers from words."""
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        raise InputError(f"{where}: expects numbers, got '{' '.join(fields)}'") from None
+
+
+def _read_matrix(path: Path, shapes: tuple[int, ...]) -> Float64Array:
+    """A square matrix of one of these sizes from a text file."""
+    values = [value for where, fields in _rows(path) for value in _floats(where, fields)]
+    for n in shapes:
+        if len(values) == n * n:
+            return np.array(values).reshape(n, n)
+    expected = " or ".join(f"{n}x{n}" for n in shapes)
+    raise InputError(f"{path}: expects a {expected} matrix, got {len(values)} numbers")
+
+
+def _read_camera_matrix(path: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy from a camera matrix."""
+    K = _read_matrix(path, (3, 4))
+    if not np.isfinite(K[:3, :3]).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise InputError(f"{path}: is not a camera matrix; its focal lengths must be greater than 0")
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
+def _matrix_reader(path: Path) -> Callable[[], Float64Array | None]:
+    """Reads a pose file when asked; None where it is missing or, as for lost tracking in ScanNet, not finite."""
+
+    def read() -> Float64Array | None:
+        if not path.is_file():
+            return None
+        T = _read_matrix(path, (4,))
+        if not np.isfinite(T).all():
+            return None
+        rotation = T[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=0.02) or np.linalg.det(rotation) < 0:
+            raise InputError(f"{path}: its upper left 3x3 part is not a rotation")
+        return T
+
+    return read
+
+
+def _track_reader(track: PoseTrack, stamp_ns: int) -> Callable[[], Float64Array | None]:
+    """Interpolates a pose when asked; None where the track has none at that time."""
+
+    def read() -> Float64Array | None:
+        pose = track.at(stamp_ns)
+        return None if pose is None else pose_matrix(*pose)
+
+    return read
+
+
+def _camera(picture: Path, intrinsics: Sequence[float], *, assumed: bool) -> CameraModel:
+    """The camera of a folder, sized as its first chosen depth picture."""
+    image = _read_png(picture)
+    height, width = image.shape[:2]
+    if assumed and (width, height) != (640, 480):
+        raise ConfigError(
+            f"{picture}: is {width}x{height} pixels, and the folder has no intrinsics; give fx, fy, cx, cy"
+        )
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    return CameraModel(width, height, fx, fy, cx, cy)
+
+
+def _read_png(path: Path) -> npt.NDArray[Any]:
+    """The pixels of a picture: (H, W) uint8 or uint16 for grey ones."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            if image.mode.startswith("I"):
+                # Older Pillow opens 16-bit grey as 32-bit integers.
+                return np.asarray(image).astype(np.uint16)
+            return np.asarray(image)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: not found") from error
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: is not a picture") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path}: is damaged: {error}") from error
+
+
+def _kind(image: npt.NDArray[Any]) -> str:
+    """What a picture is, for a message."""
+    return f"{image.dtype.itemsize * 8} bits in {1 if image.ndim == 2 else image.shape[2]} channels"

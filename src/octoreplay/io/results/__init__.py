@@ -1,0 +1,1 @@
+"""The result of a run as MCAP, and maps as PLY."""

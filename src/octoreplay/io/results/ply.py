@@ -1,0 +1,81 @@
+"""Maps as binary PLY files: leaf centres as points, or cubes of the leaves' sizes.
+
+CloudCompare, MeshLab and Open3D open them. The ``label`` property survives in Open3D through ``open3d.t.io``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from octoreplay.errors import OutputError
+from octoreplay.io.results import posterior
+from octoreplay.records import LeafTable, UInt8Array
+
+VERTEX_DTYPE = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "u1"),
+        ("probability", "<f4"), ("size", "<f4"),
+    ]
+)  # fmt: skip
+"""Properties of every vertex: ``label`` is the most probable class_id (0 free), ``size`` the leaf's edge in metres."""
+
+_CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+"""Corners of the unit cube, x fastest."""
+_FACES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
+"""The cube's faces as corner numbers, counter-clockwise seen from outside."""
+
+
+def write_points(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
+    """Write the leaves' centres as points. ``colors`` is (L, 3) uint8. Raises OutputError."""
+    _write(path, _vertices(leaves, colors, leaves.centers), None, comments)
+
+
+def write_voxels(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
+    """Write every leaf as a cube of its size: 8 vertices and 12 triangles. ``colors`` is (L, 3) uint8.
+
+    Cubes share no vertices, so that each keeps its own colour. Triangles, because not every viewer takes quads.
+    Raises OutputError.
+    """
+    corners = leaves.centers[:, None, :] + _CORNERS[None] * leaves.sizes[:, None, None]
+    vertices = np.repeat(_vertices(leaves, colors, leaves.centers), 8)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = corners[..., axis].reshape(-1)
+    triangles = np.concatenate([_FACES[:, [0, 1, 2]], _FACES[:, [0, 2, 3]]])
+    indices = 8 * np.arange(len(leaves), dtype=np.int32)[:, None, None] + triangles.astype(np.int32)[None]
+    faces = np.empty(12 * len(leaves), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = indices.reshape(-1, 3)
+    _write(path, vertices, faces, comments)
+
+
+def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
+    """One vertex per leaf."""
+    vertices = np.zeros(len(leaves), dtype=VERTEX_DTYPE)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = positions[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colors[:, channel]
+    vertices["label"] = posterior.labels(leaves.log_odds)
+    vertices["probability"] = posterior.label_probabilities(leaves.log_odds)
+    vertices["size"] = leaves.sizes
+    return vertices
+
+
+def _write(path: Path, vertices: Any, faces: Any, comments: Sequence[str]) -> None:
+    """Write under a temporary name, then rename, so that no half file appears."""
+    from plyfile import PlyData, PlyElement
+
+    elements = [PlyElement.describe(vertices, "vertex")]
+    if faces is not None:
+        elements.append(PlyElement.describe(faces, "face"))
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        PlyData(elements, byte_order="<", comments=list(comments)).write(str(partial))
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)

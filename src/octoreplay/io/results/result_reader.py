@@ -1,0 +1,277 @@
+"""Reads a result file back: configuration, classes, metrics, map states and poses (docs/result-format.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+from rosbags.serde import SerdeError
+from zstandard import ZstdError
+
+from octoreplay.config import RunConfig, parse_team
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.containers.fingerprint import fingerprint
+from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
+from octoreplay.io.results.result_writer import FORMAT_VERSION, METRICS_TOPIC, map_state_topic, pose_topic
+from octoreplay.records import (
+    ClassTable,
+    Float64Array,
+    FrameCounts,
+    LinkMetrics,
+    LinkTotals,
+    MapState,
+    RobotMetrics,
+    RunSummary,
+    TickMetrics,
+)
+
+
+class ResultReader:
+    """One result file, read lazily; a context manager.
+
+    ``description`` is the metadata record ``octoreplay``; ``config`` the run's configuration, its log paths taken from
+    the result's folder. Raises InputError for a file that is missing, cut off, damaged or no octoreplay result.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        try:
+            self._reader, self._metadata = self._open()
+            self._check_kind()
+            self.config = self._read_config()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    @property
+    def description(self) -> dict[str, str]:
+        """The metadata record ``octoreplay``: version, format_version, frame, robots, resolution, prior, rule."""
+        return self._metadata["octoreplay"]
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The team's robots in their order."""
+        return tuple(robot.robot_id for robot in self.config.robots)
+
+    @property
+    def class_table(self) -> ClassTable:
+        """The occupied classes with their names and colours."""
+        if self.config.classes is None:
+            raise InputError(f"{self.path}: damaged: the stored configuration has no classes")
+        return self.config.classes
+
+    @property
+    def prior(self) -> float:
+        """h_0, the log-odds of each occupied class in an unobserved cell."""
+        return float(self.description["prior"])
+
+    def metrics(self) -> list[TickMetrics]:
+        """The metrics of all ticks, in order."""
+        return [_tick_metrics(value) for _, value in self._messages(METRICS_TOPIC)]
+
+    def summary(self, metrics: Sequence[TickMetrics]) -> RunSummary:
+        """What the run came to. The wall time is not stored and is NaN.
+
+        For an interrupted run it is counted from ``metrics``, and nothing is known of frames and warnings.
+        Raises InputError where not a single tick is stored.
+        """
+        if not metrics:
+            raise InputError(f"{self.path}: holds no tick; the run was interrupted before its first one")
+        stored = self._metadata.get("summary", {})
+        if stored.get("complete") != "true":
+            return _summary_from_metrics(metrics, stored.get("stop_reason", "cut off"))
+        names = {item.name for item in dataclasses.fields(RunSummary)}
+        values: dict[str, Any] = {
+            name: text if name == "stop_reason" else json.loads(text) for name, text in stored.items() if name in names
+        }
+        values["warnings"] = tuple(values["warnings"])
+        values["links"] = tuple(LinkMetrics(**link) for link in values["links"])
+        values["frame_counts"] = {robot: _frame_counts(count) for robot, count in values["frame_counts"].items()}
+        return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
+
+    def state_times(self, robot_id: str) -> list[tuple[int, int]]:
+        """(tick, stamp_ns) of a robot's stored maps, in order."""
+        return [
+            (int(value.tick), stamp_to_ns(value.header.stamp))
+            for _, value in self._messages(map_state_topic(self._known(robot_id)))
+        ]
+
+    def states(self, robot_id: str, until_ns: int | None = None) -> list[MapState]:
+        """The states that make up a robot's last map with stamp <= ``until_ns`` (None: the last of all).
+
+        A key frame first, then the deltas that lead from it to that map. Raises InputError for an unknown robot, where
+        nothing is stored that early, or where a state in between is missing.
+        """
+        end = None if until_ns is None else until_ns + 1
+        chain: list[MapState] = []
+        for _, value in self._messages(map_state_topic(self._known(robot_id)), end_ns=end, reverse=True):
+            state = _map_state(value)
+            if chain and state.sequence != chain[-1].base_sequence:
+                continue
+            chain.append(state)
+            if state.is_key_frame:
+                return chain[::-1]
+        if chain:
+            raise InputError(
+                f"{self.path}: damaged: state {chain[-1].base_sequence} of robot '{robot_id}' is missing, on which"
+                f" state {chain[-1].sequence} builds"
+            )
+        raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for")
+
+    def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
+        """A robot's sensor poses: stamps [ns], and (P, 7) x, y, z, qx, qy, qz, qw in the team's frame."""
+        stamps, rows = [], []
+        for stamp_ns, value in self._messages(pose_topic(self._known(robot_id))):
+            position, turn = value.pose.position, value.pose.orientation
+            stamps.append(stamp_ns)
+            rows.append((position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w))
+        return stamps, np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+    def changed_inputs(self) -> list[str]:
+        """A sentence for every input file that is missing or no longer what this result was made from."""
+        sentences = []
+        for name, text in self._metadata.get("inputs", {}).items():
+            stored, path = json.loads(text), self.path.parent / name
+            if not path.exists():
+                sentences.append(f"{path}: input of {self.path.name} is missing")
+                continue
+            now = fingerprint(path, whole=stored["method"] == "sha256")
+            if (now.size, now.method, now.value) != (stored["size"], stored["method"], stored["fingerprint"]):
+                sentences.append(f"{path}: has changed since {self.path.name} was made from it")
+        return sentences
+
+    def _open(self) -> tuple[SeekingReader, dict[str, dict[str, str]]]:
+        """The container, and all its metadata records by name."""
+        try:
+            reader = SeekingReader(self._file, validate_crcs=True)
+            return reader, {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+        except _DAMAGE as error:
+            raise InputError(f"{self.path}: not a finished MCAP file; {_NOT_A_RESULT}") from error
+
+    def _read_config(self) -> RunConfig:
+        """The stored configuration."""
+        try:
+            return parse_team(self._metadata["config"]["team_file"], source=str(self.path), folder=self.path.parent)
+        except (ConfigError, KeyError) as error:
+            raise InputError(f"{self.path}: damaged: its configuration cannot be read: {error}") from error
+
+    def _check_kind(self) -> None:
+        """Refuse other MCAP files, and results of a later format."""
+        if "octoreplay" not in self._metadata or "config" not in self._metadata:
+            raise InputError(f"{self.path}: an MCAP file, but no result of octoreplay; {_NOT_A_RESULT}")
+        version = self.description.get("format_version")
+        if version != FORMAT_VERSION:
+            raise InputError(
+                f"{self.path}: result format {version}, this version reads {FORMAT_VERSION}; use octoreplay"
+                f" {self.description.get('version')}, which wrote it"
+            )
+
+    def _known(self, robot_id: str) -> str:
+        """The robot_id, if it is one of the team's."""
+        if robot_id not in self.robots:
+            raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
+        return robot_id
+
+    def _messages(self, topic: str, *, end_ns: int | None = None, reverse: bool = False) -> Iterator[tuple[int, Any]]:
+        """(log time, message) on one topic, before ``end_ns``, in log-time order or the reverse of it."""
+        try:
+            for schema, _, record in self._reader.iter_messages([topic], ending_before=end_ns, reverse=reverse):
+                name = schema.name if schema is not None else ""
+                yield record.log_time, typestore().deserialize_cdr(record.data, name)
+        except _DAMAGE as error:
+            raise InputError(f"{self.path}: damaged at topic '{topic}': {error}") from error
+
+
+_DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
+"""What reading a damaged file raises."""
+_NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
+
+
+def _tick_metrics(value: Any) -> TickMetrics:
+    """TickMetrics from its message."""
+    plain = ("tick", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
+             "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change")  # fmt: skip
+    return TickMetrics(
+        stamp_ns=stamp_to_ns(value.header.stamp),
+        robots=tuple(RobotMetrics(**_fields(RobotMetrics, robot)) for robot in value.robots),
+        links=tuple(LinkMetrics(**_fields(LinkMetrics, link)) for link in value.links),
+        **{name: getattr(value, name) for name in plain},
+    )
+
+
+def _fields(kind: Any, value: Any) -> dict[str, Any]:
+    """The fields of a record from the message that has the same names."""
+    return {item.name: getattr(value, item.name) for item in dataclasses.fields(kind)}
+
+
+def _map_state(value: Any) -> MapState:
+    """MapState from its message."""
+    return MapState(
+        robot_id=value.robot_id,
+        stamp_ns=stamp_to_ns(value.header.stamp),
+        tick=int(value.tick),
+        sequence=int(value.sequence),
+        base_sequence=int(value.base_sequence),
+        is_key_frame=bool(value.is_key_frame),
+        data=value.data.tobytes(),
+    )
+
+
+def _frame_counts(stored: dict[str, Any]) -> FrameCounts:
+    """FrameCounts from JSON, whose keys are text."""
+    unknown = {int(label): count for label, count in stored["unknown_label_pixels"].items()}
+    return FrameCounts(**{**stored, "unknown_label_pixels": unknown})
+
+
+def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> RunSummary:
+    """What can be said of a run that did not end by itself."""
+    published = [robot for tick in metrics for robot in tick.robots if robot.packet_bytes]
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(robot, name) for robot in published])) if published else 0.0
+
+    links = LinkTotals()
+    for tick in metrics:
+        links.add(tick.links)
+    return RunSummary(
+        num_ticks=len(metrics),
+        num_settling_ticks=sum(tick.settling for tick in metrics),
+        stop_reason=stop_reason,
+        log_seconds=(metrics[-1].stamp_ns - metrics[0].stamp_ns) / 1e9,
+        wall_seconds=math.nan,
+        last=metrics[-1],
+        peak_total_distance=max(tick.total_distance for tick in metrics),
+        peak_total_distance_all=max(tick.total_distance_all for tick in metrics),
+        mean_packet_bytes=mean("packet_bytes"),
+        mean_octree_bytes=mean("octree_bytes"),
+        mean_grid_bytes=mean("grid_bytes"),
+        total_sent_bytes=sum(robot.sent_bytes for tick in metrics for robot in tick.robots),
+        links=links.totals(),
+        frame_counts={},
+        warnings=(),
+    )

@@ -1,0 +1,416 @@
+"""Writes a run's result: one self-contained MCAP of ROS 2 messages (docs/result-format.md)."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from octoreplay import __version__
+from octoreplay.config import RobotConfig, RunConfig, dump_team
+from octoreplay.errors import OutputError
+from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.messages.ros_types import header, message
+from octoreplay.io.results import posterior
+from octoreplay.records import ClassTable, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+
+FORMAT_VERSION = "2"
+"""Counts incompatible changes of the result format."""
+TEAM_FRAME = "team"
+"""The frame that every map and pose in a result is given in."""
+
+METRICS_TOPIC = "/metrics"
+GRAPH_TOPIC = "/graph"
+TF_TOPIC = "/tf"
+STATIC_TF_TOPIC = "/tf_static"
+
+_FLOAT32, _UINT8 = 7, 2
+"""sensor_msgs/PointField datatypes."""
+VIEW_FIELDS = (
+    ("x", "<f4", 0, _FLOAT32),
+    ("y", "<f4", 4, _FLOAT32),
+    ("z", "<f4", 8, _FLOAT32),
+    ("rgb", "<u4", 12, _FLOAT32),
+    ("label", "u1", 24, _UINT8),
+    ("size", "<f4", 16, _FLOAT32),
+    ("probability", "<f4", 20, _FLOAT32),
+)
+"""One point of a map view: name, NumPy format, offset, PointField datatype. ``rgb`` holds the integer 0x00RRGGBB and is
+declared as a float32, which is PCL's habit and what viewers look for."""
+VIEW_DTYPE = np.dtype(
+    {
+        "names": [name for name, *_ in VIEW_FIELDS],
+        "formats": [number_format for _, number_format, *_ in VIEW_FIELDS],
+        "offsets": [offset for *_, offset, _ in VIEW_FIELDS],
+        "itemsize": 28,
+    }
+)
+
+_LINE_LIST, _TEXT_VIEW_FACING, _ADD, _DELETE = 5, 9, 0, 2
+"""visualization_msgs/Marker types and actions."""
+
+
+def map_state_topic(robot_id: str) -> str:
+    """Topic of a robot's stored map states."""
+    return f"/{robot_id}/map_state"
+
+
+def map_view_topic(robot_id: str) -> str:
+    """Topic of a robot's map for viewing."""
+    return f"/{robot_id}/map"
+
+
+def pose_topic(robot_id: str) -> str:
+    """Topic of a robot's sensor pose."""
+    return f"/{robot_id}/pose"
+
+
+def packet_topic(robot_id: str) -> str:
+    """Topic of the radio packets that a robot sent."""
+    return f"/{robot_id}/packet"
+
+
+def partial_path(path: Path) -> Path:
+    """Where a result is written until it is complete: ``x.partial.mcap`` for ``x.mcap``."""
+    stem = path.stem if path.suffix == ".mcap" else path.name
+    return path.with_name(f"{stem}.partial.mcap")
+
+
+class ResultWriter:
+    """Writes a result beside its own name and renames it when it is complete.
+
+    A context manager: without ``complete`` the unfinished file is removed, except that after a KeyboardInterrupt it is
+    finished and stays as ``x.partial.mcap``. ``config`` is resolved: robots and topics filled in. The same calls give
+    the same bytes: nothing of the clock or the machine is written.
+
+    Raises OutputError where the result cannot be written or would overwrite an input, and InputError where an input
+    cannot be read for its fingerprint.
+    """
+
+    def __init__(self, path: Path, config: RunConfig, class_table: ClassTable) -> None:
+        self.path = path
+        self.partial_path = partial_path(path)
+        self._config = dataclasses.replace(config, classes=class_table)
+        self._class_table = class_table
+        self._started = False
+        self._open = True
+        self._check_path()
+        inputs = self._inputs()
+        self._writer = RosMcapWriter(self.partial_path)
+        try:
+            self._write_description(inputs)
+        except BaseException:
+            self.discard()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._open:
+            return
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            self.keep_partial()
+        else:
+            self.discard()
+
+    def write_state(self, state: MapState) -> None:
+        """Store one robot's map, a key frame or a delta, on ``/<robot>/map_state``."""
+        self._start(state.stamp_ns)
+        type_name = "octoreplay_msgs/msg/MapState"
+        value = message(
+            type_name, header=header(state.stamp_ns, TEAM_FRAME), robot_id=state.robot_id, tick=state.tick,
+            sequence=state.sequence, base_sequence=state.base_sequence, is_key_frame=state.is_key_frame,
+            data=np.frombuffer(state.data, dtype=np.uint8),
+        )  # fmt: skip
+        self._writer.write(map_state_topic(state.robot_id), type_name, value, state.stamp_ns)
+
+    def write_metrics(self, metrics: TickMetrics) -> None:
+        """Store the team's metrics after one tick on ``/metrics``."""
+        self._start(metrics.stamp_ns)
+        fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
+        del fields["stamp_ns"]
+        fields["robots"] = [
+            message("octoreplay_msgs/msg/RobotMetrics", **dataclasses.asdict(robot)) for robot in metrics.robots
+        ]
+        fields["links"] = [
+            message("octoreplay_msgs/msg/LinkMetrics", **dataclasses.asdict(link)) for link in metrics.links
+        ]
+        type_name = "octoreplay_msgs/msg/TickMetrics"
+        value = message(type_name, header=header(metrics.stamp_ns, TEAM_FRAME), **fields)
+        self._writer.write(METRICS_TOPIC, type_name, value, metrics.stamp_ns)
+
+    def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable) -> None:
+        """Store the occupied leaves of one robot's map as a point cloud for viewing on ``/<robot>/map``."""
+        self._start(stamp_ns)
+        points = self._view_points(leaves)
+        type_name = "sensor_msgs/msg/PointCloud2"
+        fields = [
+            message("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=1)
+            for name, _, offset, datatype in VIEW_FIELDS
+        ]
+        value = message(
+            type_name, header=header(stamp_ns, TEAM_FRAME), height=1, width=len(points), fields=fields,
+            is_bigendian=False, point_step=VIEW_DTYPE.itemsize, row_step=VIEW_DTYPE.itemsize * len(points),
+            data=points.view(np.uint8).reshape(-1), is_dense=True,
+        )  # fmt: skip
+        self._writer.write(map_view_topic(robot_id), type_name, value, stamp_ns)
+
+    def write_poses(self, stamp_ns: int, poses: Sequence[RobotPose]) -> None:
+        """Store where the robots' sensors are: ``/<robot>/pose`` and ``/tf`` (team -> ``<robot>/sensor``)."""
+        self._start(stamp_ns)
+        transforms = []
+        for pose in poses:
+            position, rotation = _vector(pose.T_team_sensor), _quaternion(pose.T_team_sensor)
+            type_name = "geometry_msgs/msg/PoseStamped"
+            value = message(
+                type_name,
+                header=header(stamp_ns, TEAM_FRAME),
+                pose=message("geometry_msgs/msg/Pose", position=_point(position), orientation=rotation),
+            )
+            self._writer.write(pose_topic(pose.robot_id), type_name, value, stamp_ns)
+            transforms.append(_transform(stamp_ns, f"{pose.robot_id}/sensor", position, rotation))
+        if transforms:
+            self._write_transforms(TF_TOPIC, stamp_ns, transforms)
+
+    def write_graph(self, stamp_ns: int, links: Sequence[tuple[str, str]], poses: Sequence[RobotPose]) -> None:
+        """Store the tick's links (pairs of robots, each once) as lines between the robots, named, on ``/graph``."""
+        self._start(stamp_ns)
+        positions = {pose.robot_id: _vector(pose.T_team_sensor) for pose in poses}
+        points = [_point(positions[end]) for link in links if positions.keys() >= set(link) for end in link]
+        lines = _marker(
+            stamp_ns, "links", 0, _LINE_LIST, action=_ADD if points else _DELETE, points=points, scale=(0.08, 0.0, 0.0)
+        )
+        names = [
+            _marker(
+                stamp_ns, "robots", index, _TEXT_VIEW_FACING, text=robot_id, scale=(0.0, 0.0, 0.6),
+                position=positions[robot_id] + (0.0, 0.0, 0.8),
+            )
+            for index, robot_id in enumerate(robot.robot_id for robot in self._config.robots)
+            if robot_id in positions
+        ]  # fmt: skip
+        type_name = "visualization_msgs/msg/MarkerArray"
+        self._writer.write(GRAPH_TOPIC, type_name, message(type_name, markers=[lines, *names]), stamp_ns)
+
+    def write_packet(self, robot_id: str, stamp_ns: int, tick: int, data: bytes) -> None:
+        """Store one packet as it was sent on ``/<robot>/packet``."""
+        self._start(stamp_ns)
+        type_name = "octoreplay_msgs/msg/Packet"
+        value = message(
+            type_name, header=header(stamp_ns, TEAM_FRAME), sender=robot_id, tick=tick,
+            data=np.frombuffer(data, dtype=np.uint8),
+        )  # fmt: skip
+        self._writer.write(packet_topic(robot_id), type_name, value, stamp_ns)
+
+    def complete(self, summary: RunSummary) -> None:
+        """Store what the run came to, finish the file and give it its own name."""
+        try:
+            self._writer.write_metadata("summary", _summary_values(summary))
+            self._writer.finish()
+            self.partial_path.replace(self.path)
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
+        self._open = False
+
+    def keep_partial(self) -> None:
+        """Finish the file under its partial name, so that it can be opened, and leave the result's own name alone."""
+        self._writer.write_metadata("summary", {"complete": "false", "stop_reason": "interrupted"})
+        self._writer.finish()
+        self._open = False
+
+    def discard(self) -> None:
+        """Remove the unfinished file."""
+        self._open = False
+        with contextlib.suppress(OutputError):
+            self._writer.finish()
+        with contextlib.suppress(OSError):
+            self.partial_path.unlink()
+
+    def _check_path(self) -> None:
+        """Refuse a result that cannot be written before any work is done."""
+        if self.path.is_dir():
+            raise OutputError(f"{self.path}: is a folder; give a file name such as {self.path / 'out.mcap'}")
+        if not self.path.parent.is_dir():
+            raise OutputError(f"{self.path}: the folder '{self.path.parent}' does not exist")
+        for robot in self._config.robots:
+            for log in robot.logs:
+                for file in log_files(log):
+                    if file.resolve() in (self.path.resolve(), self.partial_path.resolve()):
+                        raise OutputError(f"{self.path}: is a log of robot '{robot.robot_id}'; name another output")
+
+    def _inputs(self) -> dict[str, Fingerprint]:
+        """Fingerprints of all input files by absolute path, in the order of the robots."""
+        whole = self._config.output.hash
+        files = [file for robot in self._config.robots for log in robot.logs for file in log_files(log)]
+        return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
+
+    def _write_description(self, inputs: dict[str, Fingerprint]) -> None:
+        """The metadata that says what this file is and how to make it again."""
+        config, folder = self._config, self.path.parent.resolve()
+        robots = tuple(
+            dataclasses.replace(robot, logs=tuple(log.resolve() for log in robot.logs)) for robot in config.robots
+        )
+        self._writer.write_metadata(
+            "octoreplay",
+            {
+                "version": __version__,
+                "format_version": FORMAT_VERSION,
+                "frame": TEAM_FRAME,
+                "robots": json.dumps([robot.robot_id for robot in robots]),
+                "resolution": repr(config.map.resolution),
+                "prior": repr(config.map.prior(self._class_table.num_classes)),
+                "rule": config.consensus.rule,
+            },
+        )
+        self._writer.write_metadata(
+            "config", {"team_file": dump_team(dataclasses.replace(config, robots=robots), folder)}
+        )
+        classes = [{"id": 0, "name": "free", "color": None}]
+        classes += [{"id": c.class_id, "name": c.name, "color": list(c.color)} for c in self._class_table.classes]
+        self._writer.write_metadata("classes", {"classes": json.dumps(classes)})
+        self._writer.write_metadata(
+            "inputs",
+            {
+                _relative(path, folder): json.dumps(
+                    {"size": entry.size, "method": entry.method, "fingerprint": entry.value}
+                )
+                for path, entry in inputs.items()
+            },
+        )
+
+    def _start(self, stamp_ns: int) -> None:
+        """Before the first message: the robots' map frames, which viewers need at or before everything else."""
+        if self._started:
+            return
+        self._started = True
+        transforms = [_static_transform(stamp_ns, robot) for robot in self._config.robots]
+        self._write_transforms(STATIC_TF_TOPIC, stamp_ns, transforms)
+
+    def _write_transforms(self, topic: str, stamp_ns: int, transforms: list[Any]) -> None:
+        type_name = "tf2_msgs/msg/TFMessage"
+        self._writer.write(topic, type_name, message(type_name, transforms=transforms), stamp_ns)
+
+    def _view_points(self, leaves: LeafTable) -> Any:
+        """The occupied leaves as an array of VIEW_DTYPE."""
+        label = posterior.labels(leaves.log_odds)
+        occupied = np.flatnonzero(label)
+        label = label[occupied]
+        points = np.zeros(len(occupied), dtype=VIEW_DTYPE)
+        for axis, name in enumerate("xyz"):
+            points[name] = leaves.centers[occupied, axis]
+        color = self._class_table.colors.astype(np.uint32)[label.astype(np.intp) - 1]
+        points["rgb"] = (color[:, 0] << 16) | (color[:, 1] << 8) | color[:, 2]
+        points["label"] = label
+        points["size"] = leaves.sizes[occupied]
+        points["probability"] = posterior.label_probabilities(leaves.log_odds[occupied])
+        return points
+
+
+def _relative(path: str, folder: Path) -> str:
+    """A path as the stored team file gives it: relative to the result's folder where it lies below."""
+    return str(Path(path).relative_to(folder)) if Path(path).is_relative_to(folder) else path
+
+
+def _summary_values(summary: RunSummary) -> dict[str, str]:
+    """A run's summary as metadata: numbers and lists as JSON; without the wall time, so that equal runs are equal."""
+    values = {"complete": "true"}
+    for item in dataclasses.fields(summary):
+        if item.name in ("wall_seconds", "last", "links", "frame_counts"):
+            continue
+        value = getattr(summary, item.name)
+        values[item.name] = value if isinstance(value, str) else json.dumps(value)
+    values["links"] = json.dumps([dataclasses.asdict(link) for link in summary.links])
+    counts = {robot_id: dataclasses.asdict(count) for robot_id, count in summary.frame_counts.items()}
+    values["frame_counts"] = json.dumps(counts)
+    return values
+
+
+def _static_transform(stamp_ns: int, robot: RobotConfig) -> Any:
+    """From the team's frame to ``<robot>/map``, the frame of the poses in the robot's log."""
+    x, y, z, *rotation = robot.T_team_map
+    quaternion = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", rotation, strict=True)))
+    return _transform(stamp_ns, f"{robot.robot_id}/map", np.array([x, y, z]), quaternion)
+
+
+def _transform(stamp_ns: int, child_frame: str, position: Float64Array, rotation: Any) -> Any:
+    """geometry_msgs/TransformStamped from the team's frame."""
+    return message(
+        "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, TEAM_FRAME), child_frame_id=child_frame,
+        transform=message(
+            "geometry_msgs/msg/Transform",
+            translation=message("geometry_msgs/msg/Vector3", **_xyz(position)),
+            rotation=rotation,
+        ),
+    )  # fmt: skip
+
+
+def _marker(
+    stamp_ns: int,
+    namespace: str,
+    marker_id: int,
+    kind: int,
+    *,
+    scale: tuple[float, float, float],
+    action: int = _ADD,
+    points: Sequence[Any] = (),
+    text: str = "",
+    position: Float64Array | None = None,
+) -> Any:
+    """visualization_msgs/Marker in the team's frame; what a line list or a text does not use stays empty."""
+    point = _point(np.zeros(3) if position is None else position)
+    identity = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    empty_bytes = np.zeros(0, dtype=np.uint8)
+    return message(
+        "visualization_msgs/msg/Marker", header=header(stamp_ns, TEAM_FRAME), ns=namespace, id=marker_id, type=kind,
+        action=action, pose=message("geometry_msgs/msg/Pose", position=point, orientation=identity),
+        scale=message("geometry_msgs/msg/Vector3", **_xyz(np.array(scale))),
+        color=message("std_msgs/msg/ColorRGBA", r=1.0, g=1.0, b=1.0, a=1.0),
+        lifetime=message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False, points=list(points),
+        colors=[], texture_resource="",
+        texture=message("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=empty_bytes),
+        uv_coordinates=[], text=text, mesh_resource="",
+        mesh_file=message("visualization_msgs/msg/MeshFile", filename="", data=empty_bytes),
+        mesh_use_embedded_materials=False,
+    )  # fmt: skip
+
+
+def _xyz(vector: Float64Array) -> dict[str, float]:
+    return {"x": float(vector[0]), "y": float(vector[1]), "z": float(vector[2])}
+
+
+def _point(vector: Float64Array) -> Any:
+    return message("geometry_msgs/msg/Point", **_xyz(vector))
+
+
+def _vector(transform: Float64Array) -> Float64Array:
+    return transform[:3, 3]
+
+
+def _quaternion(transform: Float64Array) -> Any:
+    """geometry_msgs/Quaternion with w >= 0 of a transform's rotation (Shepperd 1978: the largest part first)."""
+    r = transform[:3, :3]
+    trace = float(np.trace(r))
+    squares = np.array([1 + 2 * r[0, 0] - trace, 1 + 2 * r[1, 1] - trace, 1 + 2 * r[2, 2] - trace, 1 + trace])
+    largest = int(np.argmax(squares))
+    products = np.array(
+        [
+            [squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+            [r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
+        ]
+    )
+    quaternion = products[largest] / np.linalg.norm(products[largest])
+    if quaternion[3] < 0:
+        quaternion = -quaternion
+    x, y, z, w = (float(part) for part in quaternion)
+    return message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

@@ -1,0 +1,308 @@
+"""Poses in time: tracks that are interpolated, and trees of frames.
+
+Positions are metres; quaternions are (x, y, z, w) of length 1; ``T_a_b`` is (4, 4) float64 and maps coordinates of
+frame b to frame a.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from octoreplay.errors import InputError
+from octoreplay.io.messages.ros_types import stamp_to_ns
+from octoreplay.records import Float64Array
+
+Position: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+Pose: TypeAlias = tuple[Position, Quaternion]
+
+# Below this angle's cosine distance sin(angle) loses digits, and the straight line between the quaternions is as good.
+_NEARLY_PARALLEL = 1.0 - 1e-9
+
+
+def normalise(quaternion: Sequence[float]) -> Quaternion | None:
+    """The quaternion (x, y, z, w) of length 1; None where it has no direction (zero or not finite)."""
+    x, y, z, w = (float(value) for value in quaternion)
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not math.isfinite(length) or length < 1e-6:
+        return None
+    return x / length, y / length, z / length, w / length
+
+
+def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
+    """The rotation at a fraction in [0, 1] of the shorter great arc between two rotations (Shoemake 1985)."""
+    cosine = sum(a * b for a, b in zip(first, second, strict=True))
+    sign = 1.0
+    if cosine < 0.0:
+        cosine, sign = -cosine, -1.0
+    if cosine > _NEARLY_PARALLEL:
+        from_first, from_second = 1.0 - fraction, fraction
+    else:
+        angle = math.acos(cosine)
+        from_first = math.sin((1.0 - fraction) * angle) / math.sin(angle)
+        from_second = math.sin(fraction * angle) / math.sin(angle)
+    from_second *= sign
+    x, y, z, w = (from_first * a + from_second * b for a, b in zip(first, second, strict=True))
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return x / length, y / length, z / length, w / length
+
+
+def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> Float64Array:
+    """The (4, 4) transform of a position and a quaternion (x, y, z, w) of length 1."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), position[0]],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), position[1]],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), position[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def inverse(transform: Float64Array) -> Float64Array:
+    """The inverse of a (4, 4) rigid transform."""
+    result = np.eye(4)
+    rotation = transform[:3, :3].T
+    result[:3, :3] = rotation
+    result[:3, 3] = -rotation @ transform[:3, 3]
+    return result
+
+
+def transform_of(numbers: Sequence[float]) -> Float64Array:
+    """The (4, 4) transform of seven numbers x, y, z, qx, qy, qz, qw; the quaternion is normalised.
+
+    Raises ValueError where the quaternion has no direction.
+    """
+    quaternion = normalise(numbers[3:7])
+    if quaternion is None:
+        raise ValueError("a quaternion must have a direction")
+    return pose_matrix(numbers[:3], quaternion)
+
+
+class PoseTrack:
+    """Poses over time, interpolated between neighbours: linearly in position, by slerp in rotation.
+
+    A stamp of a pose itself always has that pose. Any other has one only where it lies between two poses that are at
+    most ``pose_gap_ns`` apart. Poses may be added out of order; of two with one stamp the later added holds.
+    """
+
+    def __init__(self, pose_gap_ns: int) -> None:
+        self._pose_gap_ns = pose_gap_ns
+        self._stamps: list[int] = []
+        self._poses: list[Pose] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def last_ns(self) -> int | None:
+        """Stamp of the last pose; None in an empty track."""
+        return self._stamps[-1] if self._stamps else None
+
+    def add(self, stamp_ns: int, position: Sequence[float], quaternion: Sequence[float]) -> bool:
+        """Add a pose; False, and nothing added, where a number is not finite or the quaternion is zero."""
+        x, y, z = (float(value) for value in position)
+        rotation = normalise(quaternion)
+        if rotation is None or not math.isfinite(x + y + z):
+            return False
+        pose = ((x, y, z), rotation)
+        if not self._stamps or stamp_ns > self._stamps[-1]:
+            self._stamps.append(stamp_ns)
+            self._poses.append(pose)
+            return True
+        index = bisect_left(self._stamps, stamp_ns)
+        if self._stamps[index] == stamp_ns:
+            self._poses[index] = pose
+        else:
+            self._stamps.insert(index, stamp_ns)
+            self._poses.insert(index, pose)
+        return True
+
+    def at(self, stamp_ns: int) -> Pose | None:
+        """The pose at a stamp, or None where there is none (see the class)."""
+        index = bisect_left(self._stamps, stamp_ns)
+        if index < len(self._stamps) and self._stamps[index] == stamp_ns:
+            return self._poses[index]
+        if index == 0 or index == len(self._stamps):
+            return None
+        before, after = self._stamps[index - 1], self._stamps[index]
+        if after - before > self._pose_gap_ns:
+            return None
+        fraction = (stamp_ns - before) / (after - before)
+        (p, q), (r, s) = self._poses[index - 1], self._poses[index]
+        x, y, z = (a + fraction * (b - a) for a, b in zip(p, r, strict=True))
+        return (x, y, z), slerp(q, s, fraction)
+
+    def matrix_at(self, stamp_ns: int) -> Float64Array | None:
+        """The pose at a stamp as a (4, 4) transform, or None."""
+        pose = self.at(stamp_ns)
+        return None if pose is None else pose_matrix(*pose)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop poses that no stamp from ``stamp_ns`` on needs."""
+        keep = bisect_left(self._stamps, stamp_ns) - 1
+        if keep > 0:
+            del self._stamps[:keep]
+            del self._poses[:keep]
+
+
+class FrameTree:
+    """The frames of a robot as TF gives them: every frame has one parent, by a fixed or a moving transform."""
+
+    def __init__(self, pose_gap_ns: int) -> None:
+        self._pose_gap_ns = pose_gap_ns
+        self._parents: dict[str, str] = {}
+        self._other_parents: dict[str, str] = {}
+        self._fixed: dict[str, Float64Array] = {}
+        self._moving: dict[str, PoseTrack] = {}
+
+    def add(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int | None,
+        translation: Sequence[float],
+        quaternion: Sequence[float],
+    ) -> None:
+        """Add T_parent_child: fixed where ``stamp_ns`` is None, else the moving transform's value at that stamp.
+
+        A transform that is not finite or has a zero quaternion is left out.
+        """
+        parent, child = frame_name(parent), frame_name(child)
+        known = self._parents.setdefault(child, parent)
+        if known != parent:
+            self._other_parents[child] = parent
+            return
+        if stamp_ns is None:
+            rotation = normalise(quaternion)
+            if rotation is not None and all(math.isfinite(value) for value in translation):
+                self._fixed[child] = pose_matrix(translation, rotation)
+            return
+        if child not in self._moving:
+            self._moving[child] = PoseTrack(self._pose_gap_ns)
+        self._moving[child].add(stamp_ns, translation, quaternion)
+
+    def add_message(self, message: Any, *, is_static: bool, stamp_ns: int | None = None) -> int | None:
+        """Add all transforms of a TFMessage at their own stamps, or all at ``stamp_ns``; the newest stamp added."""
+        newest: int | None = None
+        for entry in message.transforms:
+            stamp = stamp_to_ns(entry.header.stamp) if stamp_ns is None else stamp_ns
+            t, q = entry.transform.translation, entry.transform.rotation
+            self.add(
+                entry.header.frame_id, entry.child_frame_id, None if is_static else stamp, (t.x, t.y, t.z),
+                (q.x, q.y, q.z, q.w),
+            )  # fmt: skip
+            if not is_static:
+                newest = stamp if newest is None else max(newest, stamp)
+        return newest
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The names of all frames, sorted."""
+        return tuple(sorted({*self._parents, *self._parents.values()}))
+
+    def root_of(self, frame: str) -> str:
+        """The frame at the top of the chain of parents above a frame (itself where it has none)."""
+        *_, root = self._ancestors(frame_name(frame))
+        return root
+
+    def is_connected(self, a: str, b: str) -> bool:
+        """True where a chain of transforms joins two frames, at whatever time."""
+        return self.root_of(a) == self.root_of(b)
+
+    def is_fixed(self, a: str, b: str) -> bool:
+        """True where the frames are joined by fixed transforms alone."""
+        if not self.is_connected(a, b):
+            return False
+        up, down = self._chain(frame_name(a), frame_name(b))
+        return all(child in self._fixed for child in (*up, *down))
+
+    def last_ns(self, a: str, b: str) -> int | None:
+        """The stamp up to which every moving transform between two frames is known; None without moving ones."""
+        up, down = self._chain(frame_name(a), frame_name(b))
+        moving = [self._moving[child] for child in (*up, *down) if child in self._moving and child not in self._fixed]
+        return min((track.last_ns for track in moving if track.last_ns is not None), default=None)
+
+    def T_a_b(self, a: str, b: str, stamp_ns: int) -> Float64Array | None:
+        """The transform from frame b to frame a at a stamp; None where a moving transform has no value there.
+
+        Raises InputError with both names where nothing joins the frames, or a frame between has two parents.
+        """
+        a, b = frame_name(a), frame_name(b)
+        if not self.is_connected(a, b):
+            raise InputError(self.why_not_connected(a, b))
+        result = np.eye(4)
+        up, down = self._chain(a, b)
+        # Up from a to the common ancestor against the transforms, then down to b along them.
+        for child in up:
+            step = self._edge(child, stamp_ns)
+            if step is None:
+                return None
+            result = result @ inverse(step)
+        for child in reversed(down):
+            step = self._edge(child, stamp_ns)
+            if step is None:
+                return None
+            result = result @ step
+        return result
+
+    def why_not_connected(self, a: str, b: str) -> str:
+        """One sentence that says which frames each of two unconnected frames hangs on."""
+        a, b = frame_name(a), frame_name(b)
+        if not self._parents:
+            return f"no transform from '{b}' to '{a}': the log holds no TF"
+        unknown = [frame for frame in (a, b) if frame not in self.frames]
+        if unknown:
+            known = ", ".join(self.frames[:12]) + (", ..." if len(self.frames) > 12 else "")
+            return f"no transform from '{b}' to '{a}': TF knows no frame '{unknown[0]}'; its frames are {known}"
+        return (
+            f"no transform from '{b}' to '{a}': '{b}' hangs on '{self.root_of(b)}' and '{a}' on '{self.root_of(a)}', "
+            f"and nothing joins the two"
+        )
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop what no stamp from ``stamp_ns`` on needs."""
+        for track in self._moving.values():
+            track.forget_before(stamp_ns)
+
+    def _edge(self, child: str, stamp_ns: int) -> Float64Array | None:
+        """T_parent_child at a stamp."""
+        if child in self._other_parents:
+            raise InputError(
+                f"frame '{child}' has two parents in TF, '{self._parents[child]}' and '{self._other_parents[child]}'"
+            )
+        if child in self._fixed:
+            return self._fixed[child]
+        return self._moving[child].matrix_at(stamp_ns) if child in self._moving else None
+
+    def _ancestors(self, frame: str) -> Iterator[str]:
+        """A frame, its parent, and so on to the root; a loop ends where it closes."""
+        seen = set()
+        while frame not in seen:
+            seen.add(frame)
+            yield frame
+            if frame not in self._parents:
+                return
+            frame = self._parents[frame]
+
+    def _chain(self, a: str, b: str) -> tuple[list[str], list[str]]:
+        """The frames to step up from: from a, and from b, each to the first common ancestor."""
+        from_a = list(self._ancestors(a))
+        depth_of = {frame: index for index, frame in enumerate(from_a)}
+        down: list[str] = []
+        for frame in self._ancestors(b):
+            if frame in depth_of:
+                return from_a[: depth_of[frame]], down
+            down.append(frame)
+        return from_a, down
+
+
+def frame_name(name: str) -> str:
+    """A frame's name without the leading slash that old logs write."""
+    return name.lstrip("/")

@@ -1,0 +1,1 @@
+"""From message objects to arrays: images, point clouds, cameras and labels."""

@@ -1,0 +1,449 @@
+"""Containers: what goes into a log by an independent writer comes out, whole or as far as the file goes."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+
+from log_factory import ROS1, SECOND, Entry, Factory, robot_entries, ros2, write_bag, write_mcap, write_rosbag2
+from octoreplay.errors import InputError
+from octoreplay.io.containers.log_reader import DamagedMessageError, RawMessage, first_message, normalise_type_name
+from octoreplay.io.containers.logs import open_log
+from octoreplay.io.messages.ros_types import typestore
+from recordings import RECORDINGS, needs_recordings
+
+
+def contents(path: Path, topics=None) -> list[tuple[str, int, bytes]]:
+    """Every message of a log as this package reads it."""
+    with open_log(path) as log:
+        names = {topic.name for topic in log.topics} if topics is None else topics
+        return [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages(names)]
+
+
+def expected_of(entries: list[Entry]) -> list[tuple[str, int, bytes]]:
+    """The same from the entries that were written, in the order of log time."""
+    rows = [(e.topic, e.log_time_ns, bytes(typestore().serialize_cdr(e.value, e.type_name))) for e in entries]
+    return sorted(rows, key=lambda row: row[1])
+
+
+def write_plain_mcap(path: Path, messages: list[tuple[str, int, bytes]], **options) -> Path:
+    """An MCAP with the writer of the mcap package as such."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        channels: dict[str, int] = {}
+        for topic, log_time, data in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], log_time, data, log_time)
+        writer.finish()
+    return path
+
+
+def text(value: str) -> bytes:
+    return bytes(typestore().serialize_cdr(ros2.make("std_msgs/msg/String", data=value), "std_msgs/msg/String"))
+
+
+@pytest.mark.parametrize("container", ["mcap", "small chunks", "rosbag2 sqlite3", "rosbag2 mcap", "db3 file"])
+def test_every_container_gives_what_was_written(tmp_path, container):
+    entries = robot_entries()
+    if container in ("mcap", "small chunks"):
+        path = write_mcap(tmp_path / "a.mcap", entries, chunk_size=300 if container == "small chunks" else 1 << 20)
+    else:
+        path = write_rosbag2(tmp_path / "bag", entries, storage="mcap" if container.endswith("mcap") else "sqlite3")
+        path = next(path.glob("*.db3")) if container == "db3 file" else path
+    assert sorted(contents(path)) == sorted(expected_of(entries))
+    times = [row[1] for row in contents(path)]
+    assert times == sorted(times)
+    with open_log(path) as log:
+        assert log.message_count == len(entries)
+        assert (log.start_ns, log.end_ns) == (entries[0].log_time_ns, entries[-1].log_time_ns)
+        assert log.damage is None
+        topics = {topic.name: topic for topic in log.topics}
+        assert list(topics) == sorted({entry.topic for entry in entries})
+        odom = topics["/odom"]
+        assert (odom.type_name, odom.encoding, odom.num_messages) == ("nav_msgs/msg/Odometry", "cdr", 11)
+        message = first_message(log, "/odom")
+        assert message.decode().pose.pose.position.x == 0.0
+        assert message.decode().child_frame_id == "base_link"
+
+
+def test_a_ros1_bag_gives_what_was_written(tmp_path):
+    entries = robot_entries(factory=Factory(ros1=True))
+    path = write_bag(tmp_path / "a.bag", entries)
+    with open_log(path) as log:
+        assert log.message_count == len(entries)
+        assert (log.start_ns, log.end_ns) == (entries[0].log_time_ns, entries[-1].log_time_ns)
+        messages = list(log.messages(["/camera/depth/image_raw"]))
+        assert [m.channel.encoding for m in messages] == ["ros1"] * 6
+        for index, message in enumerate(messages):
+            assert message.header_stamp_ns() == 100 * SECOND + index * SECOND // 4
+            assert message.header_frame_id() == "camera"
+            assert message.decode().header.seq == 7
+
+
+def test_topics_are_filtered_and_iterators_are_independent(tmp_path):
+    path = write_plain_mcap(tmp_path / "a.mcap", [(f"/t{i % 3}", i, text(str(i))) for i in range(30)], chunk_size=100)
+    with open_log(path) as log:
+        first, second = log.messages(["/t0"]), log.messages(["/t1", "/t2"])
+        pairs = [(next(first).log_time_ns, next(second).log_time_ns) for _ in range(10)]
+        assert pairs == [(3 * i, i + i // 2 + 1) for i in range(10)]
+        assert list(log.messages(["/nothing"])) == []
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(["/a", "/b"]), st.integers(0, 50)), max_size=40),
+    st.sampled_from([CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD]),
+    st.booleans(), st.booleans(), st.booleans(),
+)  # fmt: skip
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+def test_any_mcap_comes_in_log_time_order(tmp_path, stamps, compression, use_chunking, has_index, has_summary):
+    messages = [(topic, log_time, text(str(i))) for i, (topic, log_time) in enumerate(stamps)]
+    path = write_plain_mcap(
+        tmp_path / "any.mcap", messages, chunk_size=150, compression=compression, use_chunking=use_chunking,
+        index_types=IndexType.ALL if has_index else IndexType.NONE, use_statistics=has_summary,
+        repeat_channels=has_summary, repeat_schemas=has_summary, use_summary_offsets=has_summary,
+    )  # fmt: skip
+    for topics in (["/a", "/b"], ["/b"]):
+        wanted = [message for message in messages if message[0] in topics]
+        assert contents(path, topics) == sorted(wanted, key=lambda message: message[1])
+    with open_log(path) as log:
+        assert log.damage is None
+        assert log.message_count == len(messages)
+        times = [log_time for _, log_time, _ in messages]
+        assert (log.start_ns, log.end_ns) == ((min(times), max(times)) if times else (None, None))
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_a_cut_mcap_gives_every_whole_message_before_the_cut(tmp_path, compression, use_chunking):
+    rng = np.random.default_rng(1)
+    messages = [("/a", i, text(rng.bytes(40).hex())) for i in range(60)]
+    whole = write_plain_mcap(
+        tmp_path / "whole.mcap", messages, chunk_size=1500, compression=compression, use_chunking=use_chunking
+    )
+    data = whole.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    counts = []
+    for size in sorted({*rng.integers(8, len(data) - 1, 40).tolist(), 8, len(data) - 1}):
+        cut.write_bytes(data[:size])
+        found = contents(cut)
+        assert found == messages[: len(found)]
+        counts.append(len(found))
+        with open_log(cut) as log:
+            assert log.damage is not None
+            assert log.damage.startswith(f"{cut}: cut")
+            assert log.message_count == len(found)
+        # Nothing that the mcap package finds in whole chunks may be missing.
+        assert len(found) >= count_whole(data[:size])
+    assert counts == sorted(counts)
+    assert counts[0] == 0
+    assert counts[-1] == len(messages)
+
+
+def count_whole(data: bytes) -> int:
+    """How many messages the mcap package reads before it fails."""
+    count = 0
+    try:
+        for _ in NonSeekingReader(io.BytesIO(data)).iter_messages(log_time_order=False):
+            count += 1
+    except Exception:
+        return count
+    return count
+
+
+def test_a_cut_uncompressed_chunk_gives_its_whole_messages(tmp_path):
+    messages = [("/a", i, text("x" * 100)) for i in range(10)]
+    path = write_plain_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.NONE)
+    path.write_bytes(path.read_bytes()[:900])
+    found = contents(path)
+    assert 4 <= len(found) < 10
+    assert found == messages[: len(found)]
+
+
+def test_a_damaged_chunk_is_left_out_and_named(tmp_path, caplog):
+    messages = [("/a", i, text(f"{i:0100}")) for i in range(40)]
+    path = write_plain_mcap(tmp_path / "a.mcap", messages, chunk_size=1000)
+    data = bytearray(path.read_bytes())
+    # The fourth byte of the second zstd frame's magic.
+    second = data.index(b"\x28\xb5\x2f\xfd", data.index(b"\x28\xb5\x2f\xfd") + 1)
+    data[second + 3] ^= 0xFF
+    path.write_bytes(data)
+    with open_log(path) as log:
+        assert log.damage is None
+        found = [message.log_time_ns for message in log.messages(["/a"])]
+        assert "the chunk at byte" in log.damage
+    assert 0 < len(found) < 40
+    missing = sorted(set(range(40)) - set(found))
+    assert missing == list(range(missing[0], missing[-1] + 1))
+    assert len(missing) < 15
+    assert str(path) in caplog.text
+
+
+@given(st.binary(max_size=200), st.integers(0, 2000), st.integers(1, 40))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+def test_damaged_bytes_never_raise_anything_but_input_errors(tmp_path, noise, position, length):
+    path = tmp_path / "damaged.mcap"
+    data = bytearray(write_plain_mcap(path, [("/a", i, text(str(i))) for i in range(20)], chunk_size=200).read_bytes())
+    position %= len(data)
+    data[position : position + length] = noise
+    path.write_bytes(data)
+    refusal = ""
+    try:
+        contents(path)
+    except InputError as error:
+        refusal = str(error)
+    assert refusal == "" or refusal.startswith(f"{path}: ")
+
+
+def write_long_bag(path: Path, compression) -> Path:
+    """A bag of several chunks."""
+    writer = Rosbag1Writer(path)
+    writer.chunk_threshold = 2000
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/String", typestore=ROS1)
+        rng = np.random.default_rng(2)
+        for index in range(60):
+            value = ROS1.types["std_msgs/msg/String"](data=rng.bytes(100).hex())
+            writer.write(connection, index + 1, ROS1.serialize_ros1(value, "std_msgs/msg/String"))
+    return path
+
+
+@pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
+def test_a_cut_bag_gives_every_whole_message_before_the_cut(tmp_path, compression):
+    whole = write_long_bag(tmp_path / "whole.bag", compression)
+    messages, data = contents(whole), whole.read_bytes()
+    assert len(messages) == 60
+    cut = tmp_path / "cut.bag"
+    counts = []
+    for size in sorted([*np.random.default_rng(3).integers(len(data) // 2, len(data) - 1, 25).tolist(), len(data) - 1]):
+        cut.write_bytes(data[:size])
+        found = contents(cut)
+        assert found == messages[: len(found)]
+        counts.append(len(found))
+        with open_log(cut) as log:
+            assert log.damage == f"{cut}: the bag has no index, as after a cut; everything whole before the cut is used"
+            assert (log.start_ns, log.end_ns, log.message_count) == (1, len(found), len(found))
+            assert first_message(log, "/a").decode().data
+    assert counts == sorted(counts)
+    assert 0 < counts[0] < counts[-1] == 60
+
+
+@given(st.binary(max_size=60), st.integers(0, 20000), st.integers(1, 40))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+def test_damaged_bags_never_raise_anything_but_input_errors(tmp_path, noise, position, length):
+    path = tmp_path / "damaged.bag"
+    path.unlink(missing_ok=True)
+    data = bytearray(write_long_bag(path, None).read_bytes())
+    position %= len(data)
+    data[position : position + length] = noise
+    path.write_bytes(data)
+    refusal = ""
+    try:
+        contents(path)
+    except InputError as error:
+        refusal = str(error)
+    assert refusal == "" or refusal.startswith(f"{path}: ")
+
+
+def test_one_topic_on_two_channels_is_one_topic(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        for log_time in range(4):
+            channel = writer.register_channel("/a", "cdr", schema)
+            writer.add_message(channel, log_time, text("x"), log_time)
+        writer.finish()
+    with open_log(path) as log:
+        (topic,) = log.topics
+        assert topic.num_messages == 4
+        assert len(topic.channel_ids) == 4
+        assert [message.log_time_ns for message in log.messages(["/a"])] == [0, 1, 2, 3]
+
+
+def test_a_type_is_decoded_as_the_file_defines_it(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        # Another String than ROS's, and a type that no store knows.
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"uint8 level\nstring data\n")
+        other = writer.register_schema("my_msgs/msg/Pair", "ros2msg", b"int32 a\nint32 b\n")
+        head = b"\x00\x01\x00\x00"
+        data = head + struct.pack("<B3xI3s", 9, 3, b"hi\0")
+        writer.add_message(writer.register_channel("/s", "cdr", schema), 0, data, 0)
+        writer.add_message(writer.register_channel("/p", "cdr", other), 0, head + struct.pack("<ii", 4, -5), 0)
+        writer.finish()
+    with open_log(path) as log:
+        string, pair = first_message(log, "/s").decode(), first_message(log, "/p").decode()
+        assert (string.level, string.data) == (9, "hi")
+        assert (pair.a, pair.b) == (4, -5)
+    assert ros2.store.fielddefs["std_msgs/msg/String"][1][0][0] == "data"
+
+
+def test_big_endian_messages_are_read(tmp_path):
+    value = ros2.odometry(3 * SECOND + 5, (1, 2, 3), frame_id="odom")
+    data = bytes(typestore().serialize_cdr(value, "nav_msgs/msg/Odometry", little_endian=False))
+    definition, _ = typestore().generate_msgdef("nav_msgs/msg/Odometry", ros_version=2)
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", definition.encode())
+        writer.add_message(writer.register_channel("/odom", "cdr", schema), 0, data, 0)
+        writer.finish()
+    with open_log(path) as log:
+        message = first_message(log, "/odom")
+        assert message.header_stamp_ns() == 3 * SECOND + 5
+        assert message.header_frame_id() == "odom"
+        assert message.decode().pose.pose.position.z == 3.0
+
+
+def test_other_encodings_are_listed_and_refused_when_decoded(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.Log", "protobuf", b"\x0a\x03abc")
+        writer.add_message(writer.register_channel("/log", "protobuf", schema), SECOND, b"data", SECOND)
+        writer.add_message(writer.register_channel("/json", "json", 0), SECOND, b"{}", SECOND)
+        writer.finish()
+    with open_log(path) as log:
+        assert [(t.name, t.type_name, t.encoding) for t in log.topics] == [
+            ("/json", "", "json"), ("/log", "foxglove.Log", "protobuf"),
+        ]  # fmt: skip
+        message = first_message(log, "/log")
+        with pytest.raises(InputError, match=r"a\.mcap: topic '/log' at 1\.000 s: message encoding 'protobuf' is not"):
+            message.decode()
+
+
+@pytest.mark.parametrize("size", [0, 3, 7, 13, 25, 60])
+def test_a_message_that_is_too_short_is_damage(tmp_path, size):
+    entry = robot_entries(num_frames=1)[2]
+    path = write_mcap(tmp_path / "a.mcap", [entry])
+    with open_log(path) as log:
+        whole = first_message(log, entry.topic)
+        short = RawMessage(log.path, whole.channel, 0, whole.data[:size])
+        with pytest.raises(DamagedMessageError, match=r"a\.mcap: topic '/odom' at 0\.000 s"):
+            short.decode()
+        if size < 12:
+            with pytest.raises(DamagedMessageError, match="too short to hold a header"):
+                short.header_stamp_ns()
+
+
+def test_what_is_no_log_gets_one_sentence(tmp_path):
+    def refused(name: str, data: bytes | None) -> str:
+        path = tmp_path / name
+        if data is not None:
+            path.write_bytes(data)
+        with pytest.raises(InputError) as caught:
+            open_log(path)
+        assert str(caught.value).startswith(f"{path}: ")
+        return str(caught.value)
+
+    assert refused("missing.mcap", None).endswith("no such file")
+    assert refused("empty.mcap", b"").endswith("the file is empty")
+    assert "not a log" in refused("text.mcap", b"hello, this is some text")
+    assert "not a log" in refused("short.mcap", b"\x89MCAP")
+    assert "cannot be read" in refused("cut.bag", b"#ROSBAG V2.0\n" + b"\x00" * 40)
+    assert "must end in .db3" in refused("a.sqlite", b"SQLite format 3\0" + b"\0" * 100)
+    assert "cannot be read" in refused("a.db3", b"SQLite format 3\0" + b"\0" * 100)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "x.mcap").touch()
+    assert "without metadata.yaml is no rosbag2 recording; name the files in it; it holds x.mcap" in refused(
+        "folder", None
+    )
+    (tmp_path / "folder" / "metadata.yaml").write_text("a: [")
+    with pytest.raises(InputError, match="not the metadata of a rosbag2 recording"):
+        open_log(tmp_path / "folder")
+
+
+def test_a_rosbag2_folder_that_lacks_a_file_says_so(tmp_path):
+    folder = write_rosbag2(tmp_path / "bag", robot_entries(num_frames=1), storage="mcap")
+    next(folder.glob("*.mcap")).unlink()
+    with pytest.raises(InputError, match=r"\.mcap: no such file"):
+        open_log(folder)
+
+
+def test_a_file_that_is_not_readable_says_so(tmp_path):
+    with pytest.raises(InputError, match="cannot be read: Not a directory"):
+        open_log(write_mcap(tmp_path / "a.mcap", []) / "inside")
+
+
+def test_short_type_names_become_long():
+    assert normalise_type_name("tf2_msgs/TFMessage") == "tf2_msgs/msg/TFMessage"
+    assert normalise_type_name("tf2_msgs/msg/TFMessage") == "tf2_msgs/msg/TFMessage"
+
+
+@needs_recordings
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("ros1/foxglove_example.bag", 8647), ("ros1/foxglove_example-bz2.bag", 8647),
+        ("ros1/foxglove_example-lz4.bag", 8647), ("ros1/foxglove_no-messages.bag", 0),
+        ("ros1/jsk_watercan.bag", 3533), ("db3/evo_tf_example", 518), ("db3/plotjuggler_rosbag2_test", 4695),
+        ("db3/foxglove_chatter.db3", 7), ("db3/wyq_zero_messages.db3", 0), ("rosbag2_dirs/mcap_wbag", 6074),
+        ("rosbag2_dirs/rosbags-rs_mcap", 188), ("rosbag2_dirs/rosbags-rs_sqlite3", 188),
+        ("mcap_ros2/evo_nav2_turtlebot.mcap", 8197), ("mcap_ros2/rerun_supported_ros2_messages.mcap", 194),
+        ("mcap_ros2/rosbag2_bag_with_topics_and_service_events.mcap", 10), ("mcap_other/keelson_test.mcap", 2172),
+        ("mcap_other/lichtblick_example.mcap", 111), ("mcap_other/pointcloudset_test.mcap", 273),
+        ("mcap_proto/rerun_simple-protobuf.mcap", 293),
+    ],
+)  # fmt: skip
+def test_recordings_made_by_others(name, count):
+    with open_log(RECORDINGS / name) as log:
+        messages = list(log.messages([topic.name for topic in log.topics]))
+        assert len(messages) == log.message_count == sum(t.num_messages for t in log.topics) == count
+        assert log.damage is None
+        if messages:
+            assert (messages[0].log_time_ns, messages[-1].log_time_ns) == (log.start_ns, log.end_ns)
+        decoded = 0
+        for message in messages:
+            if message.channel.encoding in ("cdr", "ros1") and "/srv/" not in message.type_name:
+                message.decode()
+                decoded += 1
+        assert decoded > 0 or not name.startswith(("ros1/foxglove_ex", "db3/evo", "mcap_ros2", "rosbag2_dirs"))
+
+
+@needs_recordings
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("nav2_turtlebot_no_footer.mcap", "cut after its last message"),
+        ("ros1_lidar_cut_60pct.mcap", "cut before its end"),
+        ("turtles_cut_90pct.bag", "the bag has no index"),
+    ],
+)
+def test_damaged_recordings_are_used_as_far_as_they_go(name, sentence):
+    with open_log(RECORDINGS / "derived_damaged" / name) as log:
+        assert sentence in log.damage
+        assert len(list(log.messages([t.name for t in log.topics]))) == log.message_count > 200
+
+
+@needs_recordings
+def test_every_conformance_file_is_read_as_the_mcap_package_reads_it():
+    files = sorted((RECORDINGS / "mcap_conformance").rglob("*.mcap"))
+    assert files
+    for file in files:
+        with file.open("rb") as stream:
+            rows = [
+                (channel.topic, message.log_time, message.data)
+                for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False)
+            ]
+        assert sorted(contents(file)) == sorted(rows), file
+        with open_log(file) as log:
+            assert log.damage is None, file

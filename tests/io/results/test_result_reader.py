@@ -1,0 +1,181 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.errors import InputError
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.messages.ros_types import message, time_message
+from octoreplay.io.results.result_reader import ResultReader
+from octoreplay.io.results.result_writer import ResultWriter
+from result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
+
+METRICS = [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
+
+
+def test_what_was_written_comes_back(tmp_path: Path) -> None:
+    path = write_result(tmp_path)
+    with ResultReader(path) as reader:
+        assert reader.metrics() == METRICS
+        assert reader.robots == ("alpha", "beta")
+        assert reader.class_table == CLASSES
+        assert reader.config == team(tmp_path)
+        assert reader.prior == 0.0
+        written = summary(METRICS)
+        read = reader.summary(reader.metrics())
+    assert np.isnan(read.wall_seconds)
+    assert dataclasses.replace(read, wall_seconds=written.wall_seconds) == written
+    assert read.lost_data
+
+
+def test_numbers_of_the_configuration_come_back_exactly(tmp_path: Path) -> None:
+    values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
+    config = team(tmp_path).with_parameters(values)
+    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+        writer.complete(summary(METRICS))
+    with ResultReader(tmp_path / "out.mcap") as reader:
+        assert reader.config == config
+        assert reader.prior == config.map.prior(2)
+
+
+def test_states_lead_from_the_last_key_frame(tmp_path: Path) -> None:
+    states = [
+        state("alpha", 0, 1, b"a", key=True), state("alpha", 1, 2, b"b"), state("alpha", 2, 3, b"c"),
+        state("alpha", 3, 4, b"d", key=True), state("alpha", 4, 6, b"e"),
+    ]  # fmt: skip
+
+    def fill(writer: ResultWriter) -> None:
+        for entry in states:
+            writer.write_state(entry)
+            writer.write_state(dataclasses.replace(entry, robot_id="beta", data=b"other"))
+
+    with ResultReader(write_result(tmp_path, fill)) as reader:
+        assert reader.states("alpha") == states[3:]
+        assert reader.states("alpha", START + 6 * SECOND - 1) == states[3:4]
+        assert reader.states("alpha", START + 3 * SECOND) == states[:3]
+        assert reader.states("alpha", START + 1 * SECOND) == states[:1]
+        assert [entry.data for entry in reader.states("beta")] == [b"other", b"other"]
+        assert reader.state_times("alpha") == [(tick, START + tick * SECOND) for tick in (1, 2, 3, 4, 6)]
+        with pytest.raises(InputError, match="no map of robot 'alpha' is stored up to the time asked for"):
+            reader.states("alpha", START)
+
+
+def test_a_delta_may_build_on_an_older_state(tmp_path: Path) -> None:
+    states = [state("alpha", 0, 1, b"a", key=True), state("alpha", 1, 2, b"b")]
+    states.append(dataclasses.replace(state("alpha", 2, 3, b"c"), base_sequence=0))
+    with ResultReader(
+        write_result(tmp_path, lambda writer: [writer.write_state(s) for s in states] and None)
+    ) as reader:
+        assert [entry.sequence for entry in reader.states("alpha")] == [0, 2]
+
+
+def test_a_missing_key_frame_is_damage(tmp_path: Path) -> None:
+    path = write_result(tmp_path, lambda writer: writer.write_state(state("alpha", 5, 1, b"delta")))
+    with ResultReader(path) as reader, pytest.raises(InputError, match="state 4 of robot 'alpha' is missing"):
+        reader.states("alpha")
+
+
+def test_poses_are_the_sensors(tmp_path: Path) -> None:
+    with ResultReader(write_result(tmp_path)) as reader:
+        stamps, poses = reader.poses("alpha")
+    assert stamps == [START + tick * SECOND for tick in range(1, 5)]
+    np.testing.assert_allclose(poses[:, :3], [[tick, 2, 3] for tick in range(1, 5)])
+    np.testing.assert_allclose(poses[:, 3:], [[0, 0, 0.5**0.5, 0.5**0.5]] * 4)
+
+
+def test_an_unknown_robot_is_named_with_the_known_ones(tmp_path: Path) -> None:
+    with ResultReader(write_result(tmp_path)) as reader:
+        for ask in (reader.states, reader.state_times, reader.poses):
+            with pytest.raises(InputError, match="robot 'gamma' not found; robots: alpha, beta"):
+                ask("gamma")
+
+
+def test_changed_and_missing_inputs_are_told(tmp_path: Path) -> None:
+    path = write_result(tmp_path)
+    with ResultReader(path) as reader:
+        assert reader.changed_inputs() == []
+        (tmp_path / "alpha.bag").write_bytes(b"another log!")
+        (tmp_path / "beta.bag").unlink()
+        first, second = reader.changed_inputs()
+    assert first.endswith("alpha.bag: has changed since result.mcap was made from it")
+    assert second.endswith("beta.bag: input of result.mcap is missing")
+
+
+def test_a_moved_result_finds_the_logs_that_moved_with_it(tmp_path: Path) -> None:
+    (tmp_path / "before").mkdir()
+    write_result(tmp_path / "before")
+    (tmp_path / "before").rename(tmp_path / "after")
+    with ResultReader(tmp_path / "after" / "result.mcap") as reader:
+        assert reader.config.robots[0].logs == (tmp_path / "after" / "alpha.bag",)
+        assert reader.changed_inputs() == []
+
+
+def test_an_interrupted_result_can_be_read(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        write_until(KeyboardInterrupt, tmp_path / "o.mcap", METRICS[:2])
+    with ResultReader(tmp_path / "o.partial.mcap") as reader:
+        metrics = reader.metrics()
+        assert metrics == METRICS[:2]
+        read = reader.summary(metrics)
+    assert (read.num_ticks, read.stop_reason, read.total_sent_bytes) == (2, "interrupted", 600)
+    assert read.mean_packet_bytes == np.mean([100, 140, 200, 240])
+    assert read.peak_total_distance == METRICS[1].total_distance
+
+
+def test_a_result_without_a_tick_says_so(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        write_until(KeyboardInterrupt, tmp_path / "o.mcap", [])
+    with ResultReader(tmp_path / "o.partial.mcap") as reader, pytest.raises(InputError, match="holds no tick"):
+        reader.summary(reader.metrics())
+
+
+def test_other_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.mcap: cannot be read: No such file"):
+        ResultReader(tmp_path / "none.mcap")
+    for content in (b"", b"not an MCAP", b"\x89MCAP0\r\n" + bytes(100)):
+        (tmp_path / "a.mcap").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.mcap: not a finished MCAP file; give the OUT\.mcap"):
+            ResultReader(tmp_path / "a.mcap")
+    with RosMcapWriter(tmp_path / "log.mcap") as writer:
+        clock = message("rosgraph_msgs/msg/Clock", clock=time_message(0))
+        writer.write("/clock", "rosgraph_msgs/msg/Clock", clock, 0)
+    with pytest.raises(InputError, match=r"log\.mcap: an MCAP file, but no result of octoreplay"):
+        ResultReader(tmp_path / "log.mcap")
+
+
+def test_a_later_format_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("octoreplay.io.results.result_writer.FORMAT_VERSION", "3")
+    path = write_result(tmp_path)
+    with pytest.raises(InputError, match="result format 3, this version reads 2"):
+        ResultReader(path)
+
+
+def test_damage_is_one_sentence_or_harmless(tmp_path: Path) -> None:
+    def fill(writer: ResultWriter) -> None:
+        writer.write_state(state("alpha", 0, 1, bytes(range(256)), key=True))
+
+    data = write_result(tmp_path, fill).read_bytes()
+    rng = np.random.default_rng(1)
+    damaged, sentences = tmp_path / "damaged.mcap", []
+    for _ in range(150):
+        content = bytearray(data)
+        content[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        damaged.write_bytes(content)
+        try:
+            with ResultReader(damaged) as reader:
+                assert reader.metrics() in (METRICS, [])
+                assert [entry.data for entry in reader.states("alpha")] == [bytes(range(256))]
+        except InputError as error:
+            sentences.append(str(error))
+    assert len(sentences) > 20
+    assert all(sentence.startswith(str(damaged)) for sentence in sentences)
+
+
+def test_every_cut_of_a_result_is_one_sentence(tmp_path: Path) -> None:
+    data = write_result(tmp_path).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for length in range(0, len(data), max(1, len(data) // 60)):
+        cut.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"cut\.mcap: "), ResultReader(cut) as reader:
+            reader.metrics()
