@@ -27,7 +27,11 @@ NO_CLASS = 0
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Pinhole intrinsics of a rectified camera, in pixels; z looks forward, x right, y down (REP 103 optical)."""
+    """Pinhole intrinsics in pixels; z looks forward, x right, y down (REP 103 optical).
+
+    ``slopes`` is (2, height, width) float32 where the lens distorts: x / z and y / z of every pixel's ray, in place of
+    (u - cx) / fx and (v - cy) / fy.
+    """
 
     width: int
     height: int
@@ -35,6 +39,21 @@ class CameraModel:
     fy: float
     cx: float
     cy: float
+    slopes: Float32Array | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyBox:
+    """A box in which a scan's points belong to a robot: its own body, or another robot's.
+
+    ``low`` and ``high`` are (3,) in metres in the box's frame, and ``T_box_team`` (4, 4) float64 maps the team's frame
+    to it. Points in an own box carry no information; points in another's free their ray and hit nothing.
+    """
+
+    low: Float64Array
+    high: Float64Array
+    T_box_team: Float64Array
+    is_own: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +62,8 @@ class DepthFrame:
 
     ``depth_image`` is (H, W), uint16 or float32; metres along z = value x ``depth_unit``.
     ``class_image`` is (H, W) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels (all points class 1).
-    ``T_team_sensor`` is (4, 4) float64.
+    ``confidence_image`` is (H, W) uint8: how sure each label is, in 255ths; None where all are sure.
+    ``T_team_sensor`` is (4, 4) float64; points in ``boxes`` are a robot's.
     """
 
     robot_id: str
@@ -53,6 +73,8 @@ class DepthFrame:
     class_image: UInt8Array | None
     camera: CameraModel
     T_team_sensor: Float64Array
+    confidence_image: UInt8Array | None = None
+    boxes: tuple[BodyBox, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +83,8 @@ class CloudFrame:
 
     ``points`` is (P, 3) float32 or float64 in the sensor's frame; NaN rows carry no information.
     ``class_ids`` is (P,) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels.
-    ``T_team_sensor`` is (4, 4) float64.
+    ``confidences`` is (P,) uint8: how sure each label is, in 255ths; None where all are sure.
+    ``T_team_sensor`` is (4, 4) float64; points in ``boxes`` are a robot's.
     """
 
     robot_id: str
@@ -69,6 +92,8 @@ class CloudFrame:
     points: npt.NDArray[Any]
     class_ids: UInt8Array | None
     T_team_sensor: Float64Array
+    confidences: UInt8Array | None = None
+    boxes: tuple[BodyBox, ...] = ()
 
 
 Frame: TypeAlias = DepthFrame | CloudFrame
