@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from octoreplay.config import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.kernels import ends, storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
@@ -19,8 +19,9 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
-from octoreplay.records import CameraModel, CloudFrame, DepthFrame
+from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
 from octree_factory import cells_of
+from reference.evidence import Evidence, IndexedScan
 from reference.hand_made import FACING_X, cloud, depth_frame, facing_x
 from reference.scenarios import TeamShape, make_scenario
 from reference.sensor import scan_update
@@ -32,6 +33,12 @@ MAP = MapConfig(resolution=0.2)
 
 def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
     """(freed keys, {hit key: class_id}) of a scan as the caster finds them."""
+    freed, hit = _weighted_cells(frame, sensor, region, num_classes, caster)
+    return freed, {key: class_id for key, (class_id, _) in hit.items()}
+
+
+def _weighted_cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
+    """(freed keys, {hit key: (class_id, strength)}) of a scan as the caster finds them."""
     touched = (caster or ScanCaster(sensor, region, num_classes)).cast(frame)
     assert len(set(touched.codes.tolist())) == len(touched.codes)
     marks = touched.marks.reshape(-1, storage.BRICK_CELLS)[touched.touched]
@@ -39,24 +46,33 @@ def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=Non
     keys = np.empty((len(rows), 3), np.int64)
     storage.codes_to_keys((touched.codes[rows] << storage.CELL_BITS) + cells, keys)
     kinds = marks[rows, cells].tolist()
-    content = dict(zip(map(tuple, keys.tolist()), kinds, strict=True))
-    freed = {key for key, kind in content.items() if kind == 1}
-    return freed, {key: kind - 1 for key, kind in content.items() if kind > 1}
+    strengths = np.full(len(kinds), 255)
+    if touched.strengths.size:
+        strengths = touched.strengths.reshape(-1, storage.BRICK_CELLS)[touched.touched][rows, cells]
+    content = dict(zip(map(tuple, keys.tolist()), zip(kinds, strengths.tolist(), strict=True), strict=True))
+    freed = {key for key, (kind, _) in content.items() if kind == 1}
+    return freed, {key: (kind - 1, strength) for key, (kind, strength) in content.items() if kind > 1}
 
 
 def _expected(frame, sensor=SENSOR, region=MAP):
+    freed, hit = _weighted_expected(frame, sensor, region)
+    return freed, {key: class_id for key, (class_id, _) in hit.items()}
+
+
+def _weighted_expected(frame, sensor=SENSOR, region=MAP):
     update = scan_update(frame, sensor, region)
+    winners = zip(update.hit_classes.tolist(), update.hit_strengths.tolist(), strict=True)
     freed = {tuple(key) for key in update.freed.tolist()}
-    return freed, dict(zip(map(tuple, update.hit.tolist()), update.hit_classes.tolist(), strict=True))
+    return freed, dict(zip(map(tuple, update.hit.tolist()), winners, strict=True))
 
 
-def _agree(frame, sensor=SENSOR, region=MAP):
-    freed, hit = _cells(frame, sensor, region)
-    expected_freed, expected_hit = _expected(frame, sensor, region)
+def _agree(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES):
+    freed, hit = _weighted_cells(frame, sensor, region, num_classes)
+    expected_freed, expected_hit = _weighted_expected(frame, sensor, region)
     assert hit == expected_hit
     assert freed - expected_freed == set()
     assert expected_freed - freed == set()
-    return freed, hit
+    return freed, {key: class_id for key, (class_id, _) in hit.items()}
 
 
 def _random_pose(rng, spread=3.0):
@@ -327,6 +343,202 @@ def test_one_caster_gives_the_same_for_every_scan_as_a_new_one():
         assert _cells(moved, caster=caster) == _cells(moved)
 
 
+# --- confidences, bodies, lenses -------------------------------------------------------------------------------------
+
+
+def _with_confidences(frame, confidences):
+    name = "confidence_image" if isinstance(frame, DepthFrame) else "confidences"
+    return dataclasses.replace(frame, **{name: np.asarray(confidences, np.uint8)})
+
+
+def _random_boxes(rng, frame, count):
+    """Boxes anywhere within the scan's reach, turned any way; some hold the sensor."""
+    boxes = []
+    for _ in range(count):
+        low = rng.uniform(-3.0, 0.2, 3)
+        turned = _random_pose(rng)
+        turned[:3, 3] -= turned[:3, :3] @ frame.T_team_sensor[:3, 3]
+        boxes.append(BodyBox(low, low + rng.uniform(0.2, 4.0, 3), turned, bool(rng.random() < 0.5)))
+    return tuple(boxes)
+
+
+def _random_slopes(rng, size, holes=0.05):
+    """A lens that bends rays, and pixels through which it sees nothing."""
+    v, u = np.mgrid[: size[0], : size[1]]
+    slopes = np.stack([(u - size[1] / 2) / 9.0, (v - size[0] / 2) / 8.5])
+    slopes *= 1.0 + rng.uniform(-0.3, 0.5) * (slopes**2).sum(axis=0)
+    slopes[:, rng.random(size) < holes] = np.nan
+    return slopes.astype(np.float32)
+
+
+def _random_frame(seed, num_classes, kind, *, confident, num_boxes, bent):
+    """A scan whose cells hold several points, with what is asked for, and a sensor that cuts some of its rays."""
+    rng = np.random.default_rng(seed)
+    if kind == "cloud":
+        # Clouds are worked on in blocks of 1024 points.
+        frame = _random_cloud(rng, rng.choice([np.float32, np.float64]), size=int(rng.choice([300, 1300])))
+    else:
+        frame = _random_depth(rng, np.float32 if kind == "depth32" else np.uint16)
+        frame.depth_image[rng.random(frame.depth_image.shape) < 0.05] = 7
+    labels = "class_ids" if kind == "cloud" else "class_image"
+    shape = getattr(frame, labels).shape
+    frame = dataclasses.replace(frame, **{labels: rng.integers(0, num_classes + 1, shape).astype(np.uint8)})
+    if bent and kind != "cloud":
+        camera = dataclasses.replace(frame.camera, slopes=_random_slopes(rng, shape))
+        frame = dataclasses.replace(frame, camera=camera)
+    if confident:
+        few = rng.random() < 0.5
+        frame = _with_confidences(frame, rng.choice([0, 1, 2, 127, 128, 255] if few else np.arange(256), shape))
+    return dataclasses.replace(frame, boxes=_random_boxes(rng, frame, num_boxes))
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_classes=st.sampled_from([1, 3, 12]),
+    kind=st.sampled_from(["depth16", "depth32", "cloud"]),
+    rays=st.sampled_from(["cells", "all"]),
+    confident=st.booleans(),
+    num_boxes=st.integers(0, 4),
+    bent=st.booleans(),
+    resolution=st.sampled_from([0.2, 0.5, 1.3]),
+)
+def test_random_scans_with_confidences_boxes_and_lenses(
+    seed, num_classes, kind, rays, confident, num_boxes, bent, resolution
+):
+    sensor = dataclasses.replace(SENSOR, rays=rays, min_range=0.4, no_return_depth=(7.0,), invalid_depth=(0.0,))
+    frame = _random_frame(seed, num_classes, kind, confident=confident, num_boxes=num_boxes, bent=bent)
+    _agree(frame, sensor, MapConfig(resolution), num_classes)
+
+
+def test_labels_vote_with_their_confidences():
+    near = np.array([[2.0, 0.0, 0.0]]) + np.arange(5)[:, None] * 1e-3
+    for class_ids, confidences, winner in (
+        ([4, 4, 2, 0, 0], [50, 60, 111, 255, 255], (2, 111)),
+        ([4, 4, 2, 0, 0], [50, 60, 110, 255, 255], (2, 110)),
+        ([4, 4, 2, 0, 0], [50, 60, 109, 255, 255], (4, 55)),
+        ([4, 4, 2, 4, 2], [50, 61, 0, 0, 0], (4, 56)),
+        ([3, 3, 3, 3, 3], [1, 0, 2, 2, 0], (3, 2)),
+        ([3, 3, 3, 3, 3], [1, 0, 1, 2, 0], (3, 1)),
+    ):
+        frame = _with_confidences(cloud(near, class_ids), confidences)
+        assert list(_weighted_cells(frame)[1].values()) == [winner]
+        _agree(frame)
+
+
+@pytest.mark.parametrize("rays", ["cells", "all"])
+def test_points_without_confidence_free_their_ray_and_hit_nothing(rays):
+    sensor = dataclasses.replace(SENSOR, rays=rays)
+    for frame in (cloud([[2.0, 0, 0]], [1]), cloud([[2.0, 0, 0]], None), depth_frame(np.array([[2.0]], np.float32))):
+        shape = (1,) if isinstance(frame, CloudFrame) else (1, 1)
+        freed, hit = _agree(_with_confidences(frame, np.zeros(shape)), sensor, MapConfig(0.25))
+        assert len(freed) == 8
+        assert not hit
+
+
+def test_long_sums_of_confidences():
+    """More than 2^31 255ths in one cell, for one class by a single one more."""
+    lengths = np.full(4, 8_000_000, np.int32)
+    sums = 255 * lengths
+    lengths[3], sums[3] = lengths[3] + 1, sums[3] + 1
+    keys, kinds = np.zeros((4, 3), np.int32), np.array([1, 2, 1, 2], np.uint8)
+    low, edges, table = np.zeros(3, np.int64), np.ones(3, np.int64), np.full(8, -1, np.int32)
+    votes, end_cells = np.zeros((1, 2), np.int32), np.zeros(1, np.int64)
+    end_keys, marks, strengths = np.zeros((1, 3), np.int32), np.zeros(1, np.uint8), np.zeros(1, np.uint8)
+    ends.distinct_ends(keys, kinds, lengths, low, edges, 2, table, votes, end_cells, end_keys, marks)
+    vote_sums = np.zeros((1, 2), np.int64)
+    ends.weigh_ends(keys, kinds, sums, low, edges, 2, table, votes, vote_sums, end_cells, marks, strengths)
+    assert (marks[0], strengths[0]) == (3, 255)
+    assert vote_sums.tolist() == [[4_080_000_000, 4_080_000_001]]
+
+
+def _box(low, high, *, is_own, pose=None):
+    return BodyBox(np.array(low, float), np.array(high, float), np.eye(4) if pose is None else pose, is_own)
+
+
+@pytest.mark.parametrize("rays", ["cells", "all"])
+def test_points_on_robots_bodies(rays):
+    """The point is at (2.5, 0.5, 0.5): its ray frees ten cells of a quarter metre."""
+    sensor = dataclasses.replace(SENSOR, rays=rays)
+    other, own = _box([2.5, 0, 0], [3, 0.5, 1], is_own=False), _box([2, 0.5, 0.5], [2.5, 0.5, 0.5], is_own=True)
+    beside = _box([2.5 + 1e-9, 0, 0], [3, 1, 1], is_own=True)
+    for frame in (cloud([[2.0, 0, 0]], [1]), depth_frame(np.array([[2.0]], np.float32))):
+        for boxes, num_freed, num_hits in (
+            ((), 8, 1), ((beside,), 8, 1), ((other,), 8, 0), ((own,), 0, 0), ((own, other), 0, 0), ((other, own), 0, 0),
+            ((beside, other), 8, 0),
+        ):  # fmt: skip
+            freed, hit = _agree(dataclasses.replace(frame, boxes=boxes), sensor, MapConfig(0.25))
+            assert (len(freed), len(hit)) == (num_freed, num_hits)
+
+
+@pytest.mark.parametrize("is_own", [True, False])
+def test_cut_rays_are_in_no_box(is_own):
+    everywhere = _box([-99] * 3, [99] * 3, is_own=is_own)
+    for frame in (cloud([[9.0, 0, 0]], [1]), depth_frame(np.array([[9.0]], np.float32))):
+        freed, hit = _agree(dataclasses.replace(frame, boxes=(everywhere,)), SENSOR, MapConfig(0.25))
+        assert (len(freed), hit) == (16, {})
+
+
+def test_boxes_are_where_their_frame_is():
+    T_box_team = np.linalg.inv(facing_x(2.5, 0.5, 0.5))
+    # The box reaches an eighth along the frame's z, which is the team's x, and nowhere else.
+    ahead = _box([0, 0, 0], [0, 0, 0.125], is_own=True, pose=T_box_team)
+    points = [[2.0, 0, 0], [2.125, 0, 0], [2.0, 0.125, 0], [2.0, 0, 0.125]]
+    hits = [_agree(dataclasses.replace(cloud([point], [1]), boxes=(ahead,)))[1] for point in points]
+    assert [len(hit) for hit in hits] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.parametrize("rays", ["cells", "all"])
+def test_a_lens_gives_what_its_points_give_as_a_cloud(dtype, rays):
+    """Every bit of the map is the same, boxes and confidences included."""
+    sensor, region = dataclasses.replace(SENSOR, rays=rays), MapConfig(0.3)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        frame = _random_depth(rng, dtype)
+        shape = frame.depth_image.shape
+        slopes = _random_slopes(rng, shape)
+        confidences, boxes = rng.integers(0, 256, shape), _random_boxes(rng, frame, 2)
+        camera = dataclasses.replace(frame.camera, slopes=slopes)
+        frame = dataclasses.replace(_with_confidences(frame, confidences), camera=camera, boxes=boxes)
+        z = frame.depth_image * frame.depth_unit
+        points = np.stack([slopes[0] * z.astype(np.float64), slopes[1] * z.astype(np.float64), z], axis=-1)
+        same = CloudFrame("r", 0, points.reshape(-1, 3), frame.class_image.ravel(), frame.T_team_sensor, boxes=boxes)
+        same = _with_confidences(same, confidences.ravel())
+        steps = clamped_increments(sensor)
+        maps = [cells_of(_sums([each], steps, sensor=sensor, region=region)) for each in (frame, same)]
+        assert maps[0] == maps[1]
+        assert len(maps[0]) > 300
+
+
+def test_a_pinhole_given_as_slopes():
+    rng = np.random.default_rng(4)
+    frame = _random_depth(rng)
+    camera = frame.camera
+    v, u = np.mgrid[: camera.height, : camera.width]
+    slopes = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
+    # What the pinhole says must not matter.
+    bent = dataclasses.replace(frame, camera=CameraModel(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0, slopes))
+    assert _cells(bent) == _cells(frame)
+
+
+@pytest.mark.parametrize("rays", ["cells", "all"])
+def test_layouts_of_confidences_and_slopes_do_not_matter(rays):
+    rng = np.random.default_rng(5)
+    frame = _random_depth(rng)
+    shape = frame.depth_image.shape
+    confidences, slopes = rng.integers(0, 256, shape).astype(np.uint8), _random_slopes(rng, shape)
+    sensor = dataclasses.replace(SENSOR, rays=rays)
+
+    def bent(layout):
+        camera = dataclasses.replace(frame.camera, slopes=layout(slopes))
+        return dataclasses.replace(frame, camera=camera, confidence_image=layout(confidences))
+
+    expected = _weighted_cells(bent(np.array), sensor)
+    for layout in (np.asfortranarray, _strided, lambda a: a[::-1][::-1], _read_only):
+        assert _weighted_cells(bent(layout), sensor) == expected
+
+
 # --- the edge of the key space ---------------------------------------------------------------------------------------
 
 
@@ -398,6 +610,65 @@ def test_sums_of_many_scans_are_those_of_the_reference(increments):
             expected[key] = np.clip(expected.get(key, np.zeros(num_classes)) + change, steps.least, steps.most)
     # All increments are multiples of a quarter, so that float32 sums are exact.
     assert cells_of(octree) == {key: value.astype(np.float32).tobytes() for key, value in expected.items()}
+
+
+def _mixed_scenario(confidence):
+    """A team's scans of both kinds; ``confidence`` gives those of a shape, or None for scans that have none."""
+    scenario = make_scenario(2, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), resolution=0.4, sensors="mixed"))
+    frames = []
+    for frame in scenario.frames:
+        shape = (len(frame.points),) if isinstance(frame, CloudFrame) else frame.depth_image.shape
+        given = confidence(shape)
+        frames.append(frame if given is None else _with_confidences(frame, given))
+    return frames
+
+
+def test_full_confidence_is_none():
+    """Bit for bit, in evidence as in counts."""
+    sensor, region = SensorConfig(max_range=4.0, hit=0.85, miss=-0.41, hit_other=-0.13), MapConfig(0.4)
+    plain, sure = _mixed_scenario(lambda _: None), _mixed_scenario(lambda shape: np.full(shape, 255))
+    for num_classes, steps in (
+        (NUM_CLASSES, clamped_increments(sensor)), (NUM_CLASSES, unclamped_increments(sensor)),
+        (1, clamped_increments(sensor)), (1, COUNT_SCANS),
+    ):  # fmt: skip
+        maps = [cells_of(_sums(frames, steps, num_classes, sensor, region)) for frames in (plain, sure)]
+        assert maps[0] == maps[1]
+
+
+@pytest.mark.parametrize("num_classes", [1, 3, 12])
+@pytest.mark.parametrize("hit_other", [None, -0.2])
+def test_weighted_sums_of_many_scans_are_those_of_the_reference(num_classes, hit_other):
+    """Clamped, unclamped and counted; scans with and without confidences, one after the other."""
+    rng = np.random.default_rng(num_classes)
+    sensor = SensorConfig(max_range=4.0, hit=0.9, miss=-0.4, hit_other=hit_other, clamp_min=-2.0, clamp_max=1.5)
+    region, frames = MapConfig(0.4), []
+    for frame in _mixed_scenario(lambda shape: rng.integers(0, 256, shape) if rng.random() < 0.8 else None):
+        labels = "class_ids" if isinstance(frame, CloudFrame) else "class_image"
+        ids = getattr(frame, labels)
+        ids = np.where(ids > 0, rng.integers(1, num_classes + 1, ids.shape), 0).astype(np.uint8)
+        frames.append(dataclasses.replace(frame, **{labels: ids}, boxes=_random_boxes(rng, frame, 1)))
+    updates = [scan_update(frame, sensor, region) for frame in frames]
+    keys = sorted({tuple(key) for update in updates for key in [*update.freed.tolist(), *update.hit.tolist()]})
+    place = {key: i for i, key in enumerate(keys)}
+    reference = Evidence(len(keys), num_classes)
+    for update in updates:
+        freed, hit = ([place[tuple(key)] for key in part.tolist()] for part in (update.freed, update.hit))
+        scan = IndexedScan(0, 0, np.array(freed, int), np.array(hit, int), update.hit_classes, update.hit_strengths)
+        reference.integrate(scan, sensor)
+    caster = ScanCaster(sensor, region, num_classes)
+    octrees = [SemanticOctree(region.resolution, classes) for classes in (num_classes, num_classes, 1)]
+    for frame in frames:
+        cells = caster.cast(frame)
+        for octree, steps in zip(
+            octrees, (clamped_increments(sensor), unclamped_increments(sensor), COUNT_SCANS), strict=True
+        ):
+            add_scan(octree, cells, steps, 0)
+    found = [cells_of(octree) for octree in octrees]
+    assert all(sorted(cells) == keys for cells in found)
+    values = [np.array([np.frombuffer(cells[key], np.float32) for key in keys]) for cells in found]
+    np.testing.assert_allclose(values[0], reference.clamped[:, 1:], atol=1e-5)
+    np.testing.assert_allclose(values[1], reference.total[:, 1:], atol=1e-5)
+    np.testing.assert_array_equal(values[2][:, 0], reference.num_touching_scans)
 
 
 def test_one_class_and_254_classes():

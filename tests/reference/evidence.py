@@ -13,13 +13,14 @@ from octoreplay.records import Float64Array, Int64Array
 
 @dataclass(frozen=True, eq=False)
 class IndexedScan:
-    """One scan as indices into the team's list of cells; ``hit_classes`` are 1..C."""
+    """One scan as indices into the team's list of cells; ``hit_classes`` are 1..C, ``hit_strengths`` in 255ths."""
 
     robot: int
     stamp_ns: int
     freed: Int64Array
     hit: Int64Array
     hit_classes: Int64Array
+    hit_strengths: Int64Array
 
 
 class Evidence:
@@ -32,7 +33,10 @@ class Evidence:
         self.num_scans = 0
 
     def integrate(self, scan: IndexedScan, sensor: SensorConfig) -> None:
-        """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells."""
+        """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells.
+
+        ``hit`` counts as much as its class is sure.
+        """
         for cells, increments in self._increments(scan, sensor):
             self.total[cells] += increments
             self.clamped[cells] = np.clip(self.clamped[cells] + increments, sensor.clamp_min, sensor.clamp_max)
@@ -44,7 +48,7 @@ class Evidence:
         num_columns = self.clamped.shape[1]
         freed = np.full((len(scan.freed), num_columns), sensor.miss)
         hit = np.full((len(scan.hit), num_columns), sensor.miss if sensor.hit_other is None else sensor.hit_other)
-        hit[np.arange(len(scan.hit)), scan.hit_classes] = sensor.hit
+        hit[np.arange(len(scan.hit)), scan.hit_classes] = sensor.hit * scan.hit_strengths / 255
         for cells, increments in ((scan.freed, freed), (scan.hit, hit)):
             increments[:, 0] = 0.0
             yield cells, increments

@@ -6,6 +6,7 @@ OctoMap's rule holds: one update per cell and scan, and a cell that is hit is no
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.config import MapConfig, SensorConfig
-from octoreplay.records import NO_CLASS, BoolArray, CloudFrame, DepthFrame, Float64Array, Frame, Int64Array
+from octoreplay.records import (
+    NO_CLASS,
+    BodyBox,
+    BoolArray,
+    CloudFrame,
+    DepthFrame,
+    Float64Array,
+    Frame,
+    Int64Array,
+)
 from reference.rays import Key, cells_before_end, coord_to_key, key_to_coord
 
 
@@ -23,21 +33,27 @@ class Measurements:
 
     ``ends`` is (P, 3) float64, team frame [m]: the measured point, or the cut end of a ray beyond max_range.
     ``class_ids`` is (P,): 1..C for a point that hits its cell, NO_CLASS for one that only frees its ray (an ignored
-    label, a cut ray, 'no return').
+    label, a cut ray, 'no return', another robot's body, a label without confidence).
+    ``confidences`` (P,) say how sure each label is, in 255ths.
     """
 
     origin: Float64Array
     ends: Float64Array
     class_ids: Int64Array
+    confidences: Int64Array
 
 
 @dataclass(frozen=True, eq=False)
 class ScanUpdate:
-    """The cells that one scan touches, each once: ``freed`` (F, 3), ``hit`` (H, 3), and the class of each hit (H,)."""
+    """The cells that one scan touches, each once: ``freed`` (F, 3), ``hit`` (H, 3), and the class of each hit (H,).
+
+    ``hit_strengths`` (H,) are how sure these classes are, in 255ths.
+    """
 
     freed: Int64Array
     hit: Int64Array
     hit_classes: Int64Array
+    hit_strengths: Int64Array
 
 
 def scan_update(frame: Frame, sensor: SensorConfig, region: MapConfig) -> ScanUpdate:
@@ -45,12 +61,13 @@ def scan_update(frame: Frame, sensor: SensorConfig, region: MapConfig) -> ScanUp
     measured = measurements(frame, sensor)
     hit = hit_cells(measured, region.resolution)
     passed = passed_cells(measured, sensor.rays, region.resolution)
-    hit = {key: class_id for key, class_id in hit.items() if in_region(key, region)}
+    hit = {key: winner for key, winner in hit.items() if in_region(key, region)}
     freed = sorted(key for key in passed if key not in hit and in_region(key, region))
     return ScanUpdate(
         freed=np.array(freed, dtype=np.int64).reshape(-1, 3),
         hit=np.array(sorted(hit), dtype=np.int64).reshape(-1, 3),
-        hit_classes=np.array([hit[key] for key in sorted(hit)], dtype=np.int64),
+        hit_classes=np.array([hit[key][0] for key in sorted(hit)], dtype=np.int64),
+        hit_strengths=np.array([hit[key][1] for key in sorted(hit)], dtype=np.int64),
     )
 
 
@@ -61,14 +78,24 @@ def in_region(key: Key, region: MapConfig) -> bool:
     return all(box[axis] <= centre[axis] < box[axis + 3] for axis in range(3))
 
 
-def hit_cells(measured: Measurements, resolution: float) -> dict[Key, int]:
-    """The class of every end cell with a labelled point: the one with the most points, ties to the lower id."""
-    votes: dict[Key, dict[int, int]] = {}
-    for end, class_id in zip(measured.ends, measured.class_ids, strict=True):
+def hit_cells(measured: Measurements, resolution: float) -> dict[Key, tuple[int, int]]:
+    """The class of every end cell with a labelled point, and its strength in 255ths.
+
+    The class with the largest sum of confidences wins, ties to the lower id; its strength is their mean, rounded half
+    up.
+    """
+    votes: dict[Key, dict[int, list[int]]] = {}
+    for end, class_id, confidence in zip(measured.ends, measured.class_ids, measured.confidences, strict=True):
         if class_id != NO_CLASS:
-            counts = votes.setdefault(coord_to_key(end, resolution), {})
-            counts[int(class_id)] = counts.get(int(class_id), 0) + 1
-    return {key: min(counts, key=lambda c: (-counts[c], c)) for key, counts in votes.items()}
+            of_cell = votes.setdefault(coord_to_key(end, resolution), {})
+            of_cell.setdefault(int(class_id), []).append(int(confidence))
+    winners = {key: min(of_cell, key=lambda c: (-sum(of_cell[c]), c)) for key, of_cell in votes.items()}
+    return {key: (c, _rounded_mean(votes[key][c])) for key, c in winners.items()}
+
+
+def _rounded_mean(numbers: list[int]) -> int:
+    """The mean of whole numbers, rounded half up."""
+    return math.floor(sum(numbers) / len(numbers) + 0.5)
 
 
 def passed_cells(measured: Measurements, rays: str, resolution: float) -> set[Key]:
@@ -92,34 +119,56 @@ def passed_cells(measured: Measurements, rays: str, resolution: float) -> set[Ke
 def measurements(frame: Frame, sensor: SensorConfig) -> Measurements:
     """The rays of one scan that carry information, in the team's frame."""
     if isinstance(frame, DepthFrame):
-        points, class_ids, no_return = _depth_points(frame, sensor)
+        points, class_ids, confidences, no_return = _depth_points(frame, sensor)
     else:
-        points, class_ids, no_return = _cloud_points(frame)
+        points, class_ids, confidences, no_return = _cloud_points(frame)
     distance = np.sqrt((points**2).sum(axis=1))
     used = no_return | ((distance >= sensor.min_range) & (distance > 0))
     points, class_ids, distance, no_return = points[used], class_ids[used], distance[used], no_return[used]
+    confidences = confidences[used]
     cut = no_return | (distance > sensor.max_range)
     points[cut] *= (sensor.max_range / distance[cut])[:, None]
-    class_ids[cut] = NO_CLASS
+    class_ids[cut | (confidences == 0)] = NO_CLASS
     rotation, origin = frame.T_team_sensor[:3, :3], frame.T_team_sensor[:3, 3]
-    return Measurements(origin.astype(np.float64), points @ rotation.T + origin, class_ids)
+    ends = points @ rotation.T + origin
+    is_own, is_others = (~cut & in_any_box(ends, [b for b in frame.boxes if b.is_own == own]) for own in (True, False))
+    class_ids[is_others] = NO_CLASS
+    kept = ~is_own
+    return Measurements(origin.astype(np.float64), ends[kept], class_ids[kept], confidences[kept])
 
 
-def _depth_points(frame: DepthFrame, sensor: SensorConfig) -> tuple[Float64Array, Int64Array, BoolArray]:
-    """Points (P, 3) in the sensor's frame, classes and the 'no return' mask of a depth image's usable pixels.
+def in_any_box(points: Float64Array, boxes: Iterable[BodyBox]) -> BoolArray:
+    """Which of the points (P, 3), in the team's frame, lie in a box, its faces included."""
+    within = np.zeros(len(points), dtype=bool)
+    for box in boxes:
+        places = points @ box.T_box_team[:3, :3].T + box.T_box_team[:3, 3]
+        within |= ((box.low <= places) & (places <= box.high)).all(axis=1)
+    return within
 
-    A pixel without return stands for the point of its ray at depth 1 m; only its direction is used.
+
+def _depth_points(frame: DepthFrame, sensor: SensorConfig) -> tuple[Float64Array, Int64Array, Int64Array, BoolArray]:
+    """Points (P, 3) in the sensor's frame, classes, confidences and the 'no return' mask of a depth image's usable
+    pixels.
+
+    A pixel without return stands for the point of its ray at depth 1 m; only its direction is used. One whose ray is
+    not known is not usable.
     """
     image, camera = frame.depth_image, frame.camera
+    across, down = np.meshgrid(
+        (np.arange(image.shape[1]) - camera.cx) / camera.fx, (np.arange(image.shape[0]) - camera.cy) / camera.fy
+    )
+    if camera.slopes is not None:
+        across, down = camera.slopes.astype(np.float64)
     no_return = _equals_any(image, sensor.no_return_depth)
     measured = ~no_return & ~_without_information(image, sensor.invalid_depth)
     depth = image.astype(np.float64) * frame.depth_unit
     depth[no_return] = 1.0
-    v, u = np.nonzero(measured | no_return)
+    v, u = np.nonzero((measured | no_return) & np.isfinite(across) & np.isfinite(down))
     z = depth[v, u]
-    points = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
+    points = np.stack([across[v, u] * z, down[v, u] * z, z], axis=1)
     classes = np.ones(image.shape, dtype=np.int64) if frame.class_image is None else frame.class_image
-    return points, classes[v, u].astype(np.int64), no_return[v, u]
+    confidences = np.full(image.shape, 255) if frame.confidence_image is None else frame.confidence_image
+    return points, classes[v, u].astype(np.int64), confidences[v, u].astype(np.int64), no_return[v, u]
 
 
 def _without_information(image: npt.NDArray[Any], invalid_depth: tuple[float, ...]) -> BoolArray:
@@ -145,12 +194,13 @@ def _equals_any(image: npt.NDArray[Any], values: tuple[float, ...]) -> BoolArray
     return found
 
 
-def _cloud_points(frame: CloudFrame) -> tuple[Float64Array, Int64Array, BoolArray]:
-    """The finite points of a cloud, their classes, and a 'no return' mask that is False."""
+def _cloud_points(frame: CloudFrame) -> tuple[Float64Array, Int64Array, Int64Array, BoolArray]:
+    """The finite points of a cloud, their classes and confidences, and a 'no return' mask that is False."""
     finite = np.isfinite(frame.points).all(axis=1)
     points = frame.points[finite].astype(np.float64)
     if frame.class_ids is None:
         class_ids = np.ones(len(points), dtype=np.int64)
     else:
         class_ids = frame.class_ids[finite].astype(np.int64)
-    return points, class_ids, np.zeros(len(points), dtype=bool)
+    confidences = np.full(len(finite), 255) if frame.confidences is None else frame.confidences
+    return points, class_ids, confidences[finite].astype(np.int64), np.zeros(len(points), dtype=bool)

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.records import BodyBox
 from reference.hand_made import cloud, depth_frame, ray
 from reference.sensor import measurements, scan_update
 
@@ -137,6 +140,64 @@ def test_bounds_keep_the_cells_whose_centre_is_inside():
     assert _touched(ray("a", 0.0, 1), region=region) == ({(1, 0, 0)}, {})
     band = MapConfig(resolution=1.0, bounds=(0.6, 9.0))
     assert _touched(ray("a", 0.0, 1), region=band) == (set(), {})
+
+
+def _weighted(points, class_ids, confidences, **options):
+    """(class, strength) of each hit cell of a cloud."""
+    frame = dataclasses.replace(cloud(points, class_ids), confidences=np.array(confidences, np.uint8), **options)
+    update = scan_update(frame, SensorConfig(), ONE_METRE)
+    return list(zip(update.hit_classes.tolist(), update.hit_strengths.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("class_ids", "confidences", "winner"),
+    [([2, 2, 1], [100, 100, 201], (1, 201)), ([2, 2, 1], [100, 101, 200], (2, 101)),
+     ([2, 2, 1], [100, 101, 201], (1, 201)), ([3, 3, 3], [1, 1, 2], (3, 1)), ([3, 3, 3], [1, 2, 2], (3, 2)),
+     ([3, 3, 1], [255, 0, 100], (3, 255)), ([0, 2, 2], [255, 1, 0], (2, 1))],
+)  # fmt: skip
+def test_the_class_with_most_confidence_wins_with_its_mean(class_ids, confidences, winner):
+    points = [[2.0, 0.1 * i, 0] for i in range(len(class_ids))]
+    assert _weighted(points, class_ids, confidences) == [winner]
+
+
+def test_hits_without_confidences_are_sure():
+    assert scan_update(ray("a", 0.0, 2), SensorConfig(), ONE_METRE).hit_strengths.tolist() == [255]
+
+
+def test_no_confidence_is_no_label():
+    assert _weighted([[2.0, 0, 0]], [1], [0]) == []
+    frame = dataclasses.replace(ray("a", 0.0, 2), confidence_image=np.zeros((1, 1), np.uint8))
+    assert _touched(frame) == ({(0, 0, 0), (1, 0, 0)}, {})
+
+
+def _box(low, high, is_own):
+    return BodyBox(np.array(low, float), np.array(high, float), np.eye(4), is_own)
+
+
+def test_points_on_an_own_body_say_nothing_and_on_anothers_free_their_ray():
+    free = {(0, 0, 0), (1, 0, 0)}
+    # The point is at (2.5, 0.5, 0.5), in the corner of both boxes.
+    own, other = _box([2.5, 0.5, 0.5], [3, 1, 1], is_own=True), _box([2, 0, 0], [2.5, 0.5, 0.5], is_own=False)
+    for boxes, expected in (((own,), (set(), {})), ((other,), (free, {})), ((other, own), (set(), {}))):
+        assert _touched(dataclasses.replace(ray("a", 0.0, 1), boxes=boxes)) == expected
+    beside = _box([2.6, 0, 0], [3, 1, 1], is_own=True)
+    assert _touched(dataclasses.replace(ray("a", 0.0, 1), boxes=(beside,))) == (free, {(2, 0, 0): 1})
+
+
+def test_cut_ends_are_in_no_box():
+    boxes = (_box([-9, -9, -9], [9, 9, 9], is_own=True),)
+    frame = dataclasses.replace(ray("a", 0.0, 1, distance=7.0), boxes=boxes)
+    assert _touched(frame, SensorConfig(max_range=2.2)) == ({(0, 0, 0), (1, 0, 0)}, {})
+
+
+def test_slopes_stand_for_the_pinhole():
+    frame = ray("a", 0.0, 1)
+    camera = dataclasses.replace(frame.camera, slopes=np.array([[[0.5]], [[-1.0]]], np.float32))
+    # Depth 2: 1 m to the right, 2 m up.
+    assert measurements(dataclasses.replace(frame, camera=camera), SensorConfig()).ends.tolist() == [[2.5, -0.5, 2.5]]
+    camera.slopes[0] = np.nan
+    for sensor in (SensorConfig(), SensorConfig(no_return_depth=(2.0,))):
+        assert _touched(dataclasses.replace(frame, camera=camera), sensor) == (set(), {})
 
 
 def test_float32_clouds_are_used_in_float64():

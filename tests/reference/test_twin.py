@@ -63,6 +63,14 @@ def test_hit_other_applies_to_the_other_classes_of_a_hit_cell():
     assert _at(ticks[-1], 0, key=(1, 0, 0)) == [-0.2, -0.2]
 
 
+def test_a_hit_counts_as_much_as_its_class_is_sure():
+    sure = np.array([[51]], np.uint8)
+    frames = [dataclasses.replace(ray("a", 0.0, 2), confidence_image=sure), ray("a", 0.1, 2)]
+    ticks, twin = _run(frames, "a", rule="local", settle=0, hit=1.5, hit_other=-0.7)
+    np.testing.assert_allclose(_at(ticks[-1], 0), [-1.4, 1.5 + 0.3])
+    assert twin.sums[0].num_touching_scans.tolist() == [2, 2, 2]
+
+
 def test_average_readings_by_hand():
     # Three scans: two hit cell 2 as class 1, the third reaches cell 1 only.
     frames = [ray("a", 0.0, 1), ray("a", 0.1, 1), ray("a", 0.2, 2, distance=1.0)]

@@ -95,6 +95,7 @@ def record(config: RunConfig, frames: Sequence[Frame]) -> Recording:
             freed=np.searchsorted(codes, _codes(update.freed)),
             hit=np.searchsorted(codes, _codes(update.hit)),
             hit_classes=update.hit_classes,
+            hit_strengths=update.hit_strengths,
         )
         for frame, update in zip(ordered, updates, strict=True)
     )

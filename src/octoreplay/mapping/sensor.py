@@ -15,6 +15,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CloudFrame,
     DepthFrame,
+    Float32Array,
     Float64Array,
     Frame,
     Int32Array,
@@ -28,13 +29,17 @@ MAX_GRID_CELLS = 1 << 32
 
 @dataclass(frozen=True)
 class Increments:
-    """What one scan adds to an octree's cells: log-odds for a hit, a pass and the classes not hit, and the limits."""
+    """What one scan adds to an octree's cells: log-odds for a hit, a pass and the classes not hit, and the limits.
+
+    ``is_count`` says that a hit counts in full however sure its label is.
+    """
 
     hit: float
     miss: float
     hit_other: float
     least: float
     most: float
+    is_count: bool = False
 
 
 def clamped_increments(sensor: SensorConfig) -> Increments:
@@ -49,7 +54,7 @@ def unclamped_increments(sensor: SensorConfig) -> Increments:
     return Increments(sensor.hit, sensor.miss, hit_other, -np.inf, np.inf)
 
 
-COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf)
+COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf, is_count=True)
 """Increments that count the scans which touched a cell, in an octree with one class."""
 
 
@@ -57,13 +62,24 @@ COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf)
 class TouchedCells:
     """The cells that one scan touches: brick codes (n,), and the marks (64 each, Morton order) of those bricks.
 
-    A mark is 0 untouched, 1 passed, 1 + class_id hit. The marks are the caster's scratch memory, and are valid until it
-    casts again.
+    A mark is 0 untouched, 1 passed, 1 + class_id hit. ``strengths``, parallel to the marks, are how sure the class of
+    each hit is, in 255ths; empty where all are sure. Both are the caster's scratch memory, and are valid until it casts
+    again.
     """
 
     codes: Int64Array
     marks: UInt8Array
     touched: Int64Array
+    strengths: UInt8Array
+
+
+def sensor_reach(sensor: SensorConfig, map_config: MapConfig) -> float:
+    """How far from the map's origin along an axis a sensor may be, so that all its rays stay in the key space [m].
+
+    Half of the key space at least, where rays are as long as that.
+    """
+    reach = storage.KEY_OFFSET * map_config.resolution
+    return reach - min(sensor.max_range + 2 * map_config.resolution, reach / 2)
 
 
 class ScanCaster:
@@ -78,32 +94,38 @@ class ScanCaster:
         self._special = np.array(sensor.invalid_depth + sensor.no_return_depth, np.float64)
         self._meanings = np.repeat([0.0, np.inf], [len(sensor.invalid_depth), len(sensor.no_return_depth)])
         self._marks = np.zeros(0, np.uint8)
+        self._strengths = np.zeros(0, np.uint8)
         self._flags = np.zeros(0, np.uint8)
         self._runs = _Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
         """The cells that a scan touches: each once, hit before passed.
 
-        Rays follow ``sensor.rays``: one per distinct end cell to its centre, or one per point. Raises InputError where
-        the scan leaves the key space, and ConfigError where max_range is too long for the resolution.
+        Rays follow ``sensor.rays``: one per distinct end cell to its centre, or one per point. Labels vote with their
+        confidences, and points in robots' bodies hit nothing. Raises InputError where the scan leaves the key space,
+        and ConfigError where max_range is too long for the resolution.
         """
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
         self._find_runs(frame)
         runs = self._runs
         low, high = self._box(frame, origin)
-        num_ends = runs.reduce(low, high, self._num_classes)
-        end_keys = runs.end_keys[:num_ends]
+        is_sure = _confidences(frame).size == 0
+        num_ends = runs.reduce(low, high, self._num_classes, is_sure=is_sure)
+        end_keys, end_marks = runs.end_keys[:num_ends], runs.end_marks[:num_ends]
         corner, num_blocks, marks, flags = self._grid(low, high)
+        strengths = self._strength_plane(0 if is_sure else marks.size)
         start = self._start(origin, corner)
         tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
         casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
-        casting.mark_hits(end_keys, runs.end_marks[:num_ends], corner, tables, marks, flags)
+        casting.mark_hits(end_keys, end_marks, corner, tables, marks, flags)
+        if not is_sure:
+            casting.mark_strengths(end_keys, end_marks, runs.end_strengths, corner, tables, strengths)
         if self._is_bounded:
             casting.clear_outside(*self._mapped(corner, num_blocks), num_blocks, marks, flags)
         most = np.count_nonzero(flags) * casting.BRICKS_PER_BLOCK
         touched, codes = np.empty(most, np.int64), np.empty(most, np.int64)
         count = casting.touched_bricks(marks.view(np.uint64), flags, corner, num_blocks, touched, codes)
-        return TouchedCells(codes[:count], marks, touched[:count])
+        return TouchedCells(codes[:count], marks, touched[:count], strengths)
 
     def _find_runs(self, frame: Frame) -> None:
         """Put the ends of the scan's rays into the runs."""
@@ -114,34 +136,52 @@ class ScanCaster:
         pose = np.ascontiguousarray(frame.T_team_sensor, np.float64)
         if not np.isfinite(pose).all():
             raise self._outside(frame)
-        if isinstance(frame, DepthFrame):
+        if isinstance(frame, CloudFrame):
+            self._find_cloud_runs(frame, frame.points, frame.class_ids, pose)
+        elif frame.camera.slopes is None:
             self._find_depth_runs(frame, pose)
         else:
-            self._find_cloud_runs(frame, pose)
+            classes = None if frame.class_image is None else frame.class_image.ravel()
+            self._find_cloud_runs(frame, self._lens_points(frame, frame.camera.slopes), classes, pose)
 
     def _find_depth_runs(self, frame: DepthFrame, pose: Float64Array) -> None:
         """Runs of a depth image's rays."""
+        camera = frame.camera
+        depth, *values = self._depths(frame)
+        classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
+        ends.depth_to_runs(
+            depth, frame.depth_unit, np.ascontiguousarray(classes),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
+            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._runs.outputs,
+        )  # fmt: skip
+
+    def _lens_points(self, frame: DepthFrame, slopes: Float32Array) -> Float64Array:
+        """The points (P, 3) of a depth image in the sensor's frame; those beyond max_range have their direction."""
+        depth, *values = self._depths(frame)
+        points = np.empty((depth.size, 3))
+        farthest = 2.0 * self._sensor.max_range
+        ends.depth_to_points(depth, frame.depth_unit, _read_only(slopes), farthest, *values, points)
+        return points
+
+    def _depths(self, frame: DepthFrame) -> tuple[npt.NDArray[Any], float, Float64Array, Float64Array]:
+        """A depth image as kernels take it, the largest value of its type, and special values with their meanings."""
         depth = frame.depth_image
         kind = np.uint16 if depth.dtype.kind in "ui" and depth.dtype.itemsize <= 2 else np.float32
         largest = float(np.iinfo(depth.dtype).max) if depth.dtype.kind in "ui" else np.inf
-        camera = frame.camera
-        classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
         # A float image stores a value such as 2.1 as its nearest float32, and that is what it is to be compared with.
         stored = np.float32 if kind is np.float32 else np.float64
         special = self._special.astype(stored).astype(np.float64)
-        ends.depth_to_runs(
-            np.ascontiguousarray(depth, kind), frame.depth_unit, np.ascontiguousarray(classes),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-            self._sensor.max_range, largest, special, self._meanings, *self._runs.outputs,
-        )  # fmt: skip
+        return np.ascontiguousarray(depth, kind), largest, special, self._meanings
 
-    def _find_cloud_runs(self, frame: CloudFrame, pose: Float64Array) -> None:
-        """Runs of a point cloud's rays."""
-        kind = np.float32 if frame.points.dtype == np.float32 else np.float64
-        classes = np.empty(0, np.uint8) if frame.class_ids is None else frame.class_ids
+    def _find_cloud_runs(
+        self, frame: Frame, points: npt.NDArray[Any], class_ids: UInt8Array | None, pose: Float64Array
+    ) -> None:
+        """Runs of the rays to a frame's points (P, 3), which have the classes (P,)."""
+        kind = np.float32 if points.dtype == np.float32 else np.float64
+        classes = np.empty(0, np.uint8) if class_ids is None else class_ids
         ends.points_to_runs(
-            np.ascontiguousarray(frame.points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-            self._sensor.min_range, self._sensor.max_range, *self._runs.outputs,
+            np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
+            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame), *self._runs.outputs,
         )  # fmt: skip
 
     def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
@@ -182,6 +222,12 @@ class ScanCaster:
         marks = self._marks[: size * casting.BLOCK_CELLS]
         return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
 
+    def _strength_plane(self, size: int) -> UInt8Array:
+        """Memory for the strengths of the hits in a scratch grid of ``size`` cells; what is not hit is not read."""
+        if size > self._strengths.size:
+            self._strengths = np.zeros(size, np.uint8)
+        return self._strengths[:size]
+
     def _start(self, origin: Float64Array, corner: Int64Array) -> Float64Array:
         """Where rays begin, in cells of a scratch grid and without what is finer than casting.FRACTION."""
         coords = origin / self._resolution
@@ -213,8 +259,10 @@ class _Runs:
         self.lengths = np.empty(places, np.int32)
         self.end_keys = np.empty((capacity, 3), np.int32)
         self.end_marks = np.empty(capacity, np.uint8)
+        self.end_strengths = np.empty(0, np.uint8)
         self._end_cells = np.empty(capacity, np.int64)
         self._votes = np.empty((capacity, num_classes), np.int32)
+        self._sums = np.empty(places, np.int32)
         self._every = rays == "all"
         self._points = np.empty((places if self._every else 0, 3))
         self._point_keys = np.empty((places if self._every else 0, 3), np.int32)
@@ -227,18 +275,28 @@ class _Runs:
     @property
     def outputs(self) -> tuple[npt.NDArray[Any], ...]:
         """What the kernels that find runs write to."""
-        return self.keys, self.kinds, self.lengths, self._points, self._point_keys, self.counters
+        return self.keys, self.kinds, self.lengths, self._sums, self._points, self._point_keys, self.counters
 
-    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int) -> int:
-        """Reduce the runs, all within low..high, to distinct end cells; returns their number."""
+    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int, *, is_sure: bool) -> int:
+        """Reduce the runs, all within low..high, to distinct end cells; returns their number.
+
+        Cells get strengths unless ``is_sure`` says that the points have no confidences.
+        """
         num_runs = self.num_runs
+        keys, edges = self.keys[:num_runs], high - low + 1
         table = np.full(1 << max(2 * num_runs, 2).bit_length(), -1, np.int32)
-        return int(
-            ends.distinct_ends(
-                self.keys[:num_runs], self.kinds, self.lengths, low, high - low + 1, num_classes, table, self._votes,
-                self._end_cells, self.end_keys, self.end_marks,
-            )
+        num_ends = ends.distinct_ends(
+            keys, self.kinds, self.lengths, low, edges, num_classes, table, self._votes, self._end_cells, self.end_keys,
+            self.end_marks,
         )  # fmt: skip
+        if not is_sure:
+            self.end_strengths = np.empty(num_ends, np.uint8)
+            ends.weigh_ends(
+                keys, self.kinds, self._sums, low, edges, num_classes, table, self._votes,
+                np.zeros((num_ends, num_classes), np.int64), self._end_cells, self.end_marks[:num_ends],
+                self.end_strengths,
+            )  # fmt: skip
+        return int(num_ends)
 
     def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
         """End points [m] (n, 3) and end cells (n, 3) of the rays; no end points where rays go to cells' centres."""
@@ -246,6 +304,28 @@ class _Runs:
             return self._points, self.end_keys[:num_ends]
         num_points = int(self.counters[ends.NUM_POINTS])
         return self._points[:num_points], self._point_keys[:num_points]
+
+
+def _confidences(frame: Frame) -> UInt8Array:
+    """How sure the label of each point is (P,), in 255ths; empty where all are sure."""
+    given = frame.confidence_image if isinstance(frame, DepthFrame) else frame.confidences
+    return _read_only(np.empty(0, np.uint8) if given is None else given.ravel())
+
+
+def _boxes(frame: Frame) -> Float64Array:
+    """The boxes (b, 4, 6) of robots' bodies as kernels take them."""
+    boxes = np.zeros((len(frame.boxes), 4, 6))
+    for rows, box in zip(boxes, frame.boxes, strict=True):
+        rows[:3, :4], rows[:3, 4], rows[:3, 5] = box.T_box_team[:3], box.low, box.high
+        rows[ends.IS_OWN, 0] = box.is_own
+    return boxes
+
+
+def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """An array in C order that cannot be written, whichever it is: kernels are compiled once."""
+    view = np.ascontiguousarray(array).view()
+    view.flags.writeable = False
+    return view
 
 
 def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
@@ -259,9 +339,12 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
         octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
     )
     octree.raise_bricks(indices, wanted, known, changes)
-    indices = indices[changes]
-    evidence.apply_marks(
-        octree.bricks, indices, cells.touched[changes], words, octree.num_classes, np.float32(increments.hit), miss,
-        np.float32(increments.hit_other), least, most, revision,
-        np.empty((2, storage.OCTETS * (octree.num_classes + 1) + 1), np.uint64),
-    )  # fmt: skip
+    brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
+    steps = np.float32(increments.hit), miss, np.float32(increments.hit_other), least, most
+    num_words = storage.OCTETS * (octree.num_classes + 1) + 1
+    if increments.is_count or cells.strengths.size == 0:
+        scratch = np.empty((2, num_words), np.uint64)
+        evidence.apply_marks(*brick_marks, octree.num_classes, *steps, revision, scratch)
+    else:
+        strengths, scratch = cells.strengths.view(np.uint64), np.empty((3, num_words), np.uint64)
+        evidence.apply_weighted_marks(*brick_marks, strengths, octree.num_classes, *steps, revision, scratch)

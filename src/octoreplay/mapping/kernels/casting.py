@@ -207,6 +207,15 @@ def mark_hits(end_keys, end_marks, corner, tables, marks, flags):
 
 
 @kernel
+def mark_strengths(end_keys, end_marks, end_strengths, corner, tables, strengths):
+    """Write the strengths (n,) of hit end cells (n, 3) where mark_hits writes their marks."""
+    for i in range(end_marks.size):
+        if end_marks[i] > 0:
+            x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
+            strengths[np.int64(tables[0, x] + tables[1, y] + tables[2, z])] = end_strengths[i]
+
+
+@kernel
 def clear_outside(low, high, num_blocks, marks, flags):
     """Take back the marks of cells outside [low, high) (3,), in cells of the scratch grid."""
     for block in range(flags.size):

@@ -13,10 +13,16 @@ from octoreplay.mapping.kernels.compiler import allocating_kernel, inline_kernel
 _CUT = np.int16(255)
 """Kind of a ray that was cut at max_range, above every class_id; other kinds are class ids, 0 for an ignored label."""
 
+_UNUSABLE = np.int16(0)
+"""Kind of a point that frees its ray and hits nothing."""
+
 _UNLABELLED = np.int16(1)
 """Kind of a point without a label."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
+
+IS_OWN = 3
+"""Row of a box that says whose body it is, after those of the axes."""
 
 _NONE = np.int16(-1)
 """Kind of a point that carries no information."""
@@ -33,7 +39,7 @@ _BLOCK = 1024
 @allocating_kernel
 def depth_to_runs(
     depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, special, meanings,
-    keys, kinds, lengths, ends, end_keys, counters,
+    confidences, boxes, keys, kinds, lengths, sums, ends, end_keys, counters,
 ):  # fmt: skip
     """Runs of a depth image's end cells: ``keys`` (m, 3), ``kinds`` (m,) and ``lengths`` (m,), m = counters[NUM_RUNS].
 
@@ -41,6 +47,10 @@ def depth_to_runs(
     Depths that equal one of ``special`` (s,), NaN included, become ``meanings`` (s,) [m], the last that applies.
     ``ends`` (n, 3), where it is not empty, gets the end point [m] of every ray and ``end_keys`` (n, 3) its key,
     n = counters[NUM_POINTS].
+
+    ``confidences`` (H W,), where they are not empty, are the points', in 255ths, and ``sums`` (m,) gets their sum over
+    each run. ``boxes`` (b, 4, 6) have a row (r_x, r_y, r_z, t, low, high) for each axis, and hold the points p with
+    low <= r p + t <= high: these carry no information where the number at (IS_OWN, 0) is not 0, else they hit nothing.
     """
     height, width = depth_image.shape
     labelled = class_image.size > 0
@@ -55,15 +65,7 @@ def depth_to_runs(
     starts = np.empty(width + 1, np.int32)
     for v in range(height):
         ratio = (v - camera[3]) / camera[1]
-        for u in range(width):
-            raw = depth_image[v, u]
-            value = raw * depth_unit
-            z[u] = value if (value > 0.0) & (value < np.inf) & (raw != largest) else 0.0
-        for k in range(special.size):
-            for u in range(width):
-                raw = depth_image[v, u]
-                is_special = (raw == special[k]) | ((raw != raw) & (special[k] != special[k]))
-                z[u] = meanings[k] if is_special else z[u]
+        _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z)
         num_cut = 0
         plus = ratio * ratio + 1.0
         for u in range(width):
@@ -84,14 +86,55 @@ def depth_to_runs(
             ahead, shift = pose[axis, 2], pose[axis, 3]
             for u in range(width):
                 world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
+        if boxes.size + confidences.size > 0:
+            _leave_out(world, width, v * width, confidences, boxes, row_kinds)
+        num_runs = counters[NUM_RUNS]
         _add_runs(world, row_kinds, width, resolution, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
+        if confidences.size > 0:
+            _sum_over_runs(confidences, v * width, starts, width, row_kinds, sums, num_runs)
+
+
+@inline_kernel
+def _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z):
+    """Depths z (W,) [m] of the pixels in row v, 0 for those without information."""
+    for u in range(z.size):
+        raw = depth_image[v, u]
+        value = raw * depth_unit
+        z[u] = value if (value > 0.0) & (value < np.inf) & (raw != largest) else 0.0
+    for k in range(special.size):
+        for u in range(z.size):
+            raw = depth_image[v, u]
+            is_special = (raw == special[k]) | ((raw != raw) & (special[k] != special[k]))
+            z[u] = meanings[k] if is_special else z[u]
+
+
+@allocating_kernel
+def depth_to_points(depth_image, depth_unit, slopes, farthest, largest, special, meanings, points):
+    """The points (H W, 3) of a depth image, in the sensor's frame, where a lens distorts: 0 without information.
+
+    ``slopes`` (2, H, W) are x / z and y / z of each pixel; depths are limited to ``farthest`` [m], the rest is as for
+    depth_to_runs. There the pinhole has a way of its own, which would take a tenth longer if it had to read slopes.
+    """
+    height, width = depth_image.shape
+    z = np.empty(width)
+    for v in range(height):
+        _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z)
+        for u in range(width):
+            depth, place = min(z[u], farthest), v * width + u
+            points[place, 0] = depth * slopes[0, v, u]
+            points[place, 1] = depth * slopes[1, v, u]
+            points[place, 2] = depth
 
 
 @allocating_kernel
 def points_to_runs(
-    points, class_ids, pose, resolution, min_range, max_range, keys, kinds, lengths, ends, end_keys, counters
-):
-    """Runs of a point cloud's end cells; as depth_to_runs, for points (p, 3) in the sensor's frame."""
+    points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, keys, kinds, lengths, sums, ends,
+    end_keys, counters,
+):  # fmt: skip
+    """Runs of a point cloud's end cells; as depth_to_runs, for points (p, 3) in the sensor's frame.
+
+    Points that are not finite, or in the sensor itself, carry no information.
+    """
     labelled = class_ids.size > 0
     least, most = min_range * min_range, max_range * max_range
     sensor = np.empty((3, _BLOCK))
@@ -129,9 +172,14 @@ def points_to_runs(
             along_x, along_y, along_z, shift = pose[axis, 0], pose[axis, 1], pose[axis, 2], pose[axis, 3]
             for i in range(size):
                 world[axis, i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
+        if boxes.size + confidences.size > 0:
+            _leave_out(world, size, first, confidences, boxes, block_kinds)
+        num_runs = counters[NUM_RUNS]
         _add_runs(
             world, block_kinds, size, resolution, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters
         )
+        if confidences.size > 0:
+            _sum_over_runs(confidences, first, starts, size, block_kinds, sums, num_runs)
 
 
 @allocating_kernel
@@ -171,6 +219,38 @@ def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, ki
         counters[NUM_POINTS] = place
 
 
+@kernel
+def _leave_out(world, size, first, confidences, boxes, point_kinds):
+    """The kinds of points without confidence or within boxes; the ``size`` points begin at ``first`` in the scan."""
+    for i in range(size if confidences.size > 0 else 0):
+        is_vain = (confidences[first + i] == 0) & (point_kinds[i] != _NONE) & (point_kinds[i] != _CUT)
+        point_kinds[i] = _UNUSABLE if is_vain else point_kinds[i]
+    for box in range(boxes.shape[0]):
+        kind = _NONE if boxes[box, IS_OWN, 0] != 0.0 else _UNUSABLE
+        for i in range(size):
+            is_within = (point_kinds[i] != _NONE) & (point_kinds[i] != _CUT)
+            for axis in range(IS_OWN):
+                place = (
+                    boxes[box, axis, 0] * world[0, i] + boxes[box, axis, 1] * world[1, i]
+                    + boxes[box, axis, 2] * world[2, i] + boxes[box, axis, 3]
+                )  # fmt: skip
+                is_within &= (boxes[box, axis, 4] <= place) & (place <= boxes[box, axis, 5])
+            point_kinds[i] = kind if is_within else point_kinds[i]
+
+
+@kernel
+def _sum_over_runs(confidences, first, starts, size, point_kinds, sums, place):
+    """Write the sums of the points' confidences over each of their runs, which begin at ``place``."""
+    run = 0
+    while starts[run] < size:
+        total = 0
+        for i in range(starts[run], starts[run + 1]):
+            total += confidences[first + i]
+        sums[place] = total
+        place += point_kinds[starts[run]] != _NONE
+        run += 1
+
+
 @inline_kernel
 def _coords_to_keys(coords, size, resolution, keys):
     """Keys = floor(coords / resolution) (3, size), by multiplication where that cannot make a difference."""
@@ -198,6 +278,16 @@ def widen_to_keys(keys, low, high):
         low[axis], high[axis] = least, most
 
 
+@inline_kernel
+def _place_of(cell, table, end_cells):
+    """Where in the hash table a cell's number is, or belongs."""
+    mask = table.size - 1
+    place = np.int64((np.uint64(cell) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)) & mask
+    while table[place] >= 0 and end_cells[table[place]] != cell:
+        place = (place + 1) & mask
+    return place
+
+
 @kernel
 def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, end_cells, end_keys, end_marks):
     """The distinct cells of runs (m,), with 1 + the class that most points in each have, 0 where none has a class.
@@ -207,15 +297,12 @@ def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, e
     """
     num_ends = 0
     last_cell, slot = np.int64(-1), np.int64(0)
-    mask = table.size - 1
     for run in range(keys.shape[0]):
         x, y, z = keys[run, 0] - low[0], keys[run, 1] - low[1], keys[run, 2] - low[2]
         cell = (z * edges[1] + y) * edges[0] + x
         if cell != last_cell:
             last_cell = cell
-            place = np.int64((np.uint64(cell) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)) & mask
-            while table[place] >= 0 and end_cells[table[place]] != cell:
-                place = (place + 1) & mask
+            place = _place_of(cell, table, end_cells)
             slot = np.int64(table[place])
             if slot < 0:
                 slot = num_ends
@@ -235,3 +322,33 @@ def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, e
                 best, most = c + 2, votes[slot, c]
         end_marks[slot] = np.uint8(best)
     return num_ends
+
+
+@kernel
+def weigh_ends(
+    keys, kinds, sums, low, edges, num_classes, table, votes, vote_sums, end_cells, end_marks, end_strengths
+):
+    """Let the class with the largest sum of confidences win each cell, and give the mean of its points as strength.
+
+    ``sums`` (m,) are those of the points in each run; the rest is as distinct_ends has left it. ``vote_sums`` (n, C) is
+    0 and gets the sums by cell, ``end_marks`` (n,) 1 + the classes, and ``end_strengths`` (n,) the means, rounded half
+    up; both stay as they are where no point has a class.
+    """
+    last_cell, slot = np.int64(-1), np.int64(0)
+    for run in range(keys.shape[0]):
+        x, y, z = keys[run, 0] - low[0], keys[run, 1] - low[1], keys[run, 2] - low[2]
+        cell = (z * edges[1] + y) * edges[0] + x
+        if cell != last_cell:
+            last_cell = cell
+            slot = np.int64(table[_place_of(cell, table, end_cells)])
+        if 0 < kinds[run] <= num_classes:
+            vote_sums[slot, kinds[run] - 1] += sums[run]
+    for slot in range(end_marks.size):
+        best, most = -1, 0
+        for c in range(num_classes):
+            if vote_sums[slot, c] > most:
+                best, most = c, vote_sums[slot, c]
+        if best >= 0:
+            num_points = np.int64(votes[slot, best])
+            end_marks[slot] = np.uint8(best + 2)
+            end_strengths[slot] = np.uint8((2 * most + num_points) // (2 * num_points))

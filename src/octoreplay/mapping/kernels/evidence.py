@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoreplay.mapping.kernels.compiler import kernel
+from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
 from octoreplay.mapping.kernels.intrinsics import lowest_one, prefetch_line
 from octoreplay.mapping.kernels.storage import (
     ALL_CELLS,
@@ -62,6 +62,48 @@ def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, c
             changes[t] = min(max(value + miss, clamp_min), clamp_max) != value
 
 
+@inline_kernel
+def _prefetch_block(bricks, rows_at, index):
+    """Ask for the block of a brick that comes soon, ahead of its use: bricks lie anywhere."""
+    ahead = np.int64(bricks.blocks[index])
+    for offset in range(0, BRICK_CELLS * 4, 64):
+        prefetch_line(rows_at + ahead * ROW_BYTES + offset)
+
+
+@inline_kernel
+def _gather_rows(words, touched, bricks, index, row_words, row_hits):
+    """The words of a scratch brick in the order of the rows of a block, and the mark of each row's own class.
+
+    Returns the number of rows that classes share, which come first, and of all.
+    """
+    octets = octets_of(bricks.known[index])
+    rows = 0
+    for e in range(OCTETS):
+        row_words[rows] = words[touched * OCTETS + e]
+        row_hits[rows] = 0
+        rows += np.int64(octets >> np.uint64(8 * e) & np.uint64(1))
+    num_shared = rows
+    for w in range(bricks.masks.shape[1]):
+        bits = bricks.masks[index, w]
+        while bits:
+            bit = lowest_one(bits)
+            row_words[rows] = words[touched * OCTETS + (bit >> 3)]
+            row_hits[rows] = np.uint64(8 * w + (bit & 7) + 2) * EVERY_BYTE
+            rows += 1
+            bits &= bits - np.uint64(1)
+    return num_shared, rows
+
+
+@inline_kernel
+def _finish_brick(bricks, index, block, has_own_rows, revision, num_classes):
+    """Store what a changed brick's values allow: classes that share the first one's, or one value for all."""
+    bricks.revisions[index] = revision
+    if has_own_rows:
+        share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
+    elif bricks.known[index] == ALL_CELLS:
+        collapse(bricks, index)
+
+
 @kernel
 def apply_marks(
     bricks, indices, touched, words, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision, scratch
@@ -80,26 +122,8 @@ def apply_marks(
     rows_at = np.int64(bricks.rows.ctypes.data)
     for t in range(indices.size):
         index = indices[t]
-        # Bricks lie anywhere: the block of one that comes soon is asked for ahead of its use.
-        ahead = np.int64(bricks.blocks[indices[min(t + PREFETCH_AHEAD, indices.size - 1)]])
-        for offset in range(0, BRICK_CELLS * 4, 64):
-            prefetch_line(rows_at + ahead * ROW_BYTES + offset)
-        octets = octets_of(bricks.known[index])
-        rows = 0
-        for e in range(OCTETS):
-            row_marks[rows] = words[touched[t] * OCTETS + e]
-            row_hits[rows] = 0
-            rows += np.int64(octets >> np.uint64(8 * e) & np.uint64(1))
-        num_shared = rows
-        for w in range(bricks.masks.shape[1]):
-            bits = bricks.masks[index, w]
-            while bits:
-                bit = lowest_one(bits)
-                row_marks[rows] = words[touched[t] * OCTETS + (bit >> 3)]
-                row_hits[rows] = np.uint64(8 * w + (bit & 7) + 2) * EVERY_BYTE
-                rows += 1
-                bits &= bits - np.uint64(1)
-        bricks.revisions[index] = revision
+        _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
+        num_shared, rows = _gather_rows(words, touched[t], bricks, index, row_marks, row_hits)
         block = np.int64(bricks.blocks[index])
         first = block * OCTETS
         for i in range(rows * OCTETS):
@@ -107,7 +131,35 @@ def apply_marks(
             step = miss if mark == 1 else (hit if mark == all_hits[i] else hit_other)
             changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
             flat[first + i] = changed if mark > 0 else flat[first + i]
-        if rows > num_shared:
-            share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
-        elif bricks.known[index] == ALL_CELLS:
-            collapse(bricks, index)
+        _finish_brick(bricks, index, block, rows > num_shared, revision, num_classes)
+
+
+@kernel
+def apply_weighted_marks(
+    bricks, indices, touched, words, strengths, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision,
+    scratch,
+):  # fmt: skip
+    """As apply_marks, where each cell's ``hit`` has a factor: its strength in 255ths.
+
+    ``strengths`` are parallel to the marks and eight to a word, and ``scratch`` is (3, 9 + 8 C).
+    """
+    row_marks, row_hits, row_strengths = scratch[0], scratch[1], scratch[2]
+    all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)
+    all_strengths = row_strengths.view(np.uint8)
+    flat = bricks.rows.reshape(bricks.rows.size)
+    rows_at = np.int64(bricks.rows.ctypes.data)
+    for t in range(indices.size):
+        index = indices[t]
+        _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
+        _gather_rows(strengths, touched[t], bricks, index, row_strengths, row_hits)
+        num_shared, rows = _gather_rows(words, touched[t], bricks, index, row_marks, row_hits)
+        block = np.int64(bricks.blocks[index])
+        first = block * OCTETS
+        for i in range(rows * OCTETS):
+            mark = all_marks[i]
+            is_own = (mark == all_hits[i]) | (num_classes == 1)
+            weighted = hit * (np.float32(all_strengths[i]) / np.float32(255))
+            step = miss if mark == 1 else (weighted if is_own else hit_other)
+            changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
+            flat[first + i] = changed if mark > 0 else flat[first + i]
+        _finish_brick(bricks, index, block, rows > num_shared, revision, num_classes)
