@@ -1,0 +1,193 @@
+"""Class tables as team files and files of classes hold them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from octoreplay.class_tables.edits import Merges, edited
+from octoreplay.class_tables.label_rows import BUILT_IN, built_in_rows, hydra_rows, kimera_rows, table_of_rows
+from octoreplay.config import PALETTE, RunConfig, is_number
+from octoreplay.errors import ConfigError, suggestion
+from octoreplay.records import ClassTable, Color, SemanticClass
+from octoreplay.yaml_file import load_yaml, read_text
+
+CLASSES_KEYS = ("classes", "ignored_raw_labels", "ignored_raw_colors", "merge_classes", "ignore_hits")
+_CLASS_KEYS = ("name", "color", "raw_labels", "raw_colors")
+
+
+def with_classes(config: RunConfig, name: str) -> RunConfig:
+    """A configuration with the classes that a built-in table or a file gives, in place of its own.
+
+    A file without 'classes' says what to make of the configuration's own classes, or of those that the logs bring.
+    Raises ConfigError with the file for anything that is not understood.
+    """
+    settings = _named_classes(name, Path())
+    if "classes" not in settings and config.classes is not None:
+        settings = {"classes": edited(config.classes, settings["merge_classes"], settings["ignore_hits"])}
+    return dataclasses.replace(config, **{"merge_classes": (), "ignore_hits": (), **settings})
+
+
+def class_settings(content: Mapping[str, Any], folder: Path, files: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """What a mapping says about classes: RunConfig's ``classes``, or what to make of those that the logs bring."""
+    merge, ignore = _merges(content.get("merge_classes") or {}), _names("ignore_hits", content.get("ignore_hits") or ())
+    entries = content.get("classes")
+    if entries is None:
+        for key in ("ignored_raw_labels", "ignored_raw_colors"):
+            if content.get(key):
+                raise ConfigError(
+                    f"{key}: goes with 'classes'; of the logs' own classes, ignore_hits ignores some by name"
+                )
+        return {"merge_classes": merge, "ignore_hits": ignore}
+    if isinstance(entries, str):
+        table = _named_classes(entries, folder, files).get("classes")
+        if table is None:
+            raise ConfigError(f"classes: the file '{entries}' holds no classes")
+    else:
+        table = class_table(entries)
+    table = _ignoring(table, content.get("ignored_raw_labels") or (), content.get("ignored_raw_colors") or ())
+    return {"classes": edited(table, merge, ignore)}
+
+
+def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The settings that a built-in table or a file gives; ``files`` are those that led to it."""
+    if name in BUILT_IN:
+        return {"classes": table_of_rows(built_in_rows(name), PALETTE)}
+    path = folder / name
+    if not _is_file(path):
+        near = suggestion(name.lower(), BUILT_IN)
+        raise ConfigError(f"classes: '{name}' is no file and no built-in table ({', '.join(BUILT_IN)}){near}")
+    if path.resolve() in files:
+        raise ConfigError(f"classes: the file '{name}' takes its classes from itself")
+    text = read_text(path, "class")
+    content = None if path.suffix.lower() == ".csv" else load_yaml(text, str(path))
+    try:
+        if path.suffix.lower() == ".csv":
+            return {"classes": edited(table_of_rows(kimera_rows(text), PALETTE), (), ())}
+        if isinstance(content, Mapping) and "label_names" in content:
+            return {"classes": edited(table_of_rows(hydra_rows(content), PALETTE), (), ())}
+        content = {"classes": content} if isinstance(content, list) else content
+        if isinstance(content, Mapping) and "robots" in content:
+            # Of a team file its classes are meant.
+            content = {key: value for key, value in content.items() if key in CLASSES_KEYS}
+            if not content:
+                raise ConfigError("the team file holds no classes")
+        if not isinstance(content, Mapping):
+            raise ConfigError("a class file is a list of classes, or a mapping with 'classes'")
+        for key in content:
+            if key not in CLASSES_KEYS:
+                raise ConfigError(f"{key}: unknown key{suggestion(str(key), CLASSES_KEYS)}")
+        return class_settings(content, path.parent, (*files, path.resolve()))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _is_file(path: Path) -> bool:
+    """True for a file; False also for what cannot be the name of one."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def _merges(entries: Any) -> Merges:
+    """What 'merge_classes' holds: new names, each with the names of the classes that become it."""
+    if not isinstance(entries, Mapping):
+        raise ConfigError("merge_classes: expects new names, each with a list of classes, such as vehicle: [car, bus]")
+    merges = tuple((str(new), _names("merge_classes", names)) for new, names in entries.items())
+    for new, names in merges:
+        if not names:
+            raise ConfigError(f"merge_classes: '{new}' needs at least one class")
+    return merges
+
+
+def _names(key: str, value: Any) -> tuple[str, ...]:
+    """Names of classes from a list, or from one name."""
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str | int) for name in names):
+        raise ConfigError(f"{key}: expects a list of class names, got {value!r}")
+    return tuple(str(name) for name in names)
+
+
+def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
+    """A class table from the list that a team file holds: mappings with name, color [r, g, b], raw_labels, raw_colors.
+
+    Raises ConfigError for an unknown key, a wrong type, a name that occurs twice, or a raw label that has two meanings.
+    """
+    if not isinstance(entries, list | tuple) or not entries:
+        raise ConfigError(
+            f"classes: expects a list of classes, each with 'name' and 'raw_labels', or one of {', '.join(BUILT_IN)}"
+        )
+    classes: list[SemanticClass] = []
+    meaning: dict[int, str] = {}
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, Mapping) or "name" not in entry:
+            raise ConfigError("classes: every class is a mapping with 'name', 'color', 'raw_labels' and 'raw_colors'")
+        for key in entry:
+            if key not in _CLASS_KEYS:
+                raise ConfigError(f"classes: {key}: unknown key{suggestion(str(key), _CLASS_KEYS)}")
+        name = str(entry["name"])
+        if any(item.name == name for item in classes):
+            raise ConfigError(f"classes: '{name}' is listed twice; give one entry all its raw_labels")
+        if name == "free":
+            raise ConfigError(
+                "classes: 'free' is the name of free space, which is no class; give the class another one"
+            )
+        raw_labels = _raw_labels(entry.get("raw_labels", [index + 1]), name)
+        for raw in raw_labels:
+            if raw in meaning:
+                raise ConfigError(f"classes: raw label {raw} means both '{meaning[raw]}' and '{name}'")
+            meaning[raw] = name
+        given = entry.get("color")
+        color = _color(given or PALETTE[index % len(PALETTE)], f"the color of '{name}'")
+        # A colour that was made up here means nothing in an image.
+        raw_colors: Any = entry.get("raw_colors", [color] if given else [])
+        classes.append(SemanticClass(index + 1, name, color, raw_labels, _colors(raw_colors, f"'{name}'")))
+    return _ignoring(ClassTable(tuple(classes)), ignored, ())
+
+
+def _ignoring(table: ClassTable, labels: Any, colors: Any) -> ClassTable:
+    """A class table with further raw labels and colours of images to ignore."""
+    ignored = _raw_labels(labels, "ignored_raw_labels")
+    meaning = {raw: item.name for item in table.classes for raw in item.raw_labels}
+    for raw in ignored:
+        if raw in meaning:
+            raise ConfigError(f"classes: raw label {raw} means '{meaning[raw]}' and is in ignored_raw_labels")
+    return ClassTable(
+        table.classes,
+        tuple(dict.fromkeys((*table.ignored_raw_labels, *ignored))),
+        tuple(dict.fromkeys((*table.ignored_raw_colors, *_colors(colors, "ignored_raw_colors")))),
+    )
+
+
+def _raw_labels(value: Any, name: str) -> tuple[int, ...]:
+    """Raw labels as whole numbers."""
+    values = [value] if is_number(value) else value
+    if not isinstance(values, list | tuple) or not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
+        raise ConfigError(f"classes: the raw labels of '{name}' must be whole numbers")
+    return tuple(values)
+
+
+def _color(value: Any, what: str) -> Color:
+    """A colour from a list [r, g, b]."""
+    is_color = isinstance(value, list | tuple) and len(value) == 3
+    if not is_color or not all(type(part) is int and 0 <= part <= 255 for part in value):
+        raise ConfigError(f"classes: {what} must be three whole numbers from 0 to 255, got {value!r}")
+    return value[0], value[1], value[2]
+
+
+def _colors(values: Any, name: str) -> tuple[Color, ...]:
+    """Colours of label images from a list of lists [r, g, b]."""
+    if not isinstance(values, list | tuple):
+        raise ConfigError(f"classes: the raw colors of {name} must be a list of [r, g, b]")
+    return tuple(dict.fromkeys(_color(value, f"every raw color of {name}") for value in values))
+
+
+def class_to_mapping(item: SemanticClass) -> dict[str, Any]:
+    """One class as a team file holds it."""
+    entry: dict[str, Any] = {"name": item.name, "color": list(item.color), "raw_labels": list(item.raw_labels)}
+    if item.raw_colors != (item.color,):
+        entry["raw_colors"] = [list(color) for color in item.raw_colors]
+    return entry

@@ -1,0 +1,31 @@
+"""Reading YAML files, with errors of one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from octoreplay.errors import ConfigError
+
+
+def read_text(path: Path, kind: str) -> str:
+    """A configuration file's text."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a {kind} file (no UTF-8 text)") from error
+
+
+def load_yaml(text: str, source: str) -> Any:
+    """What a YAML text holds."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        line = getattr(getattr(error, "problem_mark", None), "line", None)
+        where = "" if line is None else f" (line {line + 1})"
+        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
