@@ -1,14 +1,11 @@
-"""What a run can be told: frozen dataclasses with range checks, and the team file that holds them.
+"""What a run can be told: frozen dataclasses with range checks.
 
 Every parameter has one name: in the team file (a flat key), on the command line (``--name-with-dashes``) and here.
-This is the only module that reads or writes configuration files.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,8 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-from octoreplay.errors import ConfigError
-from octoreplay.records import ClassTable, SemanticClass
+from octoreplay.class_tables.edits import Merges
+from octoreplay.errors import ConfigError, suggestion
+from octoreplay.records import ClassTable
 
 RULES = ("gradient", "bayes", "natural", "ratio", "flood", "merge", "local")
 EVIDENCES = ("sum", "time-average", "cell-average")
@@ -30,6 +28,10 @@ PALETTE: tuple[tuple[int, int, int], ...] = (
     (120, 120, 120), (127, 60, 141), (17, 165, 121), (57, 105, 172), (242, 183, 1), (231, 63, 116), (128, 186, 90),
 )  # fmt: skip
 """Colours for classes that come without one (the first seven: Okabe and Ito's colour-blind safe set)."""
+
+
+_LARGEST = 1e12
+"""No number of a configuration is larger, nor smaller where it must be above 0: what times become still has room."""
 
 
 def _parameter(
@@ -48,6 +50,11 @@ def _parameter(
     )
 
 
+def _help(text: str) -> Mapping[str, str]:
+    """What a key of a robot is for, as a team file's comments say it."""
+    return {"help": text}
+
+
 def _check_ranges(config: Any) -> None:
     """Check every parameter of one section against its type and range."""
     for item in dataclasses.fields(config):
@@ -56,6 +63,8 @@ def _check_ranges(config: Any) -> None:
             continue
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{item.name}: {value} is not a finite number")
+        if isinstance(value, float) and abs(value) > _LARGEST:
+            raise ConfigError(f"{item.name}: {value:g} is above the largest value {_LARGEST:g}")
         if meta["choices"] is not None and value not in meta["choices"]:
             raise ConfigError(f"{item.name}: '{value}' is not one of {', '.join(meta['choices'])}")
         if meta["minimum"] is not None and value < meta["minimum"]:
@@ -64,6 +73,8 @@ def _check_ranges(config: Any) -> None:
             raise ConfigError(f"{item.name}: {value} is above the largest value {meta['maximum']:g}")
         if meta["above"] is not None and value <= meta["above"]:
             raise ConfigError(f"{item.name}: {value} must be greater than {meta['above']:g}")
+        if isinstance(value, float) and meta["above"] == 0.0 and value < 1.0 / _LARGEST:
+            raise ConfigError(f"{item.name}: {value:g} is below the least value {1.0 / _LARGEST:g}")
 
 
 @dataclass(frozen=True)
@@ -78,6 +89,7 @@ class SensorConfig:
     min_range: float = _parameter(0.0, "points nearer than this carry no information [m]", minimum=0.0)
     max_range: float = _parameter(10.0, "rays are cut here [m]", above=0.0)
     rays: str = _parameter("cells", "one ray per distinct end cell, or per measured point", choices=("cells", "all"))
+    hide_robots: bool = _parameter(False, "points in another robot's body_box free their ray and hit nothing")
     invalid_depth: tuple[float, ...] = _parameter((), "raw depth values that carry no information")
     no_return_depth: tuple[float, ...] = _parameter(
         (), "raw depth values that mean 'no return' and free their ray up to max_range"
@@ -209,7 +221,9 @@ class NetworkConfig:
     )
     network_seed: int = _parameter(0, "seed of the random graph, losses and jitter", minimum=0)
     weights: str = _parameter("metropolis", "weights A_ij of the links", choices=WEIGHTS)
-    publish_period: float = _parameter(1.0, "every robot publishes its map every so often [s]", above=0.0)
+    publish_period: float = _parameter(
+        1.0, "every robot publishes its map every so often [s]", above=0.0, maximum=86_400.0
+    )
     after_end: str = _parameter(
         "stay", "after a robot's last scan it stays in the team or leaves", choices=("stay", "leave")
     )
@@ -326,10 +340,22 @@ class TimeConfig:
     """How stamps are read and streams are paired."""
 
     clock: str = _parameter("header", "stamps: the messages' headers or the log's", choices=("header", "log"))
-    reorder_window: float = _parameter(1.0, "messages may be this much out of order [s]", minimum=0.0)
-    pair_tolerance: float = _parameter(0.02, "depth and label may be this far apart [s]", minimum=0.0)
-    pose_gap: float = _parameter(0.5, "poses further apart than this are not interpolated between [s]", above=0.0)
+    reorder_window: float = _parameter(1.0, "messages may be this much out of order [s]", minimum=0.0, maximum=1e6)
+    pair_tolerance: float = _parameter(0.02, "depth and label may be this far apart [s]", minimum=0.0, maximum=1e6)
+    pose_gap: float = _parameter(
+        0.5, "poses further apart than this are not interpolated between [s]", above=0.0, maximum=1e6
+    )
     strict_labels: bool = _parameter(False, "refuse raw labels that the class table does not know")
+    start: float = _parameter(
+        0.0, "frames before this much after the team's first are left out [s]", minimum=0.0, maximum=1e9
+    )
+    duration: float | None = _parameter(
+        None, "frames later than this after start are left out [s]", above=0.0, maximum=1e9
+    )
+    every: int = _parameter(1, "take one image or cloud of so many of each robot", minimum=1)
+    rate_limit: float | None = _parameter(
+        None, "take at most so many images or clouds a second of each robot [Hz]", minimum=1e-6
+    )
 
     def __post_init__(self) -> None:
         _check_ranges(self)
@@ -352,66 +378,146 @@ class OutputConfig:
 class RobotConfig:
     """One robot: its log files, topics, clock and frames. Topics and frames that are None are found in the log.
 
-    ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo. Transforms are (x, y, z, qx, qy, qz, qw):
+    ``depth_topic``, ``label_topic`` and ``confidence_topic`` are images; ``cloud_topic`` is a point cloud or a laser
+    scan, with its labels in ``label_field`` and how sure they are in ``confidence_field``. ``pose_file`` takes the
+    place of a pose topic: a trajectory in TUM's or KITTI's format, the latter with ``pose_times``, a time in each line,
+    or else with a pose for every message of the sensor.
+    ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo; ``rectified`` says whether CameraInfo's P
+    holds (None: where the topic's name says 'rect') or K and the distortion. Transforms are (x, y, z, qx, qy, qz, qw):
     ``T_team_map`` from the robot's map frame to the team's, ``T_body_sensor`` from the sensor's frame to the frame
-    whose pose the pose topic gives, in place of TF. ``clock_offset`` [s] is added to the robot's stamps. The robot
-    publishes every ``publish_period`` [s], the team's unless given, ``publish_phase`` [s] after the ticks that are
-    multiples of it.
+    whose pose the pose topic gives, in place of TF. ``body_box`` is (xmin, ymin, zmin, xmax, ymax, zmax) of the robot
+    itself [m] in ``body_frame``, the frame whose pose the pose topic gives unless named: what the sensor sees in it is
+    left out. ``clock_offset`` [s] is added to the robot's stamps. The robot publishes every ``publish_period`` [s], the
+    team's unless given, ``publish_phase`` [s] after the ticks that are multiples of it.
     """
 
     robot_id: str
     logs: tuple[Path, ...]
-    depth_topic: str | None = None
-    label_topic: str | None = None
-    camera_info_topic: str | None = None
-    cloud_topic: str | None = None
-    pose_topic: str | None = None
-    label_info_topic: str | None = None
-    map_frame: str | None = None
-    sensor_frame: str | None = None
-    intrinsics: tuple[float, ...] | None = None
-    depth_unit: float | None = None
-    clock_offset: float = 0.0
-    T_team_map: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    T_body_sensor: tuple[float, ...] | None = None
-    publish_period: float | None = None
-    publish_phase: float = 0.0
+    depth_topic: str | None = field(default=None, metadata=_help("depth images, raw or compressed"))
+    label_topic: str | None = field(
+        default=None, metadata=_help("label images, ids or colours; '' to map without labels")
+    )
+    confidence_topic: str | None = field(default=None, metadata=_help("images that say how sure the labels are"))
+    camera_info_topic: str | None = field(default=None, metadata=_help("CameraInfo of the depth images"))
+    cloud_topic: str | None = field(
+        default=None, metadata=_help("point clouds or laser scans, in place of depth_topic")
+    )
+    label_field: str | None = field(
+        default=None, metadata=_help("field of the points that holds their labels, such as rgb")
+    )
+    confidence_field: str | None = field(
+        default=None, metadata=_help("field of the points that says how sure the labels are")
+    )
+    pose_topic: str | None = field(default=None, metadata=_help("odometry, stamped poses, a path or TF"))
+    pose_file: Path | None = field(
+        default=None, metadata=_help("a trajectory in place of pose_topic: TUM or KITTI format")
+    )
+    pose_times: Path | None = field(default=None, metadata=_help("times of a KITTI trajectory, one in each line [s]"))
+    label_info_topic: str | None = field(default=None, metadata=_help("LabelInfo that names the labels"))
+    map_frame: str | None = field(default=None, metadata=_help("the frame that the poses are in"))
+    sensor_frame: str | None = field(
+        default=None, metadata=_help("the sensor's frame, if not the one that its messages name")
+    )
+    intrinsics: tuple[float, ...] | None = field(
+        default=None, metadata=_help("[fx, fy, cx, cy] in place of CameraInfo [pixels]")
+    )
+    rectified: bool | None = field(
+        default=None, metadata=_help("true: CameraInfo's P holds; false: K and the distortion")
+    )
+    depth_unit: float | None = field(default=None, metadata=_help("metres per depth value, in place of the encoding's"))
+    clock_offset: float = field(default=0.0, metadata=_help("added to this robot's stamps [s]"))
+    T_team_map: tuple[float, ...] = field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        metadata=_help("its map frame in the team's: x y z [m], quaternion x y z w"),
+    )
+    T_body_sensor: tuple[float, ...] | None = field(
+        default=None, metadata=_help("the sensor in the frame that the poses are of, in place of TF")
+    )
+    body_frame: str | None = field(
+        default=None, metadata=_help("the frame of body_box, if not the one that the poses are of")
+    )
+    body_box: tuple[float, ...] | None = field(
+        default=None, metadata=_help("the robot itself: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
+    )
+    publish_period: float | None = field(
+        default=None, metadata=_help("publishes its map every so often, in place of the team's [s]")
+    )
+    publish_phase: float = field(
+        default=0.0, metadata=_help("and so much after the ticks that are multiples of it [s]")
+    )
 
     def __post_init__(self) -> None:
         if not self.robot_id or "/" in self.robot_id:
-            raise ConfigError(f"robot id '{self.robot_id}': must not be empty or contain '/'")
+            raise ConfigError(f"robot id '{self.robot_id}': every robot needs an id, without '/' in it")
+        for problem in (*self._wrong_sources(), *self._wrong_geometry(), *self._wrong_numbers()):
+            raise ConfigError(f"robot '{self.robot_id}': {problem}")
+
+    def _wrong_sources(self) -> Iterator[str]:
+        """What does not go together in the files and topics."""
         if not self.logs:
-            raise ConfigError(f"robot '{self.robot_id}': needs a log")
+            yield "needs a log"
+        if self.depth_topic and self.cloud_topic:
+            yield "give depth_topic or cloud_topic, not both"
+        if self.pose_topic and self.pose_file:
+            yield "give pose_topic or pose_file, not both"
+        if self.pose_times and not self.pose_file:
+            yield "pose_times goes with pose_file"
+
+    def _wrong_geometry(self) -> Iterator[str]:
+        """What is no transform, no camera or no box."""
         for name in ("T_team_map", "T_body_sensor"):
             value = getattr(self, name)
-            if value is None:
-                continue
-            if len(value) != 7:
-                raise ConfigError(f"robot '{self.robot_id}': {name} expects 7 numbers x, y, z, qx, qy, qz, qw")
-            if abs(math.hypot(*value[3:]) - 1.0) > 1e-3:
-                raise ConfigError(f"robot '{self.robot_id}': {name}'s quaternion must have length 1")
+            if value is not None and len(value) != 7:
+                yield f"{name} expects 7 numbers x, y, z, qx, qy, qz, qw"
+            elif value is not None and abs(math.hypot(*value[3:]) - 1.0) > 1e-3:
+                yield f"{name}'s quaternion must have length 1"
         if self.intrinsics is not None and (len(self.intrinsics) != 4 or min(self.intrinsics[:2]) <= 0):
-            raise ConfigError(f"robot '{self.robot_id}': intrinsics expects 4 numbers fx, fy, cx, cy")
+            yield "intrinsics expects 4 numbers fx, fy, cx, cy"
+        box = self.body_box
+        if box is not None and (len(box) != 6 or not all(low < high for low, high in zip(box, box[3:], strict=False))):
+            yield "body_box expects 6 numbers XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX, every minimum below its maximum"
+
+    def _wrong_numbers(self) -> Iterator[str]:
+        """What is out of range."""
         if self.depth_unit is not None and self.depth_unit <= 0:
-            raise ConfigError(f"robot '{self.robot_id}': depth_unit must be greater than 0")
+            yield "depth_unit must be greater than 0"
         if self.publish_period is not None and not 0 < self.publish_period < math.inf:
-            raise ConfigError(f"robot '{self.robot_id}': publish_period must be greater than 0")
+            yield "publish_period must be greater than 0"
         if not 0 <= self.publish_phase < math.inf:
-            raise ConfigError(f"robot '{self.robot_id}': publish_phase must not be negative")
-        if self.depth_topic and self.cloud_topic:
-            raise ConfigError(f"robot '{self.robot_id}': give depth_topic or cloud_topic, not both")
+            yield "publish_phase must not be negative"
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            numbers = [n for n in (value if isinstance(value, tuple) else (value,)) if isinstance(n, float)]
+            if not all(math.isfinite(number) for number in numbers):
+                yield f"{item.name} must be finite, not {value}"
+            if any(abs(number) > _LARGEST for number in numbers):
+                yield f"{item.name} must not hold numbers above {_LARGEST:g}"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files and folders that the robot's data come from."""
+        return (*self.logs, *(path for path in (self.pose_file, self.pose_times) if path is not None))
+
+    def with_absolute_paths(self) -> RobotConfig:
+        """This robot with paths that hold from everywhere."""
+        logs = tuple(log.resolve() for log in self.logs)
+        pose_file, pose_times = (None if path is None else path.resolve() for path in (self.pose_file, self.pose_times))
+        return dataclasses.replace(self, logs=logs, pose_file=pose_file, pose_times=pose_times)
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """Everything that a run depends on.
 
-    ``classes`` is None where the logs bring their own class table. ``link_overrides`` are (sender, receiver, values):
-    what differs from ``link`` in one direction of a link.
+    ``classes`` is None where the logs bring their own class table; ``merge_classes`` and ``ignore_hits`` are what to
+    make of that (``edited``). ``link_overrides`` are (sender, receiver, values): what differs from ``link`` in one
+    direction of a link.
     """
 
     robots: tuple[RobotConfig, ...]
     classes: ClassTable | None = None
+    merge_classes: Merges = ()
+    ignore_hits: tuple[str, ...] = ()
     sensor: SensorConfig = SensorConfig()
     map: MapConfig = MapConfig()
     consensus: ConsensusConfig = ConsensusConfig()
@@ -456,6 +562,8 @@ class RunConfig:
                         f"robot '{robot.robot_id}': {name} {value:g} s is not a multiple of the team's publish_period"
                         f" {self.network.publish_period:g} s, the length of a tick"
                     )
+        if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
+            raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
         _check_rule(self)
 
     def link_config(self, sender: str, receiver: str) -> LinkConfig:
@@ -468,18 +576,18 @@ class RunConfig:
 
         Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.
         """
-        changes = _coerced(values)
+        changes = coerced(values)
         sections = {name: dataclasses.replace(getattr(self, name), **fields) for name, fields in changes.items()}
         return dataclasses.replace(self, **sections)
 
 
-def _coerced(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def coerced(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Flat parameters in their types, by section. Raises ConfigError for an unknown name and a wrong type."""
     changes: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         parameter = PARAMETERS.get(name)
         if parameter is None:
-            raise ConfigError(f"{name}: unknown parameter{_suggestion(name, PARAMETERS)}")
+            raise ConfigError(f"{name}: unknown parameter{suggestion(name, PARAMETERS)}")
         changes.setdefault(parameter.section, {})[name] = parameter.coerce(value)
     return changes
 
@@ -534,32 +642,32 @@ class Parameter:
             return None
         if self.kind == "floats":
             numbers = value.split(",") if isinstance(value, str) else value
-            return tuple(_number(number) for number in ([numbers] if _is_number(numbers) else numbers))
+            return tuple(as_number(number) for number in ([numbers] if is_number(numbers) else numbers))
         if self.kind == "bool":
             if not isinstance(value, bool):
                 raise TypeError
             return value
         if self.kind == "int":
-            if not _is_number(value) or int(value) != value:
+            if not is_number(value) or int(value) != value:
                 raise TypeError
             return int(value)
         if self.kind == "float":
-            return _number(value)
+            return as_number(value)
         if not isinstance(value, str):
             raise TypeError
         return value
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     """True for int and float, not for bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _number(value: Any) -> float:
+def as_number(value: Any) -> float:
     """A float from a number or its text."""
     if isinstance(value, str):
         return float(value)
-    if not _is_number(value):
+    if not is_number(value):
         raise TypeError
     return float(value)
 
@@ -569,7 +677,7 @@ def _parameters() -> Iterator[Parameter]:
     kinds = {"float": "float", "float | None": "float", "int": "int", "int | None": "int", "bool": "bool",
              "str": "str", "tuple[float, ...]": "floats"}  # fmt: skip
     for section in dataclasses.fields(RunConfig):
-        if section.name in ("robots", "classes", "link_overrides"):
+        if section.name in ("robots", "classes", "merge_classes", "ignore_hits", "link_overrides"):
             continue
         for item in dataclasses.fields(cast("Any", section.default)):
             if item.metadata:
@@ -582,6 +690,14 @@ def _parameters() -> Iterator[Parameter]:
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: parameter for parameter in _parameters()})
 """Every flat parameter by name."""
 
+SECTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "sensor": "Inverse sensor model", "map": "Map", "consensus": "Consensus", "network": "Communication graph",
+        "link": "Links", "packet": "Packets", "time": "Time and pairing", "output": "What the result holds",
+    }
+)  # fmt: skip
+"""What the sections of parameters are about."""
+
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "paper": MappingProxyType(
@@ -593,320 +709,3 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )  # fmt: skip
 """Named sets of parameters. 'paper' is the literal reading of the paper."""
-
-
-def _suggestion(name: str, known: Any) -> str:
-    """'; did you mean ...' for the nearest known name, or nothing."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""
-
-
-# --- team files ------------------------------------------------------------------------------------------------------
-
-_ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
-_CLASS_KEYS = ("name", "color", "raw_labels")
-_SCHEDULE_KEYS = {"from": "start", "to": "end", **{f.name: f.name for f in dataclasses.fields(ScheduleEntry)[2:]}}
-_LINK_KEYS = tuple(f.name for f in dataclasses.fields(LinkConfig))
-_TEAM_KEYS = ("robots", "classes", "ignored_raw_labels", "edges", "one_way", "schedule", "links")
-
-
-def load_team_file(path: str | Path) -> RunConfig:
-    """Read a team file. Log paths in it are relative to its folder.
-
-    Raises ConfigError with the file and the key for anything that is not understood.
-    """
-    path = Path(path)
-    return parse_team(_read_text(path, "team"), source=str(path), folder=path.parent)
-
-
-def _read_text(path: Path, kind: str) -> str:
-    """A configuration file's text."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a {kind} file (no UTF-8 text)") from error
-
-
-def parse_team(text: str, *, source: str, folder: Path) -> RunConfig:
-    """A configuration from a team file's text; ``source`` names it in errors. Raises ConfigError."""
-    content = _load_yaml(text, source)
-    try:
-        return _team_from_mapping(content, folder)
-    except ConfigError as error:
-        raise ConfigError(f"{source}: {error}") from error
-
-
-def _load_yaml(text: str, source: str) -> Any:
-    """What a YAML text holds."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        return YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        line = getattr(getattr(error, "problem_mark", None), "line", None)
-        where = "" if line is None else f" (line {line + 1})"
-        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
-
-
-def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
-    if not isinstance(content, Mapping):
-        raise ConfigError("a team file is a YAML mapping with the key 'robots'")
-    if "robots" not in content or not isinstance(content["robots"], list):
-        raise ConfigError("robots: expects a list of robots, each with 'id' and 'log'")
-    for key in content:
-        if key not in _TEAM_KEYS and key not in PARAMETERS:
-            raise ConfigError(f"{key}: unknown key{_suggestion(str(key), (*_TEAM_KEYS, *PARAMETERS))}")
-    robots = tuple(_robot_from_mapping(entry, folder) for entry in content["robots"])
-    classes = None
-    if content.get("classes") is not None:
-        classes = class_table(content["classes"], content.get("ignored_raw_labels") or ())
-    changes = _coerced({key: value for key, value in content.items() if key in PARAMETERS})
-    changes.setdefault("network", {}).update(
-        edges=_edges(content.get("edges") or ()),
-        one_way=_pairs("one_way", content.get("one_way") or ()),
-        schedule=schedule(content.get("schedule") or ()),
-    )
-    # All at once: what one parameter may be depends on others.
-    defaults = {item.name: item.default for item in dataclasses.fields(RunConfig)}
-    return RunConfig(
-        robots=robots,
-        classes=classes,
-        link_overrides=_link_overrides(content.get("links") or ()),
-        **{name: dataclasses.replace(cast("Any", defaults[name]), **fields) for name, fields in changes.items()},
-    )
-
-
-def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
-    if not isinstance(entry, Mapping):
-        raise ConfigError("robots: every robot is a mapping with 'id' and 'log'")
-    robot_id = str(entry.get("id", ""))
-    for key in entry:
-        if key not in _ROBOT_KEYS:
-            raise ConfigError(f"robot '{robot_id}': {key}: unknown key{_suggestion(str(key), _ROBOT_KEYS)}")
-    logs = entry.get("log") or ()
-    logs = (logs,) if isinstance(logs, str) else logs
-    if not isinstance(logs, list | tuple) or not all(isinstance(log, str) for log in logs):
-        raise ConfigError(f"robot '{robot_id}': log: expects a path or a list of paths")
-    fields: dict[str, Any] = {}
-    for key, value in entry.items():
-        if key in ("id", "log") or value is None:
-            continue
-        try:
-            if key in ("intrinsics", "T_team_map", "T_body_sensor"):
-                fields[key] = tuple(_number(number) for number in value)
-            elif key in ("clock_offset", "depth_unit", "publish_period", "publish_phase"):
-                fields[key] = _number(value)
-            else:
-                if not isinstance(value, str):
-                    raise TypeError
-                fields[key] = value
-        except (TypeError, ValueError):
-            raise ConfigError(f"robot '{robot_id}': {key}: {value!r} has the wrong type") from None
-    return RobotConfig(robot_id=robot_id, logs=tuple(folder / log for log in logs), **fields)
-
-
-def _edges(entries: Any) -> tuple[tuple[str, str, float | None], ...]:
-    """Edges from lists [a, b] or [a, b, weight]."""
-    edges = []
-    for entry in entries:
-        if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
-            raise ConfigError("edges: every edge is a list [robot, robot] or [robot, robot, weight]")
-        if len(entry) == 3 and not _is_number(entry[2]):
-            raise ConfigError(f"edges: the weight of {entry[0]} - {entry[1]} is not a number")
-        edges.append((str(entry[0]), str(entry[1]), float(entry[2]) if len(entry) == 3 else None))
-    return tuple(edges)
-
-
-def _pairs(key: str, entries: Any) -> tuple[tuple[str, str], ...]:
-    """Pairs of robots from lists [a, b]."""
-    if not isinstance(entries, list | tuple) or not all(isinstance(e, list | tuple) and len(e) == 2 for e in entries):
-        raise ConfigError(f"{key}: expects a list of pairs [robot, robot]")
-    return tuple((str(a), str(b)) for a, b in entries)
-
-
-def load_schedule(path: str | Path) -> tuple[ScheduleEntry, ...]:
-    """Read a schedule file: a YAML list of entries. Raises ConfigError with the file and the entry."""
-    path = Path(path)
-    content = _load_yaml(_read_text(path, "schedule"), str(path))
-    try:
-        return schedule(content)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
-
-
-def schedule(entries: Any) -> tuple[ScheduleEntry, ...]:
-    """A schedule from the list that a file holds: mappings with from, to and what is up or down.
-
-    Raises ConfigError for an unknown key or a wrong type.
-    """
-    if not isinstance(entries, list | tuple):
-        raise ConfigError("schedule: expects a list of entries, each with 'from' and what is up or down")
-    found = []
-    for entry in entries:
-        if not isinstance(entry, Mapping) or "from" not in entry:
-            raise ConfigError("schedule: every entry is a mapping with 'from' [s] and what is up or down")
-        values: dict[str, Any] = {}
-        for key, value in entry.items():
-            if key not in _SCHEDULE_KEYS:
-                raise ConfigError(f"schedule: {key}: unknown key{_suggestion(str(key), _SCHEDULE_KEYS)}")
-            if key in ("from", "to"):
-                if not _is_number(value):
-                    raise ConfigError(f"schedule: {key}: {value!r} is not a number of seconds")
-                value = float(value)
-            elif key == "forget":
-                if not isinstance(value, bool):
-                    raise ConfigError(f"schedule: {key}: expects true or false, got {value!r}")
-            elif key in ("links_down", "links_up"):
-                value = _pairs(f"schedule: {key}", value)
-            elif key == "groups":
-                if not isinstance(value, list | tuple) or not all(isinstance(group, list | tuple) for group in value):
-                    raise ConfigError("schedule: groups: expects a list of lists of robots")
-                value = tuple(tuple(str(robot_id) for robot_id in group) for group in value)
-            else:
-                names = [value] if isinstance(value, str) else value
-                if not isinstance(names, list | tuple):
-                    raise ConfigError(f"schedule: {key}: expects a list of robots")
-                value = tuple(str(robot_id) for robot_id in names)
-            values[_SCHEDULE_KEYS[key]] = value
-        found.append(ScheduleEntry(**values))
-    return tuple(found)
-
-
-def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...]:
-    """Links that differ, from mappings with 'from' and 'to', or 'between' for both directions, and link parameters."""
-    if not isinstance(entries, list | tuple):
-        raise ConfigError("links: expects a list of links, each with 'from' and 'to' or 'between', and what differs")
-    found = []
-    for entry in entries:
-        named = {"between", "from", "to"}.intersection(entry) if isinstance(entry, Mapping) else set()
-        if named not in ({"between"}, {"from", "to"}):
-            raise ConfigError("links: every link names 'from' and 'to', or 'between' two robots for both directions")
-        changes = {key: value for key, value in entry.items() if key not in ("between", "from", "to")}
-        for key in changes:
-            if key not in _LINK_KEYS:
-                raise ConfigError(f"links: {key}: unknown key{_suggestion(str(key), _LINK_KEYS)}")
-        try:
-            values = tuple((key, PARAMETERS[key].coerce(value)) for key, value in changes.items())
-        except ConfigError as error:
-            raise ConfigError(f"links: {error}") from error
-        if "between" in entry:
-            pair = entry["between"]
-            if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise ConfigError(f"links: between: expects [robot, robot], got {pair!r}")
-            a, b = (str(robot_id) for robot_id in pair)
-            found += [(a, b, values), (b, a, values)]
-        else:
-            found.append((str(entry["from"]), str(entry["to"]), values))
-    return tuple(found)
-
-
-def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
-    """A class table from the list that a team file holds: mappings with name, color [r, g, b] and raw_labels.
-
-    Raises ConfigError for an unknown key, a wrong type, or a raw label that has two meanings.
-    """
-    if not isinstance(entries, list | tuple) or not entries:
-        raise ConfigError("classes: expects a list of classes, each with 'name' and 'raw_labels'")
-    if len(entries) > 254:
-        raise ConfigError(f"classes: at most 254 classes, got {len(entries)}")
-    classes = []
-    meaning: dict[int, str] = {}
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, Mapping) or "name" not in entry:
-            raise ConfigError("classes: every class is a mapping with 'name', 'color' and 'raw_labels'")
-        for key in entry:
-            if key not in _CLASS_KEYS:
-                raise ConfigError(f"classes: {key}: unknown key{_suggestion(str(key), _CLASS_KEYS)}")
-        name = str(entry["name"])
-        raw_labels = _raw_labels(entry.get("raw_labels", [index + 1]), name)
-        for raw in raw_labels:
-            if raw in meaning:
-                raise ConfigError(f"classes: raw label {raw} means both '{meaning[raw]}' and '{name}'")
-            meaning[raw] = name
-        color = entry.get("color") or PALETTE[index % len(PALETTE)]
-        if len(color) != 3 or not all(isinstance(c, int) and 0 <= c <= 255 for c in color):
-            raise ConfigError(f"classes: the color of '{name}' must be three whole numbers from 0 to 255")
-        classes.append(SemanticClass(index + 1, name, (color[0], color[1], color[2]), raw_labels))
-    ignored_labels = _raw_labels(ignored, "ignored_raw_labels")
-    for raw in ignored_labels:
-        if raw in meaning:
-            raise ConfigError(f"classes: raw label {raw} means '{meaning[raw]}' and is in ignored_raw_labels")
-    return ClassTable(tuple(classes), ignored_labels)
-
-
-def _raw_labels(value: Any, name: str) -> tuple[int, ...]:
-    """Raw labels as whole numbers."""
-    values = [value] if _is_number(value) else value
-    if not isinstance(values, list | tuple) or not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
-        raise ConfigError(f"classes: the raw labels of '{name}' must be whole numbers")
-    return tuple(values)
-
-
-def dump_team(config: RunConfig, folder: Path | None = None) -> str:
-    """The team file's text of a configuration: everything that differs from the defaults, and every robot.
-
-    Log paths are written relative to ``folder`` where they lie below it. ``parse_team`` gives the same configuration.
-    """
-    from ruamel.yaml import YAML
-
-    content: dict[str, Any] = {"robots": [_robot_to_mapping(robot, folder) for robot in config.robots]}
-    if config.classes is not None:
-        content["classes"] = [
-            {"name": c.name, "color": list(c.color), "raw_labels": list(c.raw_labels)} for c in config.classes.classes
-        ]
-        if config.classes.ignored_raw_labels:
-            content["ignored_raw_labels"] = list(config.classes.ignored_raw_labels)
-    if config.network.edges:
-        content["edges"] = [[e for e in edge if e is not None] for edge in config.network.edges]
-    if config.network.one_way:
-        content["one_way"] = [list(pair) for pair in config.network.one_way]
-    if config.network.schedule:
-        content["schedule"] = [_entry_to_mapping(entry) for entry in config.network.schedule]
-    if config.link_overrides:
-        content["links"] = [{"from": a, "to": b, **dict(values)} for a, b, values in config.link_overrides]
-    for name, parameter in PARAMETERS.items():
-        value = getattr(getattr(config, parameter.section), name)
-        if value != parameter.default:
-            content[name] = list(value) if isinstance(value, tuple) else value
-    buffer = io.StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    yaml.width = 110
-    yaml.dump(content, buffer)
-    return buffer.getvalue()
-
-
-def _entry_to_mapping(entry: ScheduleEntry) -> dict[str, Any]:
-    """One entry of a schedule as a file holds it."""
-
-    def plain(value: Any) -> Any:
-        return [plain(part) for part in value] if isinstance(value, tuple) else value
-
-    defaults = ScheduleEntry(start=0.0)
-    values = {key: getattr(entry, name) for key, name in _SCHEDULE_KEYS.items()}
-    return {
-        key: plain(value)
-        for key, value in values.items()
-        if key == "from" or value != getattr(defaults, _SCHEDULE_KEYS[key])
-    }
-
-
-def _robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
-    """One robot as a team file holds it."""
-
-    def text(path: Path) -> str:
-        return str(path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path)
-
-    logs = [text(path) for path in robot.logs]
-    entry: dict[str, Any] = {"id": robot.robot_id, "log": logs[0] if len(logs) == 1 else logs}
-    for item in dataclasses.fields(RobotConfig):
-        if item.name in ("robot_id", "logs"):
-            continue
-        value = getattr(robot, item.name)
-        if value != item.default:
-            entry[item.name] = list(value) if isinstance(value, tuple) else value
-    return entry

@@ -9,9 +9,16 @@
     +-- PacketError           bytes that are not a map packet this version can read  (exit code 1)
 """
 
+import difflib
+import re
+from collections.abc import Iterable
+
 
 class OctoreplayError(Exception):
     """Base of all errors that octoreplay raises on purpose; its text is one sentence for the user."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text))
 
 
 class InputError(OctoreplayError):
@@ -28,3 +35,20 @@ class ConfigError(OctoreplayError):
 
 class PacketError(OctoreplayError):
     """Bytes that are no map packet, are damaged, or come from a newer format version."""
+
+
+def printable(text: str) -> str:
+    """A text for a terminal: names in logs may hold anything, and what controls a terminal is escaped as in Python.
+
+    Lines that are indented, as candidates are, stay lines of their own.
+    """
+    if text.isprintable():
+        return text
+    escaped = "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    return re.sub(r"\n(?!    )", r"\\n", escaped)
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The end of a sentence: '; did you mean ...' with the nearest known name, or nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, field, fields
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ Int64Array: TypeAlias = npt.NDArray[np.int64]
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 Float64Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+Color: TypeAlias = tuple[int, int, int]
 
 NO_CLASS = 0
 """The class_id of a measured point that carries no usable label: it frees its ray and hits nothing."""
@@ -30,7 +31,7 @@ class CameraModel:
     """Pinhole intrinsics in pixels; z looks forward, x right, y down (REP 103 optical).
 
     ``slopes`` is (2, height, width) float32 where the lens distorts: x / z and y / z of every pixel's ray, in place of
-    (u - cx) / fx and (v - cy) / fy.
+    (u - cx) / fx and (v - cy) / fy, NaN where no ray of the lens model hits a pixel.
     """
 
     width: int
@@ -101,20 +102,29 @@ Frame: TypeAlias = DepthFrame | CloudFrame
 
 @dataclass(frozen=True)
 class SemanticClass:
-    """One occupied class: its id 1..C, name, colour (r, g, b in 0..255) and the raw labels that mean it."""
+    """One occupied class: its id 1..C, name, colour (r, g, b in 0..255) and the raw labels that mean it.
+
+    ``raw_colors`` are the colours that mean it in colour-coded label images: its own colour unless given.
+    """
 
     class_id: int
     name: str
-    color: tuple[int, int, int]
+    color: Color
     raw_labels: tuple[int, ...]
+    raw_colors: tuple[Color, ...] = field(default=cast("tuple[Color, ...]", None))
+
+    def __post_init__(self) -> None:
+        if self.raw_colors is None:
+            object.__setattr__(self, "raw_colors", (self.color,))
 
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The occupied classes of a team, in order of class_id, and the raw labels to ignore."""
+    """The occupied classes of a team, in order of class_id, and the raw labels and colours of images to ignore."""
 
     classes: tuple[SemanticClass, ...]
     ignored_raw_labels: tuple[int, ...] = ()
+    ignored_raw_colors: tuple[Color, ...] = ()
 
     @property
     def num_classes(self) -> int:
@@ -150,25 +160,32 @@ class LeafTable:
 
 @dataclass
 class FrameCounts:
-    """What became of one robot's sensor messages while reading; every message is counted once."""
+    """What became of one robot's sensor messages while reading; every message is counted once.
+
+    ``first_missing`` says which message was the first that came too late, or had no label or pose, by the count's name;
+    ``unknown_label_pixels`` are numbers of pixels or points by raw label, ``unknown_colors`` by colour, 0xRRGGBB;
+    ``truncated_files`` has a sentence for each log that is cut or damaged, which says what was skipped.
+    """
 
     used: int = 0
     no_label: int = 0
     no_pose: int = 0
-    no_intrinsics: int = 0
     late: int = 0
+    duplicate: int = 0
     undecodable: int = 0
+    first_missing: dict[str, str] = field(default_factory=dict, compare=False)
     unknown_label_pixels: dict[int, int] = field(default_factory=dict)
+    unknown_colors: dict[int, int] = field(default_factory=dict)
     truncated_files: list[str] = field(default_factory=list)
 
     @property
     def skipped(self) -> int:
         """Sensor messages that were read and not mapped."""
-        return self.no_label + self.no_pose + self.no_intrinsics + self.late + self.undecodable
+        return self.no_label + self.no_pose + self.late + self.undecodable
 
     @property
     def lost_data(self) -> bool:
-        """True when something in the log could not be used."""
+        """True when something in the log could not be used; a duplicate is no loss."""
         return bool(self.skipped or self.truncated_files)
 
 
