@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from log_factory import ros2
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.sensors.labels import OCCUPIED, LabelLookup, class_table_from_names, label_names
+from octoreplay.io.sensors.images import LabelImage
+from octoreplay.io.sensors.labels import LOSSY_DISTANCE, OCCUPIED, LabelLookup, class_table_from_names
 from octoreplay.records import ClassTable, SemanticClass
 
 TABLE = ClassTable(
@@ -31,8 +33,10 @@ def test_every_raw_label_means_what_the_table_says(kind, values):
     lookup = LabelLookup(TABLE)
     class_ids = lookup.class_ids(raw, "here")
     assert class_ids.dtype == np.uint8
-    assert class_ids.tolist() == [MEANING.get(v, 0) for v in raw.tolist()]
-    unknown = [v for v in raw.tolist() if v not in MEANING and v != -1]
+    # Above 16 bits are instances.
+    meaning = {v: MEANING.get(v, MEANING.get(v & 0xFFFF) if v > 0xFFFF else None) for v in raw.tolist()}
+    assert class_ids.tolist() == [meaning[v] or 0 for v in raw.tolist()]
+    unknown = [v for v in raw.tolist() if meaning[v] is None and v != -1 and (v <= 0xFFFF or v & 0xFFFF != 0xFFFF)]
     assert lookup.unknown == {v: unknown.count(v) for v in unknown}
 
 
@@ -72,8 +76,7 @@ def test_class_tables_are_united_by_name():
     [
         ({"a": {1: "tree"}, "b": {1: "car"}}, "raw label 1 is 'tree' for robot 'a' and 'car' for robot 'b'"),
         ({"a": {1: "tree", 0: "sky"}, "b": {0: "void"}}, "raw label 0 is 'sky' for robot 'a' and unlabelled"),
-        ({"a": {}}, "names 0 classes"),
-        ({"a": {raw: f"class {raw}" for raw in range(300) if raw != 255}}, "names 299 classes"),
+        ({"a": {}}, "names no class"),
     ],
 )
 def test_tables_that_cannot_be_united_are_refused(names, sentence):
@@ -81,9 +84,144 @@ def test_tables_that_cannot_be_united_are_refused(names, sentence):
         class_table_from_names(names)
 
 
-def test_label_info_names():
-    assert label_names(ros2.label_info(0, {4: "x", 2: "y"})) == {4: "x", 2: "y"}
+@pytest.mark.parametrize("kind", ["u1", "u2", "i8"])
+def test_images_and_points_of_ids_mean_the_same(kind):
+    raw = np.array([[3, 8, 9], [0, 0, 255]], kind)
+    lookup = LabelLookup(TABLE)
+    np.testing.assert_array_equal(lookup.of_image(LabelImage(raw), "here"), [[1, 0, 0], [1, 1, 0]])
+    np.testing.assert_array_equal(lookup.of_points(raw[0].astype(np.int64), "here"), [1, 0, 0])
+    assert lookup.unknown == {8: 2}
+
+
+@pytest.mark.parametrize("raw", [-5, 1 << 40, 10**30])
+def test_strange_raw_labels_make_a_table(raw):
+    table = class_table_from_names({"a": {raw: "odd", 1: "tree"}})
+    lookup = LabelLookup(table)
+    assert lookup.class_ids(np.array([1, 7], np.int64), "here").tolist() == [table.names.index("tree") + 1, 0]
 
 
 def test_plain_occupancy_has_one_class():
     assert OCCUPIED.names == ("occupied",)
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+COLORS = ClassTable(
+    (
+        SemanticClass(1, "ground", (200, 100, 0), (1,)),
+        SemanticClass(2, "tree", (0, 150, 0), (2,), ((0, 150, 0), (0, 160, 0), (10, 255, 3))),
+        SemanticClass(3, "made up", (9, 9, 9), (3,), ()),
+        SemanticClass(4, "wall", (255, 255, 255), (4,)),
+    ),
+    ignored_raw_colors=((0, 0, 255),),
+)
+COLOR_MEANING = {
+    (0, 0, 0): 0, (0, 0, 255): 0, (200, 100, 0): 1, (0, 150, 0): 2, (0, 160, 0): 2, (10, 255, 3): 2, (255, 255, 255): 4,
+}  # fmt: skip
+
+
+COLOR_LOOKUP = LabelLookup(COLORS)
+
+
+def number(color):
+    return color[0] << 16 | color[1] << 8 | color[2]
+
+
+@given(st.lists(st.sampled_from([*COLOR_MEANING, (9, 9, 9), (0, 100, 200), (200, 100, 1), (255, 0, 0)]), max_size=40))
+def test_every_colour_means_what_the_table_says(colors):
+    lookup = COLOR_LOOKUP
+    lookup.unknown_colors = {}
+    class_ids = lookup.class_ids_of_colors(np.array(colors, np.uint8).reshape(-1, 3), "here", is_lossy=False)
+    assert class_ids.dtype == np.uint8
+    assert class_ids.tolist() == [COLOR_MEANING.get(color, 0) for color in colors]
+    unknown = [number(color) for color in colors if color not in COLOR_MEANING]
+    assert lookup.unknown_colors == {key: unknown.count(key) for key in unknown}
+    assert lookup.unknown == {}
+
+
+def test_colours_of_images_keep_their_shape_and_memory_order():
+    image = np.array([[(200, 100, 0), (7, 8, 9)], [(0, 160, 0), (0, 0, 0)]], np.uint8)
+    lookup = LabelLookup(COLORS)
+    for given_image in (image, np.asfortranarray(image), image[::-1][::-1]):
+        assert lookup.class_ids_of_colors(given_image, "here", is_lossy=False).tolist() == [[1, 0], [2, 0]]
+    assert lookup.unknown_colors == {0x070809: 3}
+    assert lookup.class_ids_of_colors(image[:, :0], "here", is_lossy=True).shape == (2, 0)
+
+
+def nearest_class(color):
+    """The obvious way: the class of the nearest colour, where it is nearer than half-way to the next and than 40."""
+    distance = {known: math.dist(color, known) for known in COLOR_MEANING}
+    for known, class_id in COLOR_MEANING.items():
+        least = min(math.dist(known, other) for other in COLOR_MEANING if other != known)
+        if distance[known] < least / 2 and distance[known] <= LOSSY_DISTANCE:
+            assert distance[known] == min(distance.values())
+            return class_id
+    return None
+
+
+def test_lossy_colours_are_the_nearest_ones_up_to_half_way():
+    rng = np.random.default_rng(3)
+    known = np.array(list(COLOR_MEANING))
+    near = known[rng.integers(len(known), size=4000)] + rng.integers(-45, 46, (4000, 3)) * rng.random((4000, 1))
+    edges = [(0, 155, 0), (0, 154, 0), (0, 156, 0), (200, 140, 0), (200, 141, 0), (160, 100, 0), (159, 100, 0)]
+    colors = np.concatenate([near.round().clip(0, 255), edges, known]).astype(np.uint8)
+    lookup = LabelLookup(COLORS)
+    class_ids = lookup.class_ids_of_colors(colors, "here", is_lossy=True)
+    expected = [nearest_class(color) for color in colors.tolist()]
+    assert class_ids.tolist() == [class_id or 0 for class_id in expected]
+    assert 500 < expected.count(None) < 3000
+    unknown = [number(color) & 0xF0F0F0 for color, c in zip(colors.tolist(), expected, strict=True) if c is None]
+    assert lookup.unknown_colors == {key: unknown.count(key) for key in unknown}
+
+
+def test_a_class_may_be_black():
+    table = ClassTable((SemanticClass(1, "night", (0, 0, 0), ()),))
+    lookup = LabelLookup(table)
+    image = np.array([(0, 0, 0), (0, 0, 30), (90, 0, 0)], np.uint8)
+    assert lookup.class_ids_of_colors(image, "here", is_lossy=False).tolist() == [1, 0, 0]
+    assert lookup.class_ids_of_colors(image, "here", is_lossy=True).tolist() == [1, 1, 0]
+
+
+def test_a_photograph_does_not_fill_the_memory_with_colours():
+    lookup = LabelLookup(COLORS)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        lookup.class_ids_of_colors(rng.integers(1, 256, (200, 200, 3), dtype=np.uint8), "here", is_lossy=False)
+    assert len(lookup.unknown_colors) <= 2 * 4096
+    assert 119_900 < sum(lookup.unknown_colors.values()) <= 120_000
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        (
+            ClassTable((SemanticClass(1, "road", (1, 2, 255), ()), SemanticClass(2, "tower", (1, 2, 255), ()))),
+            "#0102ff means both 'road' and 'tower'; join them with merge_classes",
+        ),
+        (ClassTable((SemanticClass(1, "a", (1, 2, 3), ()),), (), ((1, 2, 3),)), "#010203 means 'a' and is ignored"),
+        (
+            ClassTable((SemanticClass(1, "a", (1, 2, 3), (), ()),)),
+            "no class has one; give every class",
+        ),
+    ],
+)
+def test_colours_that_tell_no_classes_apart_are_refused_when_they_are_needed(table, sentence):
+    lookup = LabelLookup(table)
+    assert lookup.class_ids(np.array([255], np.uint8), "here").tolist() == [0]
+    for is_lossy in (False, True):
+        with pytest.raises(ConfigError, match=sentence):
+            lookup.class_ids_of_colors(np.zeros((1, 3), np.uint8), "here", is_lossy=is_lossy)
+
+
+def test_strict_refuses_unknown_colours_but_not_what_compression_made():
+    lookup = LabelLookup(COLORS, strict=True)
+    image = np.array([(200, 100, 0), (1, 10, 171)], np.uint8)
+    with pytest.raises(InputError, match=r"^here: colour #010aab is not in the class table; add it to a class's"):
+        lookup.class_ids_of_colors(image, "here", is_lossy=False)
+    assert lookup.class_ids_of_colors(image, "here", is_lossy=True).tolist() == [1, 0]
+    assert lookup.unknown_colors == {0x0000A0: 1}
+
+
+def test_colours_of_a_label_info_are_made_up():
+    table = class_table_from_names({"a": {1: "ground", 2: "tree"}})
+    assert [item.raw_colors for item in table.classes] == [(), ()]

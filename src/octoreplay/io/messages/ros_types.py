@@ -110,8 +110,23 @@ def message(type_name: str, **fields: Any) -> Any:
 
 
 def stamp_to_ns(stamp: Any) -> int:
-    """Nanoseconds of a builtin_interfaces/Time (ROS 2) or time (ROS 1)."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    """Nanoseconds of a builtin_interfaces/Time (ROS 2), time (ROS 1) or google.protobuf.Timestamp, or a JSON time.
+
+    Raises AttributeError, TypeError or ValueError where it is none of them, or more than 64 bits hold.
+    """
+    if hasattr(stamp, "nanosec"):
+        seconds, nanoseconds = stamp.sec, stamp.nanosec
+    elif hasattr(stamp, "nanos"):
+        seconds, nanoseconds = stamp.seconds, stamp.nanos
+    else:
+        seconds, nanoseconds = stamp.sec, stamp.nsec
+    try:
+        stamp_ns = int(seconds) * 1_000_000_000 + int(nanoseconds)
+    except OverflowError as error:
+        raise ValueError("an infinite time") from error
+    if abs(stamp_ns) >= 1 << 63:
+        raise ValueError("a time beyond 64 bits")
+    return stamp_ns
 
 
 def time_message(stamp_ns: int) -> Any:

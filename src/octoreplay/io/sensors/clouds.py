@@ -1,70 +1,134 @@
-"""PointCloud2 messages to points and raw labels."""
+"""Point clouds and laser scans to points, raw labels and confidences."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import DamagedMessageError
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.messages.sensor_messages import Cloud, CloudField, Scan
+from octoreplay.io.sensors.images import MAX_PIXELS, confidences
+from octoreplay.records import BoolArray, Int64Array, UInt8Array
 
-LABEL_FIELDS = ("label", "labels", "semantic", "semantic_label", "semantic_id", "class", "class_id", "category")
-"""Fields that are taken as a point's raw label, the first that is there."""
+LABEL_FIELDS = (
+    "label", "labels", "semantic", "semantic_label", "semantic_id", "class", "class_id", "category", "semantic_color",
+)  # fmt: skip
+"""Fields that are taken as a point's raw label, the first that is there; colours are palette entries."""
 
-# sensor_msgs/PointField: datatype number to element type.
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+COLOR_FIELDS = ("rgb", "rgba", "semantic_color")
+"""Packed colours: four bytes blue, green, red and alpha, as an integer or in the bits of a float (PCL)."""
+
+CONFIDENCE_FIELDS = ("confidence", "label_confidence", "semantic_confidence", "probability", "prob", "conf")
+"""Fields that are taken as how sure a point's label is, the first that is there."""
+
+# Labels written as floats beyond this are no labels.
+_LABEL_LIMIT = 1 << 53
 
 
-def label_field(cloud: Any) -> str | None:
-    """The name of the field that holds the labels of a sensor_msgs/PointCloud2, or None."""
-    names = {field.name for field in cloud.fields}
-    return next((name for name in LABEL_FIELDS if name in names), None)
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points (P, 3) float32 or float64 in the sensor's frame [m], and what is known of each of them.
 
-
-def decode_cloud(cloud: Any, where: str) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64] | None]:
-    """The points (P, 3) of a sensor_msgs/PointCloud2 and their raw labels (P,) int64, None without a label field.
-
-    Points are float32 or float64 as in the message, in the sensor's frame, metres; rows that are not finite are left
-    out, and so are points at the sensor itself, which is how lidars write 'no return'. ``where`` begins the errors.
-    Raises InputError where x, y or z is missing or of no float type, DamagedMessageError where there are fewer bytes
-    than the size says.
+    ``labels`` are raw labels (P,) int64, or colours (P, 3) uint8 red, green, blue; ``confidences`` (P,) uint8 in
+    255ths; None where the message has none.
     """
-    grid = {name: _column(cloud, name, where) for name in ("x", "y", "z")}
-    kinds = {column.dtype.str[1:] for column in grid.values()}
-    if not kinds <= {"f4", "f8"}:
-        raise InputError(f"{where}: the fields x, y and z must be float32 or float64")
-    dtype = np.float64 if "f8" in kinds else np.float32
-    points = np.empty((cloud.height * cloud.width, 3), dtype=dtype)
-    for axis, column in enumerate(grid.values()):
-        points[:, axis] = column.reshape(-1)
-    usable = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    are_all = bool(usable.all())
-    name = label_field(cloud)
-    labels = None
-    if name is not None:
-        raw = _column(cloud, name, where).reshape(-1)
-        raw = raw if are_all else raw[usable]
-        labels = np.nan_to_num(raw, nan=-1.0, posinf=-1.0, neginf=-1.0).astype(np.int64)
-    return (points if are_all else points[usable]), labels
+
+    points: npt.NDArray[Any]
+    labels: Int64Array | UInt8Array | None = None
+    confidences: UInt8Array | None = None
 
 
-def _column(cloud: Any, name: str, where: str) -> npt.NDArray[Any]:
-    """One field of all points: a view (height, width)."""
-    field = next((f for f in cloud.fields if f.name == name), None)
-    if field is None or field.datatype not in _FIELD_TYPES or field.count > 1:
-        present = ", ".join(f.name for f in cloud.fields)
-        raise InputError(f"{where}: the point cloud has no usable field '{name}'; its fields are {present}")
-    dtype = np.dtype((">" if cloud.is_bigendian else "<") + _FIELD_TYPES[field.datatype])
-    height, width = int(cloud.height), int(cloud.width)
-    row_step = int(cloud.row_step) or width * int(cloud.point_step)
-    needed = (height - 1) * row_step + width * int(cloud.point_step) if height * width else 0
-    if len(cloud.data) < needed or field.offset + dtype.itemsize > cloud.point_step:
+def label_field(names: Iterable[str], wanted: str | None = None) -> str | None:
+    """Which of a cloud's fields holds its labels: the wanted one, else the first of LABEL_FIELDS; None without any."""
+    there = set(names)
+    return next((name for name in ((wanted,) if wanted else LABEL_FIELDS) if name in there), None)
+
+
+def decode_cloud(
+    cloud: Cloud, where: str, *, wanted_labels: str | None = None, wanted_confidences: str | None = None
+) -> Points:
+    """The points of a cloud in its own frame, with labels and confidences where it has them.
+
+    Points without a finite place are left out, and so are points at the sensor itself, which is how lidars write 'no
+    return'. ``where`` begins the errors. Raises InputError where x, y, z or a wanted field is missing,
+    DamagedMessageError where there are fewer bytes than the size says.
+    """
+    fields = {field.name: field for field in cloud.fields if field.kind and field.count == 1}
+    label = label_field(fields, wanted_labels)
+    confidence = label_field(fields, wanted_confidences) if wanted_confidences else _first(CONFIDENCE_FIELDS, fields)
+    for wanted, found in ((wanted_labels, label), (wanted_confidences, confidence), *((name, name) for name in "xyz")):
+        if wanted and found not in fields:
+            there = ", ".join(field.name for field in cloud.fields)
+            raise InputError(f"{where}: the point cloud has no usable field '{wanted}'; its fields are {there}")
+    columns = [_column(cloud, fields[name], where) for name in "xyz"]
+    narrow = all(column.dtype.str[1:] == "f4" for column in columns)
+    points = np.empty((columns[0].size, 3), dtype=np.float32 if narrow else np.float64)
+    with np.errstate(invalid="ignore"):
+        for axis, column in enumerate(columns):
+            points[:, axis] = column
+    usable = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
+    keep: slice | BoolArray = slice(None) if bool(usable.all()) else usable
+    return Points(
+        points[keep],
+        None if label is None else _labels(cloud, fields[label], where, keep),
+        None if confidence is None else confidences(_column(cloud, fields[confidence], where)[keep]),
+    )
+
+
+def decode_scan(scan: Scan) -> Points:
+    """The points of a planar scan in its own frame: range x (cos angle, sin angle, 0), where that is in the limits.
+
+    Source: sensor_msgs/LaserScan. Ranges that are NaN, infinite or out of the limits carry no information.
+    """
+    ranges = scan.ranges
+    angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size)
+    good = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges <= scan.range_max) & (ranges > 0.0)
+    ranges, angles = ranges[good], angles[good]
+    flat = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), np.zeros(ranges.size)], axis=1)
+    return Points(flat)
+
+
+def _first(names: Iterable[str], there: Iterable[str]) -> str | None:
+    return next((name for name in names if name in set(there)), None)
+
+
+def _labels(cloud: Cloud, field: CloudField, where: str, keep: slice | BoolArray) -> Int64Array | UInt8Array:
+    """Raw labels (P,) int64 of a field, or the colours (P, 3) that it packs."""
+    if field.name not in COLOR_FIELDS:
+        raw = _column(cloud, field, where)[keep]
+        if raw.dtype.kind != "f":
+            return raw.astype(np.int64)
+        # What no label can be, NaN too, is what a signed image writes for none.
+        return np.where(np.abs(raw) < _LABEL_LIMIT, raw, -1).astype(np.int64)
+    packed = np.ascontiguousarray(_column(cloud, field, where)[keep])
+    if packed.dtype.itemsize != 4:
+        raise InputError(f"{where}: the field '{field.name}' packs colours and must have four bytes")
+    bits = packed.astype(packed.dtype.newbyteorder("=")).view(np.uint32)
+    return np.stack([(bits >> shift & 0xFF).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
+
+
+def _column(cloud: Cloud, field: CloudField, where: str) -> npt.NDArray[Any]:
+    """One field of all points, (P,), row by row."""
+    dtype = np.dtype((">" if cloud.is_big_endian else "<") + field.kind)
+    height, width = cloud.height, cloud.width
+    row_step = cloud.row_step or width * cloud.point_step
+    needed = (height - 1) * row_step + width * cloud.point_step if height * width else 0
+    fits = field.offset >= 0 and field.offset + dtype.itemsize <= cloud.point_step
+    # Rows that overlap would be more points than bytes.
+    fits = fits and (height < 2 or row_step >= width * cloud.point_step)
+    if min(height, width) < 0 or len(cloud.data) < needed or (height * width and not fits):
         raise DamagedMessageError(
             f"{where}: the cloud holds {len(cloud.data)} bytes, but {height} rows of {width} points of "
             f"{cloud.point_step} bytes are announced"
         )
-    if height * width == 0:
-        return np.empty((0, 0), dtype)
-    return np.ndarray((height, width), dtype, cloud.data, int(field.offset), (row_step, int(cloud.point_step)))
+    if height * width > MAX_PIXELS:
+        raise InputError(f"{where}: a cloud of {height * width} points is too large; {MAX_PIXELS} can be read")
+    if not needed:
+        return np.empty(0, dtype)
+    strides = (row_step, cloud.point_step)
+    return np.ndarray((height, width), dtype, cloud.data, field.offset, strides).reshape(-1)

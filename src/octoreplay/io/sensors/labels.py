@@ -1,4 +1,4 @@
-"""Raw labels to class ids, and class tables from the LabelInfo messages of a team."""
+"""Raw labels and colours to class ids, and class tables from the LabelInfo messages of a team."""
 
 from __future__ import annotations
 
@@ -8,29 +8,37 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay.class_tables.label_rows import UNLABELLED_NAMES
 from octoreplay.config import PALETTE
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.records import NO_CLASS, ClassTable, SemanticClass, UInt8Array
+from octoreplay.io.sensors.images import LabelImage
+from octoreplay.records import NO_CLASS, ClassTable, Color, Int64Array, SemanticClass, UInt8Array
 
 UNLABELLED = (255, 65535)
 """Raw labels that are ignored unless the class table names them (8 and 16 bit)."""
 
-UNLABELLED_NAMES = frozenset({"unlabeled", "unlabelled", "unknown", "ignore", "ignored", "void", "invalid"})
-"""Class names of a LabelInfo that mean 'no usable label'."""
-
 OCCUPIED = ClassTable((SemanticClass(1, "occupied", PALETTE[0], ()),))
 """The class table of a team without labels: plain occupancy."""
 
-_MAX_CLASSES = 254
+LOSSY_DISTANCE = 40
+"""A colour that compression changed is taken for the nearest of the table up to here (Euclidean, of 255).
+
+JPEG moves a flat colour by a few steps, and next to an edge by tens; what is further away is a mixture.
+"""
+
 # Not a class id, since there are at most 254 classes: marks raw labels that the table does not know.
 _UNKNOWN = 255
 _LUT_SIZE = 1 << 16
+_BLACK = (0, 0, 0)
+# So many unknown colours are counted one by one; a photograph in place of labels would have millions.
+_MAX_COUNTED_COLORS = 4096
 
 
 class LabelLookup:
-    """Raw labels to class ids by a class table; counts the raw labels that the table does not know."""
+    """Raw labels and colours to class ids by a class table; counts those that the table does not know."""
 
     def __init__(self, table: ClassTable, *, strict: bool = False) -> None:
+        self._table = table
         self._strict = strict
         self._meaning = dict.fromkeys((*UNLABELLED, *table.ignored_raw_labels), NO_CLASS)
         # A raw -1 is how a signed image writes 65535.
@@ -42,7 +50,24 @@ class LabelLookup:
             if 0 <= raw < _LUT_SIZE:
                 self._lut[raw] = class_id
         self._bytes = self._lut[:256].tobytes()
+        self._color_luts: dict[bool, UInt8Array] = {}
         self.unknown: dict[int, int] = {}
+        self.unknown_colors: dict[int, int] = {}
+
+    @property
+    def num_classes(self) -> int:
+        """C, the number of classes that labels can mean."""
+        return self._table.num_classes
+
+    def of_image(self, image: LabelImage, where: str) -> UInt8Array:
+        """The class ids (H, W) of a label image; see ``class_ids`` and ``class_ids_of_colors``."""
+        if image.is_color:
+            return self.class_ids_of_colors(image.pixels, where, is_lossy=image.is_lossy)
+        return self.class_ids(image.pixels, where)
+
+    def of_points(self, raw: Int64Array | UInt8Array, where: str) -> UInt8Array:
+        """The class ids (P,) of points' raw labels (P,), or of the colours (P, 3) that mean them."""
+        return self.class_ids_of_colors(raw, where, is_lossy=False) if raw.ndim == 2 else self.class_ids(raw, where)
 
     def class_ids(self, raw: npt.NDArray[Any], where: str) -> UInt8Array:
         """The class ids of raw labels, an array of the same shape: 1..C, or NO_CLASS where ignored or unknown.
@@ -50,6 +75,7 @@ class LabelLookup:
         ``raw`` holds integers of any type. Unknown ones are counted in ``unknown`` (raw label to number).
         Raises InputError for an unknown label where the lookup is strict; ``where`` begins it.
         """
+        class_ids: UInt8Array
         if raw.dtype == np.uint8:
             # bytearray.translate is several times faster than numpy's indexing, and its result can be written to.
             mapped = np.frombuffer(bytearray(np.ascontiguousarray(raw)).translate(self._bytes), dtype=np.uint8)
@@ -62,13 +88,54 @@ class LabelLookup:
             self._count_unknown(raw, class_ids, where)
         return class_ids
 
+    def class_ids_of_colors(self, rgb: npt.NDArray[Any], where: str, *, is_lossy: bool) -> UInt8Array:
+        """The class ids of colours (..., 3) uint8, an array of the leading shape: 1..C, or NO_CLASS.
+
+        Where ``is_lossy`` (JPEG), a colour is the table's colour that it is nearer to than half the way to that one's
+        nearest neighbour, and not further from than ``LOSSY_DISTANCE``. Colours that the table does not know are
+        counted in ``unknown_colors`` (0xRRGGBB to number; where they are many or lossy, rounded down to multiples of
+        16). Raises ConfigError where the table's colours do not tell its classes apart, InputError for an unknown
+        colour where the lookup is strict and the image not lossy; ``where`` begins it.
+        """
+        if is_lossy not in self._color_luts:
+            self._color_luts[is_lossy] = _color_lut(_meaning_of_colors(self._table), is_lossy=is_lossy)
+        # Four bytes are one number: r + 256 g + 65536 b.
+        padded = np.zeros((*rgb.shape[:-1], 4), dtype=np.uint8)
+        padded[..., :3] = rgb
+        class_ids: UInt8Array = self._color_luts[is_lossy].take(padded.view("<u4")[..., 0])
+        if class_ids.size and class_ids.max() == _UNKNOWN:
+            self._count_unknown_colors(rgb, class_ids, where, is_lossy=is_lossy)
+        return class_ids
+
+    def _count_unknown_colors(
+        self, rgb: npt.NDArray[Any], class_ids: UInt8Array, where: str, *, is_lossy: bool
+    ) -> None:
+        """Count the unknown colours and give them no class."""
+        is_unknown = class_ids == _UNKNOWN
+        keys = rgb[is_unknown].astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
+        if self._strict and not is_lossy:
+            raise InputError(
+                f"{where}: colour #{int(keys[0]):06x} is not in the class table; "
+                f"add it to a class's 'raw_colors' or to 'ignored_raw_colors'"
+            )
+        values, counts = np.unique(keys, return_counts=True)
+        if is_lossy or len(values) + len(self.unknown_colors) > _MAX_COUNTED_COLORS:
+            values = values & 0xF0F0F0
+        for value, count in zip(values.tolist(), counts.tolist(), strict=True):
+            self.unknown_colors[value] = self.unknown_colors.get(value, 0) + count
+        class_ids[is_unknown] = NO_CLASS
+
     def _of_any_integer(self, raw: npt.NDArray[Any]) -> UInt8Array:
         """Class ids of signed or wide integers, which may lie outside the table."""
         if raw.size and raw.min() >= 0 and raw.max() < _LUT_SIZE:
             return self._lut.take(raw)
         values, inverse = np.unique(raw, return_inverse=True)
-        of_value = np.array([self._meaning.get(int(value), _UNKNOWN) for value in values], dtype=np.uint8)
+        of_value = np.array([self._of_integer(int(value)) for value in values], dtype=np.uint8)
         return of_value.take(inverse).reshape(raw.shape)
+
+    def _of_integer(self, value: int) -> int:
+        """The class id of one number; above 16 bits, which no table uses, are instances (SemanticKITTI)."""
+        return self._meaning.get(value, self._meaning.get(value & 0xFFFF, _UNKNOWN) if value > 0xFFFF else _UNKNOWN)
 
     def _count_unknown(self, raw: npt.NDArray[Any], class_ids: UInt8Array, where: str) -> None:
         """Count the unknown raw labels and give them no class."""
@@ -84,17 +151,68 @@ class LabelLookup:
         class_ids[is_unknown] = NO_CLASS
 
 
-def label_names(info: Any) -> dict[int, str]:
-    """Raw label to class name of a vision_msgs/LabelInfo."""
-    return {int(entry.class_id): str(entry.class_name) for entry in info.class_map}
+def _meaning_of_colors(table: ClassTable) -> dict[Color, int]:
+    """The class id of every colour that a table knows. Raises ConfigError where a colour has two meanings, or none."""
+    owners: dict[Color, str] = {}
+    meaning: dict[Color, int] = {}
+    for item in table.classes:
+        for color in item.raw_colors:
+            if color in owners:
+                raise ConfigError(
+                    f"the labels are colours, but {_hex(color)} means both '{owners[color]}' and '{item.name}'; join "
+                    f"them with merge_classes, or give their raw_colors"
+                )
+            owners[color], meaning[color] = item.name, item.class_id
+    for color in table.ignored_raw_colors:
+        if color in owners:
+            raise ConfigError(
+                f"the labels are colours, but {_hex(color)} means '{owners[color]}' and is ignored; ignore that class "
+                f"too, or take the colour out of its raw_colors"
+            )
+    if not meaning:
+        raise ConfigError("the labels are colours, but no class has one; give every class its 'raw_colors'")
+    return {_BLACK: NO_CLASS, **dict.fromkeys(table.ignored_raw_colors, NO_CLASS), **meaning}
+
+
+def _hex(color: Color) -> str:
+    """A colour as #rrggbb."""
+    return "#" + bytes(color).hex()
+
+
+def _color_lut(meaning: Mapping[Color, int], *, is_lossy: bool) -> UInt8Array:
+    """The class id of every colour there is, at r + 256 g + 65536 b: (2^24,) uint8."""
+    colors = np.array(list(meaning), dtype=np.int64)
+    cube = np.full((256, 256, 256), _UNKNOWN, dtype=np.uint8)
+    for color, class_id in zip(colors, meaning.values(), strict=True):
+        if is_lossy:
+            _fill_ball(cube, color, _least_square(color, colors), class_id)
+        b, g, r = color[::-1]
+        cube[b, g, r] = class_id
+    return cube.reshape(-1)
+
+
+def _least_square(color: Int64Array, colors: Int64Array) -> float:
+    """The squared distance of a colour to the nearest other one; infinite where there is none."""
+    steps = (colors - color).astype(np.float64)
+    squares = np.einsum("ij,ij->i", steps, steps)
+    return float(np.min(squares[squares > 0], initial=np.inf))
+
+
+def _fill_ball(cube: UInt8Array, color: Int64Array, least_square: float, class_id: int) -> None:
+    """Set the colours that are nearer to one than half of the way to its neighbour, so that no two balls touch."""
+    low, high = np.maximum(color - LOSSY_DISTANCE, 0), np.minimum(color + LOSSY_DISTANCE, 255) + 1
+    r, g, b = (np.arange(low[i], high[i]) - color[i] for i in range(3))
+    squares = b[:, None, None] ** 2 + g[:, None] ** 2 + r**2
+    is_near = (4 * squares < least_square) & (squares <= LOSSY_DISTANCE**2)
+    cube[low[2] : high[2], low[1] : high[1], low[0] : high[0]][is_near] = class_id
 
 
 def class_table_from_names(names_of_robots: Mapping[str, Mapping[int, str]]) -> ClassTable:
     """The class table of a team from each robot's raw label names: classes are united by name.
 
     Classes are numbered in the order in which the robots, and in each the raw labels, name them first. Names such as
-    'unlabeled', and the raw labels 255 and 65535, are ignored. Raises ConfigError where robots give one raw label two
-    names, where nothing is named, or where there are too many classes.
+    'unlabeled', and the raw labels 255 and 65535, are ignored. Their colours are made up, so no colour in an image
+    means them. Raises ConfigError where robots give one raw label two names, or where nothing is named.
     """
     meaning: dict[int, tuple[str, str]] = {}
     raw_labels: dict[str, list[int]] = {}
@@ -118,13 +236,11 @@ def class_table_from_names(names_of_robots: Mapping[str, Mapping[int, str]]) -> 
             f"raw label {clash[0]} is '{meaning[clash[0]][1]}' for robot '{meaning[clash[0]][0]}' and unlabelled for "
             f"another; give one class table under 'classes' in the team file"
         )
-    if not 1 <= len(raw_labels) <= _MAX_CLASSES:
-        raise ConfigError(
-            f"the logs' LabelInfo names {len(raw_labels)} classes; between 1 and {_MAX_CLASSES} are needed"
-        )
+    if not raw_labels:
+        raise ConfigError("the logs' LabelInfo names no class; give 'classes' in the team file")
     return ClassTable(
         tuple(
-            SemanticClass(index + 1, name, PALETTE[index % len(PALETTE)], tuple(sorted(raws)))
+            SemanticClass(index + 1, name, PALETTE[index % len(PALETTE)], tuple(sorted(raws)), ())
             for index, (name, raws) in enumerate(raw_labels.items())
         ),
         tuple(sorted(ignored)),

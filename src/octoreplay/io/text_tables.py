@@ -1,0 +1,64 @@
+"""Text tables: words, numbers, times and matrices, with the file and line in every error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from octoreplay.errors import InputError
+from octoreplay.records import Float64Array
+
+_MAX_SECONDS = 1 << 32
+
+
+def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The rows of a text table as words, with 'file line N' for messages; comments and empty lines are left out.
+
+    Raises InputError where the file cannot be read or is no text.
+    """
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if fields:
+            yield f"{path} line {number}", fields
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file") from error
+
+
+def floats(where: str, fields: list[str]) -> list[float]:
+    """Numbers from words. Raises InputError, begun by ``where``."""
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        raise InputError(f"{where}: expects numbers, got '{' '.join(fields)}'") from None
+
+
+def seconds_to_ns(where: str, text: str) -> int:
+    """Integer nanoseconds of a decimal number of seconds, without going through a float. Raises InputError."""
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        seconds = Decimal("nan")
+    # Checked before it is multiplied: an exponent may have millions.
+    if not seconds.is_finite() or seconds.copy_abs() >= _MAX_SECONDS:
+        raise InputError(f"{where}: '{text}' is not a time in seconds")
+    return int((seconds * 1_000_000_000).to_integral_value())
+
+
+def read_matrix(path: Path, shapes: tuple[int, ...]) -> Float64Array:
+    """A square matrix of one of these sizes, (n, n) float64, from a text file. Raises InputError."""
+    values = [value for where, fields in rows(path) for value in floats(where, fields)]
+    for n in shapes:
+        if len(values) == n * n:
+            return np.array(values).reshape(n, n)
+    expected = " or ".join(f"{n}x{n}" for n in shapes)
+    raise InputError(f"{path}: expects a {expected} matrix, got {len(values)} numbers")
