@@ -1,106 +1,123 @@
-"""ROS 1 bags and rosbag2 recordings (sqlite3 files, folders with metadata.yaml), read by rosbags."""
+"""ROS 1 bags, whole, cut or damaged: an index of chunks, and lazy reading in log-time order.
+
+The index comes from the records at the bag's end, else from one pass over the file. Format:
+http://wiki.ros.org/Bags/Format/2.0
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Collection, Iterator
-from pathlib import Path
-from typing import Any
-
-from rosbags.interfaces import Connection, MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Rosbag1Reader
-from rosbags.rosbag1 import ReaderError as Rosbag1ReaderError
-from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2 import ReaderError as Rosbag2ReaderError
+from typing import IO
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, TopicInfo, normalise_type_name
+from octoreplay.io.containers.bag_pass import CUT_CHUNK, BagPass
+from octoreplay.io.containers.bag_records import (
+    CHUNK_INFO,
+    CONNECTION,
+    MAGIC,
+    RecordHead,
+    channel_of,
+    cut_records,
+    read_head,
+    walk_messages,
+    whole_records,
+)  # fmt: skip
+from octoreplay.io.containers.block_log import Block, BlockLog, Entry, Index
+from octoreplay.io.messages.decoders import Bytes
 
-_FORMATS = {
-    MessageDefinitionFormat.NONE: "",
-    MessageDefinitionFormat.MSG: "ros2msg",
-    MessageDefinitionFormat.IDL: "ros2idl",
-}
+_TIME = struct.Struct("<II")
+_COUNT = struct.Struct("<II")
 
 
-class BagLog(LogReader):
-    """A recording that rosbags reads. Raises InputError where it cannot be opened."""
+class BagLog(BlockLog):
+    """A ROS 1 bag. A damaged one gives everything that is whole, and ``damage`` says what was skipped.
 
-    def __init__(self, path: Path, *, is_ros1: bool) -> None:
-        super().__init__(path)
-        self._is_ros1 = is_ros1
-        self._reader: Any = None
-        try:
-            self._reader = Rosbag1Reader(path) if is_ros1 else Rosbag2Reader(path)
-            self._reader.open()
-        except (Rosbag1ReaderError, Rosbag2ReaderError, OSError) as error:
-            self._reader = None
-            raise InputError(f"{path}: cannot be read: {str(error).rstrip('.')}") from error
-        except Exception as error:
-            # On a damaged index rosbags lets whatever its parsers raise through, bare AssertionErrors included.
-            self._reader = None
-            raise InputError(f"{path}: cannot be read: the recording's index is damaged") from error
-        self._connections: list[Connection] = list(self._reader.connections)
-        self._channels = {(id(c.owner), c.id): self._channel(c) for c in self._connections}
+    Raises InputError where the file cannot be opened, is encrypted, or holds neither an index nor a whole message.
+    """
 
-    @property
-    def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics, sorted by name and type."""
-        groups: dict[tuple[str, str, str], list[Connection]] = {}
-        for connection in self._connections:
-            channel = self._channels[id(connection.owner), connection.id]
-            groups.setdefault((channel.topic, channel.type_name, channel.encoding), []).append(connection)
-        return tuple(
-            TopicInfo(*key, sum(c.msgcount for c in group), tuple(c.id for c in group))
-            for key, group in sorted(groups.items())
-        )
+    def _read_index(self) -> Index:
+        """The index: from the records at the end, else from one pass over the file."""
+        header = read_head(self._file, len(MAGIC), self._size)
+        if header is not None and header.fields.get("encryptor"):
+            raise InputError(f"{self.path}: cannot be read: the bag is encrypted")
+        index = _index_from_end(self._file, self._size)
+        if index is not None:
+            return index
+        index = BagPass(self._file, self._size, self._damage).index()
+        if not index.blocks:
+            raise InputError(f"{self.path}: cannot be read: the bag has no index and holds no whole message")
+        return index
 
-    @property
-    def start_ns(self) -> int | None:
-        """Log time of the first message; None in a log without messages."""
-        return int(self._reader.start_time) if self.message_count else None
-
-    @property
-    def end_ns(self) -> int | None:
-        """Log time of the last message; None in a log without messages."""
-        # rosbags gives the first nanosecond after the last message.
-        return int(self._reader.end_time) - 1 if self.message_count else None
-
-    @property
-    def message_count(self) -> int:
-        """Messages of all topics."""
-        return sum(connection.msgcount for connection in self._connections)
-
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            reader.close()
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the file."""
-        connections = [c for c in self._connections if c.topic in topics and c.msgcount]
-        if not connections:
+    def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
+        """The messages of the wanted connections in a chunk."""
+        records = self._records(block)
+        if records is None:
+            self._damage.skip("chunk", block.offset, block.num_messages)
             return
-        iterator = self._reader.messages(connections=connections)
-        while True:
-            try:
-                connection, log_time_ns, data = next(iterator)
-            except StopIteration:
-                return
-            except Exception:
-                # See __init__: a damaged page or chunk can raise anything.
-                self._note_damage("damaged or cut; everything whole before the damage is used")
-                return
-            channel = self._channels[id(connection.owner), connection.id]
-            yield RawMessage(self.path, channel, int(log_time_ns), data)
+        count = 0
+        for channel_id, log_time_ns, start, end in walk_messages(records):
+            count += 1
+            if channel_id in wanted:
+                yield log_time_ns, block.offset, start, end, channel_id, records
+        if block.num_messages is not None and count < block.num_messages:
+            self._damage.skip("part", block.offset, block.num_messages - count)
 
-    def _channel(self, connection: Connection) -> Channel:
-        """A connection's topic, type and definition."""
-        encoding = "ros1" if self._is_ros1 else str(getattr(connection.ext, "serialization_format", "cdr"))
-        return Channel(
-            connection.topic,
-            normalise_type_name(connection.msgtype),
-            encoding,
-            _FORMATS[connection.msgdef.format],
-            connection.msgdef.data,
-        )
+    def _records(self, block: Block) -> Bytes | None:
+        """The records in a chunk; None where they cannot be read."""
+        try:
+            head = read_head(self._file, block.offset, block.offset + block.length)
+        except OSError:
+            return None
+        if head is None:
+            return None
+        if block.form == CUT_CHUNK:
+            return cut_records(head, self._bytes_at(head.start, block.offset + block.length - head.start))
+        if head.end > block.offset + block.length:
+            return None
+        return whole_records(head, self._bytes_at(head.start, head.length))
+
+
+def _index_from_end(file: IO[bytes], size: int) -> Index | None:
+    """The index that the records at the end hold; None where they are missing or damaged."""
+    header = read_head(file, len(MAGIC), size)
+    if header is None or not len(MAGIC) < header.number("index_pos") <= size:
+        return None
+    index, infos = Index(), []
+    position = end = header.number("index_pos")
+    while position < size:
+        head = read_head(file, position, size)
+        if head is None or head.end > size or head.operation not in (CONNECTION, CHUNK_INFO):
+            return None
+        data = file.read(head.length)
+        if head.operation == CHUNK_INFO:
+            infos.append((head, data))
+        elif (channel := channel_of(head.fields, data)) is not None:
+            index.channels[head.number("conn")] = channel
+        position = head.end
+    if (len(index.channels), len(infos)) != (header.number("conn_count"), header.number("chunk_count")):
+        return None
+    # A chunk ends before the next one begins, or a file could be read any number of times.
+    infos.sort(key=lambda info: info[0].number("chunk_pos"))
+    ends = [head.number("chunk_pos") for head, _ in infos[1:]] + [end]
+    is_good = all(_take_info(index, head, data, end) for (head, data), end in zip(infos, ends, strict=False))
+    return index if is_good else None
+
+
+def _take_info(index: Index, head: RecordHead, data: bytes, end: int) -> bool:
+    """Take what a chunk info record says of a chunk before a byte; False where it is damaged."""
+    position, times = head.number("chunk_pos"), [head.fields.get(name, b"") for name in ("start_time", "end_time")]
+    if len(data) != _COUNT.size * head.number("count") or not len(MAGIC) <= position < end:
+        return False
+    if any(len(time) != _TIME.size for time in times):
+        return not data
+    start_ns, end_ns = (sec * 1_000_000_000 + nanosec for sec, nanosec in map(_TIME.unpack, times))
+    counts = dict(_COUNT.iter_unpack(data))
+    if not index.channels.keys() >= counts.keys():
+        return False
+    for channel_id, count in counts.items():
+        index.tally.add(channel_id, start_ns, count, end_ns)
+    if counts:
+        block = Block(position, end - position, start_ns, frozenset(counts), num_messages=sum(counts.values()))
+        index.blocks.append(block)
+    return True

@@ -1,8 +1,9 @@
-"""Logs that are read block by block by means of an index: what MCAP files and cut ROS 1 bags have in common."""
+"""Logs that are read block by block by means of an index: what MCAP files, ROS 1 bags and cut databases share."""
 
 from __future__ import annotations
 
 import heapq
+import io
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,7 +11,8 @@ from pathlib import Path
 from typing import IO, TypeAlias
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import Bytes, Channel, LogReader, RawMessage, TopicInfo
+from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, TopicInfo
+from octoreplay.io.messages.decoders import Bytes
 
 Entry: TypeAlias = tuple[int, int, int, int, int, Bytes]
 """(log time, block's offset, start, end, channel id, bytes that start and end count in) of one message."""
@@ -18,33 +20,87 @@ Entry: TypeAlias = tuple[int, int, int, int, int, Bytes]
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A part of a file that is read at once: where it is, when it starts, whose messages it holds (None: any).
+    """A part of a log that is read at once: where it is, when it starts, whose messages it holds (None: any).
 
-    ``form`` says how its bytes are to be read, in the words of the log that made it.
+    ``form`` says what kind of part it is, in the words of the log that made it; ``num_messages`` is None where the
+    index does not say.
     """
 
     offset: int
     length: int
-    form: str
     start_ns: int
     channel_ids: frozenset[int] | None
+    form: str = ""
+    num_messages: int | None = None
+
+
+class Tally:
+    """How many messages of which channels there are, and from when to when."""
+
+    def __init__(self) -> None:
+        self._spans: dict[int, tuple[int, int, int]] = {}
+
+    def add(self, channel_id: int, log_time_ns: int, count: int = 1, last_ns: int | None = None) -> None:
+        """Take one message, or several from a first to a last log time."""
+        last_ns = log_time_ns if last_ns is None else last_ns
+        number, start, end = self._spans.get(channel_id, (0, log_time_ns, last_ns))
+        self._spans[channel_id] = number + count, min(start, log_time_ns), max(end, last_ns)
+
+    def count(self, channel_id: int) -> int:
+        """How many messages a channel has."""
+        return self._spans.get(channel_id, (0, 0, 0))[0]
+
+    def drop_unknown(self, channels: Mapping[int, object]) -> int:
+        """Forget the messages of all other channels; returns how many they were."""
+        unknown = [self._spans.pop(i)[0] for i in tuple(self._spans) if i not in channels]
+        return sum(unknown)
+
+    @property
+    def total(self) -> int:
+        """All messages."""
+        return sum(number for number, _, _ in self._spans.values())
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message; None where there is none."""
+        return min((start for number, start, _ in self._spans.values() if number), default=None)
+
+    @property
+    def end_ns(self) -> int | None:
+        """Log time of the last message; None where there is none."""
+        return max((end for number, _, end in self._spans.values() if number), default=None)
+
+
+class BlockBuilder:
+    """Gathers what a block must say of its messages while they are walked over, and counts them."""
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self._start_ns: int | None = None
+        self._channel_ids: set[int] = set()
+        self.num_messages = 0
+
+    def add(self, channel_id: int, log_time_ns: int) -> None:
+        """Take one message."""
+        self._tally.add(channel_id, log_time_ns)
+        self._start_ns = log_time_ns if self._start_ns is None else min(self._start_ns, log_time_ns)
+        self._channel_ids.add(channel_id)
+        self.num_messages += 1
+
+    def build(self, offset: int, length: int, form: str = "") -> list[Block]:
+        """The block; none where it holds no message."""
+        if self._start_ns is None:
+            return []
+        return [Block(offset, length, self._start_ns, frozenset(self._channel_ids), form, self.num_messages)]
 
 
 @dataclass
 class Index:
-    """How many messages of which channels a file holds, from when to when, and in which blocks."""
+    """Which channels a log has, how many messages of each, and in which blocks."""
 
-    counts: dict[int, int] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    tally: Tally = field(default_factory=Tally)
     blocks: list[Block] = field(default_factory=list)
-    start_ns: int | None = None
-    end_ns: int | None = None
-    damage: str | None = None
-
-    def count(self, channel_id: int, log_time_ns: int) -> None:
-        """Take one message into the counts and the span."""
-        self.counts[channel_id] = self.counts.get(channel_id, 0) + 1
-        self.start_ns = log_time_ns if self.start_ns is None else min(self.start_ns, log_time_ns)
-        self.end_ns = log_time_ns if self.end_ns is None else max(self.end_ns, log_time_ns)
 
 
 class BlockLog(LogReader):
@@ -57,38 +113,41 @@ class BlockLog(LogReader):
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         try:
-            self._index, self._channels = self._read_index()
+            self._size = self._file.seek(0, io.SEEK_END)
+            self._file.seek(0)
+            self._index = self._read_index()
+        except OSError as error:
+            self._file.close()
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         except BaseException:
             self._file.close()
             raise
-        if self._index.damage is not None:
-            self._note_damage(self._index.damage)
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """The topics, sorted by name and type."""
         groups: dict[tuple[str, str, str], list[int]] = {}
-        for channel_id, channel in sorted(self._channels.items()):
+        for channel_id, channel in sorted(self._index.channels.items()):
             groups.setdefault((channel.topic, channel.type_name, channel.encoding), []).append(channel_id)
         return tuple(
-            TopicInfo(*key, sum(self._index.counts.get(i, 0) for i in channel_ids), tuple(channel_ids))
+            TopicInfo(*key, sum(self._index.tally.count(i) for i in channel_ids), tuple(channel_ids))
             for key, channel_ids in sorted(groups.items())
         )
 
     @property
     def start_ns(self) -> int | None:
         """Log time of the first message; None in a log without messages."""
-        return self._index.start_ns
+        return self._index.tally.start_ns
 
     @property
     def end_ns(self) -> int | None:
         """Log time of the last message; None in a log without messages."""
-        return self._index.end_ns
+        return self._index.tally.end_ns
 
     @property
     def message_count(self) -> int:
         """Messages of all topics."""
-        return sum(self._index.counts.values())
+        return self._index.tally.total
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -99,28 +158,40 @@ class BlockLog(LogReader):
 
         Only blocks that hold such messages are read. A damaged block is left out and noted in ``damage``.
         """
-        wanted = {i: channel for i, channel in self._channels.items() if channel.topic in topics}
+        wanted = {i: channel for i, channel in self._index.channels.items() if channel.topic in topics}
         blocks = [b for b in self._index.blocks if b.channel_ids is None or not wanted.keys().isdisjoint(b.channel_ids)]
         blocks.sort(key=lambda block: (block.start_ns, block.offset))
         pending: list[Entry] = []
         for block in blocks:
             while pending and pending[0][:2] < (block.start_ns, block.offset):
                 yield self._message(heapq.heappop(pending))
-            self._file.seek(block.offset)
-            for entry in self._read_block(block, self._file.read(block.length), wanted):
+            for entry in self._read_block(block, wanted):
                 heapq.heappush(pending, entry)
         while pending:
             yield self._message(heapq.heappop(pending))
 
     @abstractmethod
-    def _read_index(self) -> tuple[Index, Mapping[int, Channel]]:
-        """The index and the channels of the open file."""
+    def _read_index(self) -> Index:
+        """The index of the open file; notes what is damaged."""
 
     @abstractmethod
-    def _read_block(self, block: Block, data: bytes, wanted: Collection[int]) -> Iterator[Entry]:
-        """The messages of the wanted channels in a block's bytes."""
+    def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
+        """The messages of the wanted channels in a block; notes what is damaged."""
+
+    def _bytes_at(self, offset: int, length: int) -> bytes:
+        """Bytes of the file, as many as there are; none where the disk cannot read them."""
+        if offset >= self._size:
+            return b""
+        try:
+            self._file.seek(offset)
+            # A file object makes room for as much as it is asked for.
+            return self._file.read(min(length, self._size - offset))
+        except OSError:
+            return b""
 
     def _message(self, entry: Entry) -> RawMessage:
         """A message with its own copy of the bytes, which lets go of the block and aligns the arrays in it."""
         log_time_ns, _, start, end, channel_id, data = entry
-        return RawMessage(self.path, self._channels[channel_id], log_time_ns, bytearray(memoryview(data)[start:end]))
+        return RawMessage(
+            self.path, self._index.channels[channel_id], log_time_ns, bytearray(memoryview(data)[start:end])
+        )

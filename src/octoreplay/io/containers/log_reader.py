@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import logging
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, Self
 
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from octoreplay.errors import InputError, printable
+from octoreplay.io.containers.damage import Damage, damage_sentence
+from octoreplay.io.messages import decoders
+from octoreplay.io.messages.decoders import Bytes, DamagedMessageError, UndefinedTypeError
+from octoreplay.io.messages.ros_types import stamp_to_ns
+from octoreplay.io.messages.sensor_messages import Kind, SensorMessage, convert, kind_of
 
-from octoreplay.errors import InputError
-from octoreplay.io.messages.ros_types import typestore
-
-logger = logging.getLogger(__name__)
-
-Bytes: TypeAlias = bytes | bytearray | memoryview
-Decoder: TypeAlias = Callable[[Bytes], Any]
-
-DECODABLE_ENCODINGS = ("cdr", "ros1")
-"""Message encodings that ``RawMessage.decode`` understands."""
-
-
-class DamagedMessageError(InputError):
-    """One message whose bytes do not hold what its type says; the messages around it may be good."""
+# So many messages are looked at for one that is whole.
+_NUM_TRIED = 100
+# Where the stamp of a message stands in its bytes, by encoding: without a Header, and with one.
+_STAMP_OFFSETS = {"cdr": (4, 4), "ros1": (0, 4)}
 
 
 @dataclass(frozen=True)
@@ -49,29 +42,26 @@ class TopicInfo:
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """Where a message comes from: the topic, its type, and how its bytes become a message object."""
+    """Where a message comes from: the topic, its type, and the definition that its log holds of that type."""
 
     topic: str
     type_name: str
     encoding: str
     definition_format: str
-    definition: str
-
-    def decode(self, data: Bytes) -> Any:
-        """The message object of serialised bytes; raises whatever the decoder raises."""
-        return _decoder(self.type_name, self.encoding, self.definition_format, self.definition)(data)
+    definition: bytes
 
 
 class RawMessage:
     """One message as recorded: its bytes stay as they are until ``decode`` is called."""
 
-    __slots__ = ("channel", "data", "log", "log_time_ns")
+    __slots__ = ("_value", "channel", "data", "log", "log_time_ns")
 
     def __init__(self, log: Path, channel: Channel, log_time_ns: int, data: Bytes) -> None:
         self.log = log
         self.channel = channel
         self.log_time_ns = log_time_ns
         self.data = data
+        self._value: Any = None
 
     @property
     def topic(self) -> str:
@@ -86,55 +76,74 @@ class RawMessage:
     @property
     def where(self) -> str:
         """File, topic and time, as errors begin."""
-        return f"{self.log}: topic '{self.topic}' at {self.log_time_ns / 1e9:.3f} s"
+        return printable(f"{self.log}: topic '{self.topic}' at {self.log_time_ns / 1e9:.3f} s")
 
     def header_stamp_ns(self) -> int:
-        """The header's stamp in nanoseconds, read without decoding the rest; only for types that begin with a Header.
+        """The header's stamp in nanoseconds; only for types that begin with a Header, or with a time and a frame.
 
-        Raises DamagedMessageError where the bytes are too short.
+        ROS messages are not decoded for it. Raises as ``decode`` does, also where the message has no such stamp.
         """
-        # The stamp stands at byte 4 in CDR (after the encapsulation) and in ROS 1 (after the sequence number).
+        if self.channel.encoding in _STAMP_OFFSETS:
+            seconds, nanoseconds = self._peek("iI", self._header_offset)
+            return int(seconds) * 1_000_000_000 + int(nanoseconds)
+        stamp = getattr(self.decode(), "timestamp", None)
         try:
-            sec, nanosec = struct.unpack_from(">iI" if self._is_big_endian else "<iI", self.data, 4)
-        except struct.error:
-            raise DamagedMessageError(f"{self.where}: the message is too short to hold a header") from None
-        return int(sec) * 1_000_000_000 + int(nanosec)
+            return stamp_to_ns(stamp)
+        except (AttributeError, TypeError, ValueError):
+            raise DamagedMessageError(f"{self.where}: the message has no timestamp") from None
 
     def header_frame_id(self) -> str:
-        """The header's frame, read without decoding the rest; only for types that begin with a Header.
-
-        Raises DamagedMessageError where the bytes are too short.
-        """
-        try:
-            (length,) = struct.unpack_from(">I" if self._is_big_endian else "<I", self.data, 12)
-        except struct.error:
-            raise DamagedMessageError(f"{self.where}: the message is too short to hold a header") from None
+        """The header's frame; as ``header_stamp_ns`` otherwise."""
+        if self.channel.encoding not in _STAMP_OFFSETS:
+            return str(getattr(self.decode(), "frame_id", ""))
+        start = self._header_offset + 8
+        (length,) = self._peek("I", start)
         # CDR counts the zero at the string's end.
-        return bytes(self.data[16 : 16 + length]).rstrip(b"\0").decode("utf-8", "replace")
-
-    @property
-    def _is_big_endian(self) -> bool:
-        """True for CDR in big-endian order; ROS 1 is little-endian always."""
-        return self.channel.encoding == "cdr" and len(self.data) > 1 and self.data[1] == 0
+        return bytes(self.data[start + 4 : start + 4 + length]).rstrip(b"\0").decode("utf-8", "replace")
 
     def decode(self) -> Any:
         """The message as an object whose fields are named as in its definition; arrays are views of ``data``.
 
         Raises DamagedMessageError where the bytes do not fit the type, InputError for an unknown type or encoding.
         """
-        if self.channel.encoding not in DECODABLE_ENCODINGS:
-            raise InputError(
-                f"{self.where}: message encoding '{self.channel.encoding}' is not supported; "
-                f"record as ROS 2 (cdr) or ROS 1"
-            )
+        if self._value is not None:
+            return self._value
+        channel = self.channel
         try:
-            return self.channel.decode(memoryview(self.data))
-        except SerdeError as error:
-            raise DamagedMessageError(f"{self.where}: damaged {self.type_name}: {error}") from error
-        except (AssertionError, IndexError, OverflowError, MemoryError) as error:
-            raise DamagedMessageError(f"{self.where}: damaged {self.type_name}") from error
-        except (KeyError, TypesysError) as error:
-            raise InputError(f"{self.where}: the definition of type '{self.type_name}' is unknown") from error
+            value = decoders.decode(
+                self.data, channel.type_name, channel.encoding, channel.definition_format, channel.definition
+            )
+        except (DamagedMessageError, UndefinedTypeError) as error:
+            raise type(error)(f"{self.where}: {error}") from error
+        if channel.encoding not in _STAMP_OFFSETS:
+            # Its stamp cannot be read from the bytes alone, so it is decoded before it is used.
+            self._value = value
+        return value
+
+    def sensor_message(self) -> SensorMessage:
+        """The message in the form that it has whatever its schema; only for types that ``kind_of`` knows.
+
+        Raises as ``decode`` does, and DamagedMessageError where fields are missing.
+        """
+        value = self.decode()
+        try:
+            return convert(self.type_name, value)
+        except DamagedMessageError as error:
+            raise DamagedMessageError(f"{self.where}: {error}") from error
+
+    @property
+    def _header_offset(self) -> int:
+        """Where the stamp stands: after the encapsulation in CDR, after a Header's sequence number in ROS 1."""
+        has_header = not self.channel.type_name.startswith("foxglove_msgs/")
+        return _STAMP_OFFSETS[self.channel.encoding][has_header]
+
+    def _peek(self, form: str, offset: int) -> tuple[Any, ...]:
+        """Numbers at an offset of the bytes; CDR may be big-endian, ROS 1 is little-endian always."""
+        is_big_endian = self.channel.encoding == "cdr" and len(self.data) > 1 and self.data[1] == 0
+        try:
+            return struct.unpack_from((">" if is_big_endian else "<") + form, self.data, offset)
+        except struct.error:
+            raise DamagedMessageError(f"{self.where}: the message is too short to hold a header") from None
 
 
 class LogReader(ABC):
@@ -142,7 +151,7 @@ class LogReader(ABC):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._damage: str | None = None
+        self._damage = Damage()
 
     @property
     @abstractmethod
@@ -174,8 +183,16 @@ class LogReader(ABC):
 
     @property
     def damage(self) -> str | None:
-        """What is missing from a cut or damaged log, as one sentence; None for a good log (as far as it was read)."""
-        return self._damage
+        """What is missing from a cut or damaged log, as one sentence; None for a good log.
+
+        It grows while messages are read: ask for it at the end. A reader logs nothing; whoever opened it tells.
+        """
+        return damage_sentence(self.path, self.damage_clauses)
+
+    @property
+    def damage_clauses(self) -> tuple[str, ...]:
+        """The parts of that sentence, without the path."""
+        return self._damage.clauses
 
     def __enter__(self) -> Self:
         return self
@@ -185,46 +202,27 @@ class LogReader(ABC):
     ) -> None:
         self.close()
 
-    def _note_damage(self, sentence: str) -> None:
-        """Remember and log the first damage; what comes after it is a consequence."""
-        if self._damage is None:
-            self._damage = f"{self.path}: {sentence}"
-            logger.warning("%s", self._damage)
-
 
 def normalise_type_name(name: str) -> str:
     """``package/msg/Name`` of a type's name in ROS 1's short or ROS 2's long form."""
     return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
+def first_whole_message(log: LogReader, topic: str, kinds: Collection[Kind]) -> RawMessage | None:
+    """The first message of a topic that says something of some kinds and is whole; None without any of those kinds.
+
+    Where none of the first hundred is whole, it is the first.
+    """
+    found = None
+    messages = (message for message in log.messages((topic,)) if kind_of(message.type_name) in kinds)
+    for message in islice(messages, _NUM_TRIED):
+        found = found or message
+        with suppress(InputError):
+            message.sensor_message()
+            return message
+    return found
+
+
 def first_message(log: LogReader, topic: str) -> RawMessage | None:
     """The first message of a topic in log time, or None; reads no further than it."""
     return next(log.messages((topic,)), None)
-
-
-@cache
-def _decoder(type_name: str, encoding: str, definition_format: str, definition: str) -> Decoder:
-    """The decoder of a type as the log defines it, or as this package knows it where the log says nothing."""
-    store = _store(type_name, encoding, definition_format, definition)
-    deserialise = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
-    # rosbags annotates only bytes and memoryview, and takes any buffer.
-    return lambda data: deserialise(data, type_name)  # type: ignore[arg-type]
-
-
-def _store(type_name: str, encoding: str, definition_format: str, definition: str) -> Typestore:
-    """A type store that decodes one type the way the log's own definition says."""
-    known = typestore()
-    if not definition:
-        return get_typestore(Stores.ROS1_NOETIC) if encoding == "ros1" else known
-    if encoding == "cdr" and definition_format == "ros2idl" and type_name in known.fielddefs:
-        return known
-    types = (
-        get_types_from_idl(definition) if definition_format == "ros2idl" else get_types_from_msg(definition, type_name)
-    )
-    if encoding == "cdr" and all(
-        name in known.fielddefs and known.fielddefs[name][1] == fields for name, (_, fields) in types.items()
-    ):
-        return known
-    store = get_typestore(Stores.EMPTY)
-    store.register(types)
-    return store

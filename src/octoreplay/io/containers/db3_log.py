@@ -1,0 +1,168 @@
+"""rosbag2's sqlite3 files: read by rosbags, and where that fails by row number, as far as rows can be read."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader
+
+from octoreplay.errors import InputError
+from octoreplay.io.containers.damaged_db3_log import DamagedDb3Log
+from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, TopicInfo, normalise_type_name
+
+_FORMATS = {
+    MessageDefinitionFormat.NONE: "",
+    MessageDefinitionFormat.MSG: "ros2msg",
+    MessageDefinitionFormat.IDL: "ros2idl",
+}
+
+
+def open_db3(path: Path) -> LogReader:
+    """A reader of a sqlite3 recording, also of a damaged one. Raises InputError where nothing in it can be read."""
+    try:
+        return Db3Log(path)
+    except InputError as error:
+        try:
+            return DamagedDb3Log(path)
+        except InputError:
+            raise error from None
+
+
+class Db3Log(LogReader):
+    """A sqlite3 recording that rosbags reads; where it meets a damaged page, the rest is read by row number.
+
+    Raises InputError where it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._file = path
+        self._reader: Any = None
+        self._thread = threading.get_ident()
+        self._rows: DamagedDb3Log | None = None
+        try:
+            self._reader = Reader(path)
+            self._reader.open()
+            self._connections: list[Connection] = list(self._reader.connections)
+            self._channels = {c.id: _channel(c) for c in self._connections}
+            self._is_used = any(c.msgcount for c in self._connections)
+            self._span = int(self._reader.start_time), int(self._reader.end_time) - 1
+        except Exception as error:
+            # On a damaged database rosbags lets whatever its parsers raise through, bare AssertionErrors included.
+            self.close()
+            raise InputError(f"{path}: cannot be read: no rosbag2 recording, or a damaged one") from error
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """The topics, sorted by name and type."""
+        groups: dict[tuple[str, str, str], list[Connection]] = {}
+        for connection in self._connections:
+            channel = self._channels[connection.id]
+            groups.setdefault((channel.topic, channel.type_name, channel.encoding), []).append(connection)
+        return tuple(
+            TopicInfo(*key, sum(c.msgcount for c in group), tuple(c.id for c in group))
+            for key, group in sorted(groups.items())
+        )
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message; None in a log without messages."""
+        return self._span[0] if self._is_used else None
+
+    @property
+    def end_ns(self) -> int | None:
+        """Log time of the last message; None in a log without messages."""
+        return self._span[1] if self._is_used else None
+
+    @property
+    def message_count(self) -> int:
+        """Messages of all topics."""
+        return sum(connection.msgcount for connection in self._connections)
+
+    @property
+    def damage_clauses(self) -> tuple[str, ...]:
+        """What is wrong and what was skipped; empty for a good log."""
+        return self._damage.clauses if self._rows is None else self._rows.damage_clauses
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        reader, self._reader = self._reader, None
+        if reader is not None and reader.is_open:
+            reader.close()
+        if self._rows is not None:
+            self._rows.close()
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """The messages of some topics in order of log time, read lazily; ties in the order of the file."""
+        if not any(c.topic in topics and c.msgcount for c in self._connections):
+            return
+        # How many messages of which topic were given at the last log time, for going on by another way.
+        last_ns, given = -(1 << 63), dict[str, int]()
+        with self._reader_of_this_thread() as reader:
+            wanted = [c for c in reader.connections if c.topic in topics and c.msgcount]
+            iterator = reader.messages(connections=wanted)
+            while True:
+                try:
+                    connection, log_time_ns, data = next(iterator)
+                except StopIteration:
+                    return
+                except Exception:
+                    # As at opening, a damaged page can raise anything.
+                    break
+                if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
+                    break
+                if log_time_ns != last_ns:
+                    last_ns = log_time_ns
+                    given.clear()
+                given[connection.topic] = given.get(connection.topic, 0) + 1
+                yield RawMessage(self.path, self._channels[connection.id], log_time_ns, data)
+        yield from self._rest(topics, last_ns, given)
+
+    @contextmanager
+    def _reader_of_this_thread(self) -> Iterator[Any]:
+        """Rosbags' reader, another one in another thread: SQLite's connections belong to the thread that opens them."""
+        if threading.get_ident() == self._thread:
+            yield self._reader
+            return
+        reader = Reader(self._file)
+        reader.open()
+        try:
+            yield reader
+        finally:
+            # Left by a generator that nobody reads on, perhaps in yet another thread.
+            with suppress(sqlite3.ProgrammingError):
+                reader.close()
+
+    def _rest(self, topics: Collection[str], last_ns: int, given: dict[str, int]) -> Iterator[RawMessage]:
+        """The messages from a log time on, without those of that very time that were given already."""
+        if self._rows is None:
+            try:
+                self._rows = DamagedDb3Log(self._file)
+            except InputError:
+                self._damage.note("cut or damaged beyond repair")
+                return
+            self._rows.path = self.path
+        for message in self._rows.messages(topics):
+            if message.log_time_ns < last_ns:
+                continue
+            if message.log_time_ns == last_ns and given.get(message.topic):
+                given[message.topic] -= 1
+                continue
+            yield message
+
+
+def _channel(connection: Connection) -> Channel:
+    """A connection's topic, type and definition."""
+    return Channel(
+        connection.topic,
+        normalise_type_name(connection.msgtype),
+        str(getattr(connection.ext, "serialization_format", "cdr")),
+        _FORMATS[connection.msgdef.format],
+        connection.msgdef.data.encode(),
+    )

@@ -1,0 +1,144 @@
+"""The records of MCAP files as bytes: their heads, the runs of them, and the chunks that hold them.
+
+Format: https://mcap.dev/spec
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from typing import Any, NamedTuple, TypeAlias
+
+from isal import isal_zlib
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex, Statistics
+from mcap.records import Schema as SchemaRecord
+
+from octoreplay.io.containers.decompression import decompress, is_plausible_size
+from octoreplay.io.containers.log_reader import Channel, normalise_type_name
+from octoreplay.io.messages.decoders import ROS_FORMATS, Bytes
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+FOOTER = struct.Struct("<QQI")
+MAX_TIME_NS = (1 << 63) - 1
+"""Times are stored as unsigned numbers; ROS knows no later one than this (in the year 2262)."""
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_INDEX_HEAD = struct.Struct("<HI")
+_READERS: dict[int, Any] = {
+    Opcode.SCHEMA: SchemaRecord, Opcode.CHANNEL: ChannelRecord, Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.STATISTICS: Statistics,
+}  # fmt: skip
+_UNREADABLE = (McapError, struct.error, ValueError, OverflowError, MemoryError)
+
+Record: TypeAlias = SchemaRecord | ChannelRecord | ChunkIndex | Statistics
+
+
+class Definitions:
+    """The schemas and channels of a file as they are come upon."""
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, SchemaRecord] = {}
+        self.channels: dict[int, ChannelRecord] = {}
+
+    def take(self, opcode: int, body: Bytes, *, is_certain: bool = True) -> None:
+        """Add a schema or a channel; other records and damaged ones say nothing.
+
+        One that is not certain, as it stands in a damaged place, counts until a certain one of that number comes.
+        """
+        record = read_record(opcode, body)
+        if isinstance(record, SchemaRecord) and (is_certain or record.id not in self.schemas):
+            self.schemas[record.id] = record
+        elif isinstance(record, ChannelRecord) and (is_certain or record.id not in self.channels):
+            self.channels[record.id] = record
+
+    def resolved(self) -> dict[int, Channel]:
+        """Every channel with its type's definition as the file gives it."""
+        return {i: _channel(record, self.schemas.get(record.schema_id)) for i, record in self.channels.items()}
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk says of itself; ``start`` and ``length`` are those of its compressed records within its bytes."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    start: int
+    length: int
+
+
+def read_record(opcode: int, body: Bytes) -> Record | None:
+    """A schema, channel, chunk index or statistics record; None for other records and damaged ones."""
+    if opcode not in _READERS:
+        return None
+    try:
+        record: Record = _READERS[opcode].read(ReadDataStream(io.BytesIO(body)))
+    except _UNREADABLE:
+        return None
+    return record
+
+
+def walk(records: Bytes) -> Iterator[tuple[int, int, int]]:
+    """(opcode, start, end) of each whole record in a run of records."""
+    position, size = 0, len(records)
+    while position + RECORD_HEAD.size <= size:
+        opcode, length = RECORD_HEAD.unpack_from(records, position)
+        start = position + RECORD_HEAD.size
+        position = start + length
+        if position > size:
+            return
+        yield opcode, start, position
+
+
+def chunk_head(body: Bytes) -> ChunkHead | None:
+    """What a chunk's first bytes say; None where they contradict themselves or the compression is unknown."""
+    if len(body) < _CHUNK_HEAD.size:
+        return None
+    start_ns, end_ns, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+    start = _CHUNK_HEAD.size + name_length + 8
+    if name_length > 4 or len(body) < start:
+        return None
+    compression = bytes(body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]).decode("ascii", "replace")
+    length = int.from_bytes(body[start - 8 : start], "little")
+    if not is_plausible_size(compression, length, size):
+        return None
+    return ChunkHead(start_ns, end_ns, size, crc, compression, start, length)
+
+
+def whole_records(body: Bytes) -> Bytes | None:
+    """The records of a chunk; None where its sizes or its checksum (where it has one) do not fit."""
+    head = chunk_head(body)
+    if head is None or head.start + head.length != len(body):
+        return None
+    records = decompress(head.compression, memoryview(body)[head.start :], head.size)
+    is_whole = len(records) == head.size and (head.crc == 0 or isal_zlib.crc32(records) == head.crc)
+    return records if is_whole else None
+
+
+def cut_records(body: Bytes) -> Bytes:
+    """The records of a chunk whose end is missing, as far as they can be decompressed."""
+    head = chunk_head(body)
+    return b"" if head is None else decompress(head.compression, memoryview(body)[head.start :], head.size)
+
+
+def num_indexed(head: Bytes, length: int) -> int:
+    """How many messages a message index record of so many bytes lists, by its first six."""
+    if len(head) < _INDEX_HEAD.size:
+        return 0
+    _, num_bytes = _INDEX_HEAD.unpack_from(head)
+    return int(num_bytes) // 16 if int(num_bytes) == length - _INDEX_HEAD.size else 0
+
+
+def _channel(record: ChannelRecord, schema: SchemaRecord | None) -> Channel:
+    """A channel with its type's definition as the file gives it."""
+    if schema is None:
+        return Channel(record.topic, "", record.message_encoding, "", b"")
+    name = normalise_type_name(schema.name) if schema.encoding in ROS_FORMATS else schema.name
+    return Channel(record.topic, name, record.message_encoding, schema.encoding, schema.data)
