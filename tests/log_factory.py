@@ -1,18 +1,23 @@
-"""Messages and small robot logs for the tests of reading, in ROS 2 and ROS 1 types."""
+"""Messages and small robot logs for the tests of reading, in ROS 2 and ROS 1 types and Foxglove's schemas."""
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import foxglove.messages
 import numpy as np
 import numpy.typing as npt
+from mcap.writer import Writer as PlainMcapWriter
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from octoreplay.io.containers.log_reader import Channel, RawMessage, normalise_type_name
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import typestore
 
@@ -64,15 +69,37 @@ class Factory:
 
     def camera_info(
         self, stamp_ns: int, size: tuple[int, int], *, k: Sequence[float] = (50, 0, 5.5, 0, 60, 3.5, 0, 0, 1),
-        d: Sequence[float] = (), model: str = "plumb_bob",
+        d: Sequence[float] = (), model: str = "plumb_bob", p: Sequence[float] = (0,) * 12,
+        binning: tuple[int, int] = (0, 0), roi: tuple[int, int, int, int] = (0, 0, 0, 0),
     ) -> Any:  # fmt: skip
-        matrices = {"d": np.array(d, float), "k": np.array(k, float), "r": np.eye(3).ravel(), "p": np.zeros(12)}
+        """A CameraInfo; ``roi`` is (x, y, width, height)."""
+        matrices = {"d": np.array(d, float), "k": np.array(k, float), "r": np.eye(3).ravel(), "p": np.array(p, float)}
         if self.ros1:
             matrices = {name.upper(): value for name, value in matrices.items()}
-        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        region = self.make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=roi[0], y_offset=roi[1], width=roi[2], height=roi[3],
+            do_rectify=False,
+        )  # fmt: skip
         return self.make(
             "sensor_msgs/msg/CameraInfo", header=self.header(stamp_ns, "camera"), height=size[1], width=size[0],
-            distortion_model=model, binning_x=0, binning_y=0, roi=roi, **matrices,
+            distortion_model=model, binning_x=binning[0], binning_y=binning[1], roi=region, **matrices,
+        )  # fmt: skip
+
+    def compressed_image(self, stamp_ns: int, data: bytes, form: str, *, frame_id: str = "camera") -> Any:
+        return self.make(
+            "sensor_msgs/msg/CompressedImage", header=self.header(stamp_ns, frame_id), format=form,
+            data=np.frombuffer(data, np.uint8),
+        )  # fmt: skip
+
+    def scan(
+        self, stamp_ns: int, ranges: Sequence[float], *, angle_min: float = 0.0, angle_increment: float = 0.25,
+        limits: tuple[float, float] = (0.0, 100.0), frame_id: str = "lidar",
+    ) -> Any:  # fmt: skip
+        return self.make(
+            "sensor_msgs/msg/LaserScan", header=self.header(stamp_ns, frame_id), angle_min=angle_min,
+            angle_max=angle_min + angle_increment * (len(ranges) - 1), angle_increment=angle_increment,
+            time_increment=0.0, scan_time=0.0, range_min=limits[0], range_max=limits[1],
+            ranges=np.array(ranges, np.float32), intensities=np.zeros(0, np.float32),
         )  # fmt: skip
 
     def pose(self, position: Sequence[float], quaternion: Sequence[float] = IDENTITY) -> Any:
@@ -103,10 +130,25 @@ class Factory:
             ),
         )
 
-    def pose_stamped(self, stamp_ns: int, position: Sequence[float], *, frame_id: str = "map") -> Any:
+    def pose_stamped(
+        self, stamp_ns: int, position: Sequence[float], quaternion: Sequence[float] = IDENTITY, *, frame_id: str = "map"
+    ) -> Any:
         return self.make(
-            "geometry_msgs/msg/PoseStamped", header=self.header(stamp_ns, frame_id), pose=self.pose(position)
+            "geometry_msgs/msg/PoseStamped", header=self.header(stamp_ns, frame_id),
+            pose=self.pose(position, quaternion),
+        )  # fmt: skip
+
+    def pose_with_covariance(self, stamp_ns: int, position: Sequence[float], *, frame_id: str = "map") -> Any:
+        pose = self.make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(position), covariance=np.zeros(36)
+        )  # fmt: skip
+        return self.make(
+            "geometry_msgs/msg/PoseWithCovarianceStamped", header=self.header(stamp_ns, frame_id), pose=pose
         )
+
+    def path(self, stamp_ns: int, poses: Sequence[Any], *, frame_id: str = "map") -> Any:
+        """A path of stamped poses."""
+        return self.make("nav_msgs/msg/Path", header=self.header(stamp_ns, frame_id), poses=list(poses))
 
     def tf(self, *edges: tuple[str, str, int, Sequence[float], Sequence[float]]) -> Any:
         transforms = []
@@ -173,6 +215,161 @@ class Factory:
 
 
 ros2 = Factory()
+
+
+class Row(NamedTuple):
+    """One message of a log as bytes, with the definition of its type."""
+
+    topic: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+    data: bytes
+    log_time_ns: int
+
+    def message(self, path: Path = Path("a.mcap")) -> RawMessage:
+        """The message as a log that holds it would give it."""
+        is_ros = self.schema_encoding.startswith("ros")
+        name = normalise_type_name(self.schema_name) if is_ros else self.schema_name
+        channel = Channel(self.topic, name, self.encoding, self.schema_encoding, self.schema)
+        return RawMessage(path, channel, self.log_time_ns, self.data)
+
+
+def ros_row(entry: Entry) -> Row:
+    """A ROS 2 message as bytes."""
+    definition, _ = typestore().generate_msgdef(entry.type_name, ros_version=2)
+    data = bytes(typestore().serialize_cdr(entry.value, entry.type_name))
+    return Row(entry.topic, entry.type_name, "ros2msg", definition.encode(), "cdr", data, entry.log_time_ns)
+
+
+def ros1_row(entry: Entry) -> Row:
+    """A ROS 1 message as bytes."""
+    definition, _ = ROS1.generate_msgdef(entry.type_name, ros_version=1)
+    data = bytes(ROS1.serialize_ros1(entry.value, entry.type_name))
+    return Row(entry.topic, entry.type_name, "ros1msg", definition.encode(), "ros1", data, entry.log_time_ns)
+
+
+# foxglove_msgs for ROS 2, as far as it is used.
+_FOXGLOVE_MSGS = {
+    "CompressedImage": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
+    "RawImage": "builtin_interfaces/Time timestamp\nstring frame_id\nuint32 width\nuint32 height\nstring encoding\n"
+    "uint32 step\nuint8[] data\n",
+    "CameraCalibration": "builtin_interfaces/Time timestamp\nstring frame_id\nuint32 width\nuint32 height\n"
+    "string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n",
+    "PackedElementField": "string name\nuint32 offset\nuint8 type\n",
+    "PointCloud": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nuint32 point_stride\n"
+    "foxglove_msgs/PackedElementField[] fields\nuint8[] data\n",
+    "LaserScan": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nfloat64 start_angle\n"
+    "float64 end_angle\nfloat64[] ranges\nfloat64[] intensities\n",
+    "PoseInFrame": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\n",
+    "FrameTransform": "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
+    "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
+}
+FOXGLOVE_ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+for _name, _definition in _FOXGLOVE_MSGS.items():
+    FOXGLOVE_ROS2.register(get_types_from_msg(_definition, f"foxglove_msgs/msg/{_name}"))
+
+FOXGLOVE_ENCODINGS = ("cdr", "protobuf", "json")
+# The types of the fields that are messages, in the SDK and in foxglove_msgs.
+_PARTS = {
+    "timestamp": ("Timestamp", "builtin_interfaces/msg/Time"), "pose": ("Pose", "geometry_msgs/msg/Pose"),
+    "position": ("Vector3", "geometry_msgs/msg/Point"), "orientation": ("Quaternion", "geometry_msgs/msg/Quaternion"),
+    "translation": ("Vector3", "geometry_msgs/msg/Vector3"), "rotation": ("Quaternion", "geometry_msgs/msg/Quaternion"),
+    "fields": ("PackedElementField", "foxglove_msgs/msg/PackedElementField"),
+    "transforms": ("FrameTransform", "foxglove_msgs/msg/FrameTransform"),
+}  # fmt: skip
+_NUMERIC_TYPES = ("Unknown", "Uint8", "Int8", "Uint16", "Int16", "Uint32", "Int32", "Float32", "Float64")
+
+
+def foxglove_row(topic: str, name: str, fields: Mapping[str, Any], log_time_ns: int, encoding: str) -> Row:
+    """A message of Foxglove's schema ``name`` as foxglove_msgs in CDR, as protobuf by Foxglove's SDK, or as JSON.
+
+    ``fields`` are named and nested as in Foxglove's JSON schemas, with bytes as bytes.
+    """
+    if encoding == "json":
+        text = json.dumps(fields, default=lambda data: base64.b64encode(data).decode())
+        return Row(topic, f"foxglove.{name}", "jsonschema", b"{}", "json", text.encode(), log_time_ns)
+    if encoding == "protobuf":
+        value = _foxglove_value(name, fields)
+        schema = value.get_schema()
+        return Row(topic, schema.name, schema.encoding, schema.data, "protobuf", value.encode(), log_time_ns)
+    type_name = f"foxglove_msgs/msg/{name}"
+    definition, _ = FOXGLOVE_ROS2.generate_msgdef(type_name, ros_version=2)
+    data = bytes(FOXGLOVE_ROS2.serialize_cdr(_foxglove_msg(type_name, fields), type_name))
+    return Row(topic, type_name, "ros2msg", definition.encode(), "cdr", data, log_time_ns)
+
+
+def foxglove_stamp(stamp_ns: int) -> dict[str, int]:
+    """A time as in Foxglove's JSON schemas."""
+    return {"sec": stamp_ns // SECOND, "nsec": stamp_ns % SECOND}
+
+
+def foxglove_pose(position: Sequence[float], quaternion: Sequence[float] = IDENTITY) -> dict[str, Any]:
+    """A pose as in Foxglove's JSON schemas."""
+    return {
+        "position": dict(zip("xyz", map(float, position), strict=True)),
+        "orientation": dict(zip("xyzw", map(float, quaternion), strict=True)),
+    }
+
+
+def foxglove_transform(
+    parent: str, child: str, stamp_ns: int, translation: Sequence[float], rotation: Sequence[float] = IDENTITY
+) -> dict[str, Any]:
+    """A FrameTransform as in Foxglove's JSON schemas."""
+    return {
+        "timestamp": foxglove_stamp(stamp_ns), "parent_frame_id": parent, "child_frame_id": child,
+        "translation": dict(zip("xyz", map(float, translation), strict=True)),
+        "rotation": dict(zip("xyzw", map(float, rotation), strict=True)),
+    }  # fmt: skip
+
+
+def _foxglove_value(name: str, fields: Mapping[str, Any]) -> Any:
+    """A message of Foxglove's SDK."""
+
+    def convert(key: str, value: Any) -> Any:
+        if name == "PackedElementField" and key == "type":
+            return getattr(foxglove.messages.PackedElementFieldNumericType, _NUMERIC_TYPES[value])
+        if key in _PARTS and isinstance(value, list):
+            return [_foxglove_value(_PARTS[key][0], part) for part in value]
+        return _foxglove_value(_PARTS[key][0], value) if key in _PARTS else value
+
+    return getattr(foxglove.messages, name)(**{key: convert(key, value) for key, value in fields.items()})
+
+
+def _foxglove_msg(type_name: str, fields: Mapping[str, Any]) -> Any:
+    """A message of foxglove_msgs."""
+
+    def convert(key: str, value: Any) -> Any:
+        if key in _PARTS and isinstance(value, list):
+            return [_foxglove_msg(_PARTS[key][1], part) for part in value]
+        if key in _PARTS:
+            return _foxglove_msg(_PARTS[key][1], value)
+        if isinstance(value, bytes):
+            return np.frombuffer(value, np.uint8)
+        return np.array(value, np.float64) if isinstance(value, list) else value
+
+    names = {"nsec": "nanosec"} if type_name.endswith("/Time") else {name: name.lower() for name in "DKRP"}
+    values = {names.get(key, key): convert(key, value) for key, value in fields.items()}
+    return FOXGLOVE_ROS2.types[type_name](**values)
+
+
+def write_rows(path: Path, rows: Iterable[Row]) -> Path:
+    """Write messages of any encoding as an MCAP, with the writer of the mcap package."""
+    with path.open("wb") as file:
+        writer = PlainMcapWriter(file)
+        writer.start()
+        channels: dict[tuple[str, str], int] = {}
+        for row in rows:
+            if (row.topic, row.schema_name) not in channels:
+                schema = writer.register_schema(row.schema_name, row.schema_encoding, row.schema)
+                channels[row.topic, row.schema_name] = writer.register_channel(row.topic, row.encoding, schema)
+            channel = channels[row.topic, row.schema_name]
+            writer.add_message(channel, row.log_time_ns, row.data, row.log_time_ns)
+        writer.finish()
+    return path
+
 
 WIDTH, HEIGHT = 12, 8
 NAMES = {1: "ground", 2: "tree", 7: "wall"}

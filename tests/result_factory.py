@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay.config import RobotConfig, RunConfig, class_table
+from octoreplay.class_file import class_table
+from octoreplay.config import RobotConfig, RunConfig
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import (
     FrameCounts,
@@ -75,7 +76,7 @@ def summary(metrics: Sequence[TickMetrics]) -> RunSummary:
         mean_packet_bytes=150.5, mean_octree_bytes=250.25, mean_grid_bytes=6000.125, total_sent_bytes=9999,
         links=links.totals(),
         frame_counts={
-            "alpha": FrameCounts(used=7, no_pose=2, unknown_label_pixels={42: 3}),
+            "alpha": FrameCounts(used=7, no_pose=2, unknown_label_pixels={42: 3}, unknown_colors={0xA0B0C: 5}),
             "beta": FrameCounts(used=9, truncated_files=["beta.bag"]),
         },
         warnings=("a warning with [brackets]",),

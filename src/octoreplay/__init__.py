@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from octoreplay.config import RobotConfig, RunConfig, load_team_file
+    from octoreplay.config import RobotConfig, RunConfig
     from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.simulate.team import SimulationConfig, simulate_team
+    from octoreplay.team_file import load_team_file
 
 _HOMES = {
     "ClassTable": "records",
@@ -40,7 +41,7 @@ _HOMES = {
     "TickMetrics": "records",
     "discover": "io.robots.discover",
     "export_ply": "report.export",
-    "load_team_file": "config",
+    "load_team_file": "team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
     "replay_team": "replay.session",

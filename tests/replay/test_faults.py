@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config import ScheduleEntry, load_team_file
-from octoreplay.errors import ConfigError
+from octoreplay.config import ScheduleEntry
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping import codec
+from octoreplay.replay import session as session_module
 from octoreplay.replay.exchange import Source
 from octoreplay.replay.session import Session, _rule_warnings, replay_team
 from octoreplay.result import open_result
+from octoreplay.team_file import load_team_file
 from reference.comparison import compare_map
 from reference.scenarios import START_NS, TeamShape, make_scenario
 from reference.twin import Twin, record
@@ -558,3 +560,16 @@ def test_a_silent_robot_hears_and_says_nothing(rule):
     assert (during[1] != 0)[others].mean() > 0.5
     if rule == "flood":
         assert _from_oracle(tick).max() < FLOOD_TOLERANCE
+
+
+# --- stamps ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_that_are_ages_away_end_the_run_instead_of_idle_ticks(monkeypatch):
+    monkeypatch.setattr(session_module, "MAX_TICKS", 50)
+    config = _config(settle=0)
+    frames = [frame for frame in _scenario().frames if frame.robot_id == config.robots[0].robot_id]
+    ages_later = dataclasses.replace(frames[-1], stamp_ns=START_NS + 60 * PERIOD_NS)
+    sources = [FrameList((*frames, ages_later)), *(FrameList(()) for _ in config.robots[1:])]
+    with pytest.raises(InputError, match=r"span more than 50 ticks of 1 s; check the stamps, or give clock"):
+        list(Session(config, sources, num_threads=1).ticks())

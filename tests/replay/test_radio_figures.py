@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.config import ScheduleEntry, load_team_file
+from octoreplay.config import ScheduleEntry
 from octoreplay.replay.session import replay_team
 from octoreplay.result import open_result
+from octoreplay.team_file import load_team_file
 
 TRIO = Path(__file__).parents[1] / "fixtures" / "trio" / "team.yaml"
 

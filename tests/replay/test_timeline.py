@@ -53,3 +53,13 @@ def test_a_loop_that_stops_early_loses_nothing():
     timeline = Timeline([FakeLog("a", [1, 2, 3])])
     next(iter(timeline.frames_before(0, 10)))
     assert [frame.stamp_ns for frame in timeline.frames_before(0, 10)] == [2, 3]
+
+
+def test_the_next_stamp_is_the_earliest_that_waits():
+    timeline = Timeline([FakeLog("a", [5, 9]), FakeLog("b", [7]), FakeLog("c", [])])
+    assert timeline.next_stamp_ns == 5
+    list(timeline.frames_before(0, 8))
+    assert timeline.next_stamp_ns == 7
+    list(timeline.frames_before(1, 8))
+    list(timeline.frames_before(0, 10))
+    assert timeline.next_stamp_ns is None

@@ -10,11 +10,11 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from fixtures.make_fixtures import FIXTURES
-from octoreplay.config import load_team_file
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.simulate import team
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, simulate_team
 from octoreplay.simulate.world import VILLAGE_CLASSES, make_village
+from octoreplay.team_file import load_team_file
 from stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"

@@ -14,17 +14,21 @@ from typing import TypeVar
 
 import numpy as np
 
-from octoreplay.config import PacketConfig, RunConfig
+from octoreplay.config import PacketConfig, RunConfig, TimeConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
+from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import (
     Float64Array,
+    Frame,
     FrameCounts,
     LinkMetrics,
     RobotMetrics,
@@ -44,7 +48,7 @@ from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.robot import MapSizes, Publication, Robot, Turn
 from octoreplay.replay.settling import num_quiet_ticks, num_settle_ticks
 from octoreplay.replay.tick import Tick, falls_due
-from octoreplay.replay.timeline import FrameSource, Timeline
+from octoreplay.replay.timeline import Bodies, FrameSource, Timeline
 
 CONVERGED = "converged"
 SETTLE_MAX = "settle_max reached"
@@ -72,12 +76,20 @@ class Session:
     """A team that replays frames and runs the consensus; iterate over ``ticks()``.
 
     ``config`` is resolved and has a class table; ``sources`` give each robot's frames, in the order of
-    ``config.robots``. Raises ConfigError where epsilon is above the bound of a graph that occurs, and InputError where
-    no robot has a frame. The result does not depend on ``num_threads``. ``is_symmetric`` says whether on all graphs so
-    far every link carried both ways, with the same weight.
+    ``config.robots``, and ``bodies`` where the robots are, which then do not become part of the map. Raises ConfigError
+    where epsilon is above the bound of a graph that occurs, and InputError where no robot has a frame. The result does
+    not depend on ``num_threads``. ``is_symmetric`` says whether on all graphs so far every link carried both ways, with
+    the same weight.
     """
 
-    def __init__(self, config: RunConfig, sources: Sequence[FrameSource], *, num_threads: int | None = None) -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        sources: Sequence[FrameSource],
+        *,
+        bodies: Bodies | None = None,
+        num_threads: int | None = None,
+    ) -> None:
         if config.classes is None:
             raise InputError("a session needs a class table")
         self.config = config
@@ -89,6 +101,7 @@ class Session:
         check_team_graph(config.network, config.consensus, self._robot_ids)
         self._network = TeamNetwork(config.network, config.consensus, self._robot_ids)
         self._timeline = Timeline(sources)
+        self._bodies = bodies
         self._encoder = PacketEncoder(config.packet)
         families: dict[str, type[Robot]] = {"flood": FloodRobot, "ratio": RatioRobot}
         self._family = families.get(config.consensus.rule, ConsensusRobot)
@@ -109,10 +122,20 @@ class Session:
         with ThreadPoolExecutor(self.num_threads) as self._threads:
             number = 0
             while not self._timeline.exhausted or number == 0:
+                self._check_next_frame(start_ns)
                 yield self._tick(number, start_ns + number * self._period_ns)
                 number += 1
             # The scans of the last period are in now; they have been published by nobody yet.
             yield from self._settle(number, start_ns)
+
+    def _check_next_frame(self, start_ns: int) -> None:
+        """Raise InputError where the next frame is more ticks away than a run may have: nobody waits for it."""
+        next_ns = self._timeline.next_stamp_ns
+        if next_ns is not None and (next_ns - start_ns) // self._period_ns >= MAX_TICKS:
+            raise InputError(
+                f"the frames from {start_ns / 1e9:.3f} s to {next_ns / 1e9:.3f} s span more than {MAX_TICKS:,} ticks "
+                f"of {self.config.network.publish_period:g} s; check the stamps, or give clock: log"
+            )
 
     def _settle(self, number: int, start_ns: int) -> Iterator[Tick]:
         """Ticks over the last graph with gamma ramped to 0, until no log-odds changes (Alg. 1's stopping rule)."""
@@ -199,14 +222,22 @@ class Session:
         A robot that is off sees nothing.
         """
         schedule, start_ns = self._network.schedule, stamp_ns - number * self._period_ns
+        if self._bodies is not None:
+            self._bodies.advance(stamp_ns - self._period_ns, stamp_ns)
 
         def integrate(index: int) -> None:
             frames = self._timeline.frames_before(index, stamp_ns)
             now = (stamp_ns - start_ns) / 1e9
             seen = (frame for frame in frames if schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, now))
-            self._robots[index].integrate(seen, number)
+            self._robots[index].integrate((self._with_bodies(index, frame) for frame in seen), number)
 
         self._each(integrate, range(len(self._robots)))
+
+    def _with_bodies(self, index: int, frame: Frame) -> Frame:
+        """A robot's frame with the boxes of the other robots in it."""
+        if self._bodies is None:
+            return frame
+        return dataclasses.replace(frame, boxes=(*frame.boxes, *self._bodies.seen_by(index, frame.stamp_ns)))
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Every active robot that is due hands its packets to its links."""
@@ -373,12 +404,19 @@ def replay_team(
     assert config.classes is not None
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
-        logs = [stack.enter_context(RobotLog(robot, config.time, config.classes)) for robot in config.robots]
-        session = Session(config, logs, num_threads=num_threads)
+        reach = sensor_reach(config.sensor, config.map)
+        logs = [
+            stack.enter_context(RobotLog(robot, config.time, config.classes, reach=reach)) for robot in config.robots
+        ]
+        team_start_ns = min(log.first_stamp_ns for log in logs)
+        sources = [stack.enter_context(ReadAhead(log, team_start_ns)) for log in logs]
+        hides = config.sensor.hide_robots
+        bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
+        session = Session(config, sources, bodies=bodies, num_threads=num_threads)
         threads = stack.enter_context(ThreadPoolExecutor(session.num_threads))
         writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
         recorder = Recorder(config, writer, threads)
-        total_ns = _total_ns(logs)
+        total_ns = _total_ns(logs, config.time)
         _check_num_ticks(config, total_ns)
         with deferred_interrupts() as deliver_interrupts:
             try:
@@ -390,7 +428,7 @@ def replay_team(
                     deliver_interrupts()
             except InputError as error:
                 if recorder.last is None:
-                    raise InputError(f"{error}: {_causes(logs)}") from error
+                    raise InputError(f"{error}: {_causes(logs, config.time)}") from error
                 raise
             counts = {log.robot_id: log.counts for log in logs}
             warnings = (*_rule_warnings(config, session.is_symmetric), *_warnings(logs, recorder))
@@ -400,11 +438,14 @@ def replay_team(
         return summary
 
 
-def _total_ns(logs: Sequence[RobotLog]) -> int | None:
-    """Length of the logs together, where they say it."""
+def _total_ns(logs: Sequence[RobotLog], time: TimeConfig) -> int | None:
+    """Length of the part of the logs that is replayed, where they say it."""
     starts = [log.start_ns for log in logs if log.start_ns is not None]
     ends = [log.end_ns for log in logs if log.end_ns is not None]
-    return max(ends) - min(starts) if starts and ends else None
+    if not starts or not ends:
+        return None
+    whole = max(ends) - min(starts) - round(time.start * 1e9)
+    return max(whole, 0) if time.duration is None else max(min(whole, round(time.duration * 1e9)), 0)
 
 
 def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
@@ -459,7 +500,15 @@ def _warnings(logs: Sequence[RobotLog], recorder: Recorder) -> tuple[str, ...]:
     """What a user should know of a run that went well."""
     sentences = []
     if recorder.last is not None and recorder.last.metrics.num_known_cells == 0:
-        sentences.append("the maps are empty: no ray passes the mapped region; check bounds, max_range and the poses")
+        sentences.append(
+            "the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses"
+        )
+    sensors: dict[tuple[Path, str], str] = {}
+    for log in logs:
+        for source in ((path.resolve(), log.sensor_topic) for path in log.robot.logs):
+            other = sensors.setdefault(source, log.robot_id)
+            if other != log.robot_id:
+                sentences.append(f"{other} and {log.robot_id} map the same messages of {source[0]}, which count twice")
     spans = [(log.start_ns, log.end_ns, log.robot_id) for log in logs]
     for start, _, robot_id in spans:
         others = [(a, b) for a, b, other in spans if other != robot_id]
@@ -468,15 +517,17 @@ def _warnings(logs: Sequence[RobotLog], recorder: Recorder) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _causes(logs: Sequence[RobotLog]) -> str:
+def _causes(logs: Sequence[RobotLog], time: TimeConfig) -> str:
     """Why frames were not used, robot by robot."""
 
     def text(counts: FrameCounts) -> str:
         causes = {
             "without a label": counts.no_label, "without a pose": counts.no_pose,
-            "without intrinsics": counts.no_intrinsics, "late": counts.late, "unreadable": counts.undecodable,
+            "late": counts.late, "unreadable": counts.undecodable,
         }  # fmt: skip
         return ", ".join(f"{number} {cause}" for cause, number in causes.items() if number) or "no frames"
 
     found = "; ".join(f"{log.robot_id}: {text(log.counts)}" for log in logs)
+    if time.start > 0 or time.duration is not None:
+        return f"{found}; start and duration may leave none of them"
     return f"{found}; compare sensor and poses in 'octoreplay info', or try clock 'log' or a larger pose_gap"

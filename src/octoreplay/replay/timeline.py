@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
-from octoreplay.records import Frame
+from octoreplay.records import BodyBox, Frame
 
 
 class FrameSource(Protocol):
@@ -13,6 +13,16 @@ class FrameSource(Protocol):
 
     def frames(self) -> Iterator[Frame]:
         """The frames from the beginning."""
+
+
+class Bodies(Protocol):
+    """Where the robots' bodies are (``io.robots.team_bodies.TeamBodies``)."""
+
+    def advance(self, start_ns: int, end_ns: int) -> None:
+        """Make the boxes between two stamps known."""
+
+    def seen_by(self, index: int, stamp_ns: int) -> tuple[BodyBox, ...]:
+        """The boxes at a stamp of all robots but one."""
 
 
 class Timeline:
@@ -33,6 +43,11 @@ class Timeline:
     def exhausted(self) -> bool:
         """True when every frame of every robot has been given."""
         return all(frame is None for frame in self._next)
+
+    @property
+    def next_stamp_ns(self) -> int | None:
+        """Stamp of the earliest frame that has not been given; None when every frame has."""
+        return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
 
     def has_ended(self, robot_index: int) -> bool:
         """True when a robot's last frame has been given (at once for a robot without any)."""

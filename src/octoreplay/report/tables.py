@@ -28,7 +28,7 @@ _YEAR_2000_NS = 946_684_800_000_000_000
 """Stamps before it count from some start of a clock and are no dates."""
 
 _CAUSES = {
-    "no_label": "no label", "no_pose": "no pose", "no_intrinsics": "no intrinsics", "late": "late",
+    "no_label": "no label", "no_pose": "no pose", "late": "late",
     "undecodable": "unreadable",
 }  # fmt: skip
 """Why a frame was not mapped: fields of FrameCounts and what the table calls them."""
@@ -155,7 +155,7 @@ def made_files(files: Mapping[Path, str]) -> Table:
 
 def description(logs: LogDescription) -> RenderableType:
     """What logs hold: their topics, the robots in them, and what a run would miss."""
-    parts: list[RenderableType] = [_log_table(log) for log in logs.logs]
+    parts: list[RenderableType] = [_log_table(log) for log in logs.logs if log.error is None]
     if logs.robots:
         parts.append(_robot_spans(logs))
     parts.append(_readiness(logs))

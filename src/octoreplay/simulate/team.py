@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay.config import MapConfig, RobotConfig, RunConfig, dump_team
+from octoreplay.config import MapConfig, RobotConfig, RunConfig
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
 from octoreplay.records import CameraModel, Float64Array
@@ -22,6 +22,7 @@ from octoreplay.simulate.world import (
     write_ground_truth,
     write_mesh,
 )
+from octoreplay.team_file import dump_team
 
 START_NS = 1_700_000_000_000_000_000
 """Stamp of a simulation's first message: fixed, so that the same options give the same bytes."""

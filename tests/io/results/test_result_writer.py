@@ -216,8 +216,8 @@ def test_partial_names() -> None:
     [
         ("none/out.mcap", "the folder '.*none' does not exist"),
         ("", "is a folder; give a file name"),
-        ("alpha.bag", "is a log of robot 'alpha'; name another output"),
-        ("none/../beta.bag", "is a log of robot 'beta'; name another output"),
+        ("alpha.bag", "is an input of robot 'alpha'; name another output"),
+        ("none/../beta.bag", "is an input of robot 'beta'; name another output"),
     ],
 )
 def test_an_output_that_cannot_be_written_is_refused_at_once(tmp_path: Path, name: str, sentence: str) -> None:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.io.robots.frame_queue import FrameQueue, Settled
+from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
 
 
 class FakePoses:
@@ -25,10 +27,13 @@ class FakePoses:
         self.forgotten = stamp_ns
 
 
-def make_queue(poses=None, *, window=100, tolerance=10, gap=50, has_labels=True) -> FrameQueue[str]:
+KINDS = ("label", "confidence")
+
+
+def make_queue(poses=None, *, window=100, tolerance=10, gap=50, num_partners=1) -> FrameQueue[str]:
     return FrameQueue(
         poses or FakePoses(), reorder_window_ns=window, pair_tolerance_ns=tolerance, pose_gap_ns=gap,
-        has_labels=has_labels,
+        num_partners=num_partners,
     )  # fmt: skip
 
 
@@ -43,9 +48,9 @@ def run(
             settled.append(ready)
 
     for kind, stamp in arrivals:
-        if kind == "label":
-            queue.add_label(stamp, f"label {stamp}")
-        elif not queue.add_sensor(stamp, f"depth {stamp}"):
+        if kind in KINDS:
+            queue.add_partner(KINDS.index(kind), stamp, f"{kind} {stamp}")
+        elif queue.add_sensor(stamp, f"depth {stamp}") is Fate.LATE:
             late.append(stamp)
         if not final_only:
             drain(final=False)
@@ -55,8 +60,8 @@ def run(
 
 @st.composite
 def arrivals_within(draw, window: int):
-    """Messages whose stamps are behind the newest sensor stamp by at most a window."""
-    kinds = draw(st.lists(st.tuples(st.sampled_from(["depth", "label"]), st.integers(0, 400)), max_size=40))
+    """Messages, none twice, whose stamps are behind the newest sensor stamp by at most a window."""
+    kinds = draw(st.lists(st.tuples(st.sampled_from(["depth", *KINDS]), st.integers(0, 400)), max_size=40))
     delays = draw(st.lists(st.integers(0, window), min_size=len(kinds), max_size=len(kinds)))
     order = sorted(range(len(kinds)), key=lambda i: (kinds[i][1] + delays[i], i))
     unique = dict.fromkeys(kinds[i] for i in order)
@@ -65,19 +70,21 @@ def arrivals_within(draw, window: int):
 
 @given(arrivals_within(60), st.integers(0, 30))
 def test_reading_in_a_window_gives_what_reading_everything_first_gives(arrivals, tolerance):
-    streamed, late = run(make_queue(window=60, tolerance=tolerance), arrivals)
-    at_once, _ = run(make_queue(window=10**6, tolerance=tolerance), arrivals, final_only=True)
+    streamed, late = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
+    at_once, _ = run(make_queue(window=10**6, tolerance=tolerance, num_partners=2), arrivals, final_only=True)
     assert late == []
-    assert [(s.stamp_ns, s.message, s.label) for s in streamed] == [(s.stamp_ns, s.message, s.label) for s in at_once]
+    assert [s[:3] for s in streamed] == [s[:3] for s in at_once]
 
 
-@given(arrivals_within(60), st.integers(0, 30))
-def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance):
-    settled, _ = run(make_queue(window=60, tolerance=tolerance), arrivals)
+@given(arrivals_within(60), st.integers(0, 30), st.sampled_from([0, 1]))
+def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance, index):
+    settled, _ = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
     depths = [stamp for kind, stamp in arrivals if kind == "depth"]
-    labels = [stamp for kind, stamp in arrivals if kind == "label"]
+    labels = [stamp for kind, stamp in arrivals if kind == KINDS[index]]
     assert [s.stamp_ns for s in settled] == sorted(depths)
-    partner = {s.stamp_ns: int(s.label.split()[1]) for s in settled if s.label is not None}
+    found = {s.stamp_ns: s.partners[index] for s in settled if s.partners[index] is not None}
+    assert all(name.startswith(KINDS[index]) for name in found.values())
+    partner = {stamp: int(name.split()[1]) for stamp, name in found.items()}
     assert len(set(partner.values())) == len(partner)
     for depth in depths:
         if depth in labels:
@@ -93,30 +100,38 @@ def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance):
 
 
 @given(st.lists(st.integers(0, 300), max_size=30), st.integers(0, 100))
-def test_late_is_more_than_the_window_behind_and_the_rest_comes_in_order(stamps, window):
-    settled, late = run(make_queue(window=window, has_labels=False), [("depth", stamp) for stamp in stamps])
-    expected = [stamp for i, stamp in enumerate(stamps) if stamp < max(stamps[:i], default=0) - window]
-    assert late == expected
-    kept = [s.stamp_ns for s in settled]
-    assert kept == sorted(kept)
-    assert sorted(kept + late) == sorted(stamps)
+def test_late_is_more_than_the_window_behind_and_the_rest_comes_in_order_and_once(stamps, window):
+    queue, fates, settled = make_queue(window=window, num_partners=0), [], []
+    for stamp in stamps:
+        fates.append(queue.add_sensor(stamp, str(stamp)))
+        while (ready := queue.pop(final=False)) is not None:
+            settled.append(ready.stamp_ns)
+    while (ready := queue.pop(final=True)) is not None:
+        settled.append(ready.stamp_ns)
+    for i, (stamp, fate) in enumerate(zip(stamps, fates, strict=True)):
+        if stamp < max(stamps[:i], default=0) - window:
+            assert fate is Fate.LATE
+        else:
+            assert fate is (Fate.DUPLICATE if stamp in stamps[:i] else Fate.WAITS)
+    kept = [stamp for stamp, fate in zip(stamps, fates, strict=True) if fate is Fate.WAITS]
+    assert settled == sorted(kept) == sorted(set(kept))
 
 
 def test_the_nearer_depth_image_gets_the_label():
     settled, _ = run(make_queue(tolerance=20), [("depth", 0), ("label", 12), ("depth", 15), ("depth", 40)])
-    assert [(s.stamp_ns, s.label) for s in settled] == [(0, None), (15, "label 12"), (40, None)]
+    assert [(s.stamp_ns, s.partners) for s in settled] == [(0, (None,)), (15, ("label 12",)), (40, (None,))]
 
 
 def test_a_label_waits_for_the_nearer_image_that_comes_out_of_order():
     arrivals = [("depth", 0), ("label", 19), ("depth", 40), ("depth", 37)]
     settled, late = run(make_queue(window=10, tolerance=20), arrivals)
     assert late == []
-    assert [(s.stamp_ns, s.label) for s in settled] == [(0, None), (37, "label 19"), (40, None)]
+    assert [(s.stamp_ns, s.partners) for s in settled] == [(0, (None,)), (37, ("label 19",)), (40, (None,))]
 
 
 def test_a_message_waits_for_its_pose_but_not_for_ever():
     poses = FakePoses(known_to=90)
-    queue = make_queue(poses, window=100, gap=50, has_labels=False)
+    queue = make_queue(poses, window=100, gap=50, num_partners=0)
     for stamp in (80, 100, 240):
         queue.add_sensor(stamp, str(stamp))
     assert queue.pop(final=False).stamp_ns == 80
@@ -131,33 +146,78 @@ def test_a_message_waits_for_its_pose_but_not_for_ever():
 
 
 def test_what_is_held_does_not_grow_with_the_log():
-    queue = make_queue(window=100)
+    queue = make_queue(window=100, num_partners=2)
     largest = 0
     for stamp in range(0, 20_000, 10):
-        queue.add_label(stamp + 5, "label")
-        queue.add_label(stamp - 1000, "late label")
+        for kind in (0, 1):
+            queue.add_partner(kind, stamp + 5, "label")
+            queue.add_partner(kind, stamp - 1000, "late label")
         # The second half of the log holds labels only.
         if stamp < 10_000:
             queue.add_sensor(stamp, "depth")
         while queue.pop(final=False) is not None:
             pass
-        largest = max(largest, len(queue._waiting) + len(queue._labels) + len(queue._label_stamps))
-    assert largest < 100
+        held = [len(partners._stamps) + len(partners._messages) for partners in queue._partners]
+        largest = max(largest, len(queue._waiting), len(queue._stamps), *held)
+    assert largest < 50
 
 
 def test_labels_that_no_message_can_have_are_dropped_in_order():
     queue = make_queue(window=10, tolerance=5)
     for stamp in (0, 3, 50, 52):
-        queue.add_label(stamp, str(stamp))
+        queue.add_partner(0, stamp, str(stamp))
     queue.add_sensor(51, "depth")
-    assert queue.pop(final=True).label == "50"
-    assert queue._label_stamps == [52]
-    assert list(queue._labels) == [52]
+    assert queue.pop(final=True).partners == ("50",)
+    assert queue._partners[0]._stamps == [52]
+    assert list(queue._partners[0]._messages) == [52]
 
 
 @pytest.mark.parametrize("window", [0, 7])
-def test_equal_stamps_keep_their_order_of_arrival(window):
-    queue = make_queue(window=window, has_labels=False)
-    for name in ("first", "second", "third"):
-        queue.add_sensor(5, name)
-    assert [queue.pop(final=True).message for _ in range(3)] == ["first", "second", "third"]
+def test_of_equal_stamps_the_first_holds_also_once_it_was_given(window):
+    queue = make_queue(window=window, num_partners=0)
+    fates = [queue.add_sensor(5, name) for name in ("first", "second", "third")]
+    assert fates == [Fate.WAITS, Fate.DUPLICATE, Fate.DUPLICATE]
+    assert queue.pop(final=True).message == "first"
+    assert queue.add_sensor(5, "fourth") is Fate.DUPLICATE
+    assert queue.pop(final=True) is None
+
+
+def test_of_equal_partners_the_first_holds():
+    queue = make_queue()
+    for name in ("first", "second"):
+        queue.add_partner(0, 5, name)
+    queue.add_sensor(5, "depth")
+    assert queue.pop(final=True).partners == ("first",)
+
+
+def test_a_confidence_does_not_take_the_place_of_a_label():
+    queue = make_queue(num_partners=2)
+    queue.add_sensor(5, "depth")
+    queue.add_partner(1, 6, "confidence")
+    assert queue.pop(final=True).partners == (None, "confidence")
+
+
+def test_late_ones_do_not_move_the_newest_stamp():
+    queue = make_queue(window=10)
+    assert queue.newest_ns is None
+    queue.add_sensor(100, "a")
+    assert queue.add_sensor(89, "b") is Fate.LATE
+    assert queue.add_sensor(90, "c") is Fate.WAITS
+    assert queue.newest_ns == 100
+    queue.add_partner(0, 120, "label")
+    assert queue.newest_ns == 120
+
+
+def test_many_messages_in_one_window_take_no_quadratic_time():
+    """A clock that hardly moves: 20,000 messages within the window, all of which wait for the end."""
+    queue = FrameQueue(FakePoses(), reorder_window_ns=10**9, pair_tolerance_ns=100, pose_gap_ns=0, num_partners=1)
+    started = time.process_time()
+    for index in range(20_000):
+        queue.add_sensor(index * 1000, index)
+        queue.add_partner(0, index * 1000 + 1, index)
+    popped = 0
+    while (settled := queue.pop(final=True)) is not None:
+        assert settled.partners == (settled.message,)
+        popped += 1
+    assert popped == 20_000
+    assert time.process_time() - started < 3.0

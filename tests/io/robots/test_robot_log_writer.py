@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
-from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, rotation_to_quaternion
+from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
 from octoreplay.records import CameraModel, ClassTable, SemanticClass
 from stored_messages import matrix, pixels, read_messages, stamp_ns
 
@@ -151,15 +149,79 @@ def test_same_calls_give_the_same_bytes(tmp_path, depth, labels):
     assert first.read_bytes() == second.read_bytes()
 
 
-@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_quaternion_of_a_rotation_gives_the_rotation_back(q):
-    rotation = Rotation.from_quat(q).as_matrix()
-    x, y, z, w = rotation_to_quaternion(rotation)
-    assert w >= 0
-    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), rotation, atol=1e-12)
+# --- clouds -----------------------------------------------------------------------------------------------------------
+
+POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, np.nan], [7.0, 8.0, 9.0]])
 
 
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]])
-def test_half_turns_have_a_quaternion(axis):
-    rotation = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
-    np.testing.assert_allclose(Rotation.from_quat(rotation_to_quaternion(rotation)).as_matrix(), rotation, atol=1e-9)
+def write_cloud(path: Path, points: np.ndarray = POINTS, **fields: np.ndarray) -> Path:
+    with RobotLogWriter(path, "r1", None, CLASSES, T_body_sensor=camera_mount(), start_ns=START) as log:
+        log.write_pose(START, body_pose())
+        log.write_cloud(START + 50, points, **fields)
+    return path
+
+
+def test_a_lidar_log_holds_clouds_in_the_lidars_frame(tmp_path):
+    messages = read_messages(write_cloud(tmp_path / "r1.mcap", labels=np.array([7, 9, 2], np.uint32)))
+    assert set(messages) == {"/r1/lidar/points", "/r1/labels/label_info", "/r1/odom", "/tf", "/tf_static"}
+    [(log_time, cloud)] = messages["/r1/lidar/points"]
+    assert log_time == stamp_ns(cloud) == START + 50
+    assert cloud.header.frame_id == "r1/lidar"
+    [(_, tf)] = messages["/tf_static"]
+    [transform] = tf.transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("r1/base_link", "r1/lidar")
+
+
+@pytest.mark.parametrize("label_type", ["<u2", ">u2", "<u4"])
+def test_clouds_keep_every_field(tmp_path, label_type):
+    fields = {
+        "labels": np.array([7, 9, 65535], label_type), "rgb": np.array([0x102030, 0xFFFEFD, 0], np.uint32),
+        "intensity": np.array([0.5, 0.25, 1.0]),
+    }  # fmt: skip
+    [(_, cloud)] = read_messages(write_cloud(tmp_path / "r1.mcap", **fields))["/r1/lidar/points"]
+    label = (4, "<u2") if label_type[1:] == "u2" else (6, "<u4")
+    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+        ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), ("intensity", 12, 7, 1), ("rgb", 16, 7, 1),
+        ("label", 20, label[0], 1),
+    ]  # fmt: skip
+    types = ["<f4"] * 4 + ["<u4", label[1]]
+    names = ["x", "y", "z", "intensity", "rgb", "label"]
+    stored = np.frombuffer(cloud.data.tobytes(), list(zip(names, types, strict=True)))
+    assert (cloud.height, cloud.width, cloud.point_step) == (1, 3, stored.dtype.itemsize)
+    assert cloud.row_step == len(cloud.data)
+    assert (cloud.is_bigendian, cloud.is_dense) == (False, False)
+    np.testing.assert_array_equal(np.stack([stored[name] for name in "xyz"], axis=1), POINTS)
+    for name, field in (("label", "labels"), ("rgb", "rgb"), ("intensity", "intensity")):
+        np.testing.assert_array_equal(stored[name], fields[field])
+
+
+def test_a_cloud_needs_coordinates_only_and_may_be_empty(tmp_path):
+    for points, is_dense in ((POINTS[:0], True), (POINTS[:1], True), (POINTS, False)):
+        [(_, cloud)] = read_messages(write_cloud(tmp_path / "r1.mcap", points))["/r1/lidar/points"]
+        assert ([f.name for f in cloud.fields], cloud.width) == (["x", "y", "z"], len(points))
+        assert cloud.is_dense == is_dense
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"labels": np.zeros(2, np.uint16)}, {"labels": np.zeros(3, np.int64)}, {"rgb": np.zeros(4, np.uint32)},
+     {"intensity": np.zeros((3, 1))}],
+)  # fmt: skip
+def test_a_cloud_that_does_not_fit_is_refused(tmp_path, fields):
+    with pytest.raises(
+        InputError, match=r"r1\.mcap: topic '/r1/lidar/points': takes clouds in a lidar's log only, whose"
+    ):
+        write_cloud(tmp_path / "r1.mcap", **fields)
+
+
+def test_a_log_is_a_cameras_or_a_lidars(tmp_path, depth):
+    with (
+        RobotLogWriter(tmp_path / "a.mcap", "r1", CAMERA, None, T_body_sensor=np.eye(4), start_ns=0) as log,
+        pytest.raises(InputError, match="takes clouds in a lidar's log only"),
+    ):
+        log.write_cloud(0, POINTS)
+    with (
+        RobotLogWriter(tmp_path / "b.mcap", "r1", None, None, T_body_sensor=np.eye(4), start_ns=0) as log,
+        pytest.raises(InputError, match="topic '/r1/camera/depth/image_raw': a lidar's log takes no images"),
+    ):
+        log.write_frame(0, depth)

@@ -17,7 +17,7 @@ from mcap.reader import SeekingReader
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
-from octoreplay.config import RunConfig, parse_team
+from octoreplay.config import RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
@@ -33,6 +33,7 @@ from octoreplay.records import (
     RunSummary,
     TickMetrics,
 )
+from octoreplay.team_file import parse_team
 
 
 class ResultReader:
@@ -243,9 +244,13 @@ def _map_state(value: Any) -> MapState:
 
 
 def _frame_counts(stored: dict[str, Any]) -> FrameCounts:
-    """FrameCounts from JSON, whose keys are text."""
-    unknown = {int(label): count for label, count in stored["unknown_label_pixels"].items()}
-    return FrameCounts(**{**stored, "unknown_label_pixels": unknown})
+    """FrameCounts from JSON, whose keys are text; counts that an older version had beside them are left out."""
+    by_number = {
+        name: {int(number): count for number, count in stored.get(name, {}).items()}
+        for name in ("unknown_label_pixels", "unknown_colors")
+    }
+    known = {item.name for item in dataclasses.fields(FrameCounts)}
+    return FrameCounts(**{name: value for name, value in {**stored, **by_number}.items() if name in known})
 
 
 def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> RunSummary:

@@ -13,13 +13,15 @@ from typing import Any, Self
 import numpy as np
 
 from octoreplay import __version__
-from octoreplay.config import RobotConfig, RunConfig, dump_team
+from octoreplay.config import RobotConfig, RunConfig
 from octoreplay.errors import OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.io.results import posterior
 from octoreplay.records import ClassTable, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.team_file import dump_team
+from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
 """Counts incompatible changes of the result format."""
@@ -242,23 +244,21 @@ class ResultWriter:
         if not self.path.parent.is_dir():
             raise OutputError(f"{self.path}: the folder '{self.path.parent}' does not exist")
         for robot in self._config.robots:
-            for log in robot.logs:
-                for file in log_files(log):
+            for path in robot.files:
+                for file in log_files(path):
                     if file.resolve() in (self.path.resolve(), self.partial_path.resolve()):
-                        raise OutputError(f"{self.path}: is a log of robot '{robot.robot_id}'; name another output")
+                        raise OutputError(f"{self.path}: is an input of robot '{robot.robot_id}'; name another output")
 
     def _inputs(self) -> dict[str, Fingerprint]:
         """Fingerprints of all input files by absolute path, in the order of the robots."""
         whole = self._config.output.hash
-        files = [file for robot in self._config.robots for log in robot.logs for file in log_files(log)]
+        files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
 
     def _write_description(self, inputs: dict[str, Fingerprint]) -> None:
         """The metadata that says what this file is and how to make it again."""
         config, folder = self._config, self.path.parent.resolve()
-        robots = tuple(
-            dataclasses.replace(robot, logs=tuple(log.resolve() for log in robot.logs)) for robot in config.robots
-        )
+        robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         self._writer.write_metadata(
             "octoreplay",
             {
@@ -396,21 +396,6 @@ def _vector(transform: Float64Array) -> Float64Array:
 
 
 def _quaternion(transform: Float64Array) -> Any:
-    """geometry_msgs/Quaternion with w >= 0 of a transform's rotation (Shepperd 1978: the largest part first)."""
-    r = transform[:3, :3]
-    trace = float(np.trace(r))
-    squares = np.array([1 + 2 * r[0, 0] - trace, 1 + 2 * r[1, 1] - trace, 1 + 2 * r[2, 2] - trace, 1 + trace])
-    largest = int(np.argmax(squares))
-    products = np.array(
-        [
-            [squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
-            [r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
-            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
-        ]
-    )
-    quaternion = products[largest] / np.linalg.norm(products[largest])
-    if quaternion[3] < 0:
-        quaternion = -quaternion
-    x, y, z, w = (float(part) for part in quaternion)
+    """geometry_msgs/Quaternion of a transform's rotation."""
+    x, y, z, w = rotation_to_quaternion(transform[:3, :3])
     return message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

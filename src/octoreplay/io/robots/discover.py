@@ -3,52 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from octoreplay.class_tables.edits import edited
 from octoreplay.config import RobotConfig, RunConfig, TimeConfig
 from octoreplay.errors import ConfigError, InputError, OctoreplayError
-from octoreplay.io.containers.log_reader import DECODABLE_ENCODINGS, LogReader, TopicInfo, first_message
+from octoreplay.io.containers.log_reader import TopicInfo, first_whole_message
 from octoreplay.io.containers.logs import open_log
+from octoreplay.io.messages.decoders import ENCODINGS, DamagedMessageError
+from octoreplay.io.messages.sensor_messages import Kind, LabelNames, Transforms, kind_of
 from octoreplay.io.robots.pose_source import (
-    ODOMETRY,
-    POSE_TYPES,
-    STAMPED_POSES,
-    TF_TYPES,
-    is_static_tf,
+    POSE_KINDS,
     load_static_transforms,
+    moving_tf_names,
     tf_topics,
 )
 from octoreplay.io.robots.poses import FrameTree, frame_name
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.sensors.clouds import label_field
-from octoreplay.io.sensors.images import DEPTH_ENCODINGS, LABEL_ENCODINGS
-from octoreplay.io.sensors.labels import OCCUPIED, class_table_from_names, label_names
+from octoreplay.io.robots.survey import CLOUDS, IMAGES, Look, Survey, survey_log
+from octoreplay.io.sensors.labels import OCCUPIED, class_table_from_names
 from octoreplay.records import ClassTable
 
-IMAGE = "sensor_msgs/msg/Image"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-CLOUD = "sensor_msgs/msg/PointCloud2"
-LABEL_INFO = "vision_msgs/msg/LabelInfo"
-
-_DEPTH_HINTS = ("depth", "range", "disparity_z")
-_LABEL_HINTS = ("label", "semantic", "segment", "class")
 # Poses that are wished for, not measured.
 _NO_POSE_HINTS = ("goal", "initialpose", "initial_pose", "target", "setpoint")
 # How much of TF is read to find the root of a robot's frames.
 _TF_SAMPLE_NS = 5_000_000_000
 _TF_SAMPLE_MESSAGES = 5_000
 
-_ROLE_TYPES: Mapping[str, tuple[tuple[str, ...], str]] = {
-    "depth_topic": ((IMAGE,), "image"),
-    "label_topic": ((IMAGE,), "image"),
-    "camera_info_topic": ((CAMERA_INFO,), "CameraInfo"),
-    "cloud_topic": ((CLOUD,), "point cloud"),
-    "pose_topic": (POSE_TYPES, "pose"),
-    "label_info_topic": ((LABEL_INFO,), "LabelInfo"),
+_ROLE_KINDS: Mapping[str, tuple[tuple[Kind, ...], str]] = {
+    "depth_topic": (IMAGES, "image"),
+    "label_topic": (IMAGES, "image"),
+    "confidence_topic": (IMAGES, "image"),
+    "camera_info_topic": ((Kind.CAMERA_INFO,), "CameraInfo"),
+    "cloud_topic": (CLOUDS, "point cloud or laser scan"),
+    "pose_topic": (POSE_KINDS, "pose"),
+    "label_info_topic": ((Kind.LABEL_INFO,), "LabelInfo"),
 }
 
 T = TypeVar("T")
@@ -71,7 +66,10 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """One log: its span in log time (None where it is empty), its topics, and what is damaged."""
+    """One log: its span in log time (None where it is empty), its topics, and what is damaged.
+
+    ``error`` says why it cannot be opened; None where it can.
+    """
 
     path: Path
     start_ns: int | None
@@ -79,6 +77,7 @@ class LogSummary:
     num_messages: int
     topics: tuple[TopicSummary, ...]
     damage: str | None
+    error: str | None = None
 
 
 @dataclass(frozen=True)
@@ -107,35 +106,11 @@ class LogDescription:
 
 
 @dataclass(frozen=True)
-class _Look:
-    """What the first message of an image or cloud topic shows."""
-
-    encoding: str
-    size: tuple[int, int]
-    frame_id: str
-    has_labels: bool
-    detail: str
-
-
-@dataclass(frozen=True)
-class _Survey:
-    """One log's topics and what its sensor topics look like."""
-
-    path: Path
-    start_ns: int | None
-    end_ns: int | None
-    num_messages: int
-    topics: tuple[TopicInfo, ...]
-    looks: Mapping[str, _Look]
-    damage: str | None
-
-
-@dataclass(frozen=True)
 class _Group:
-    """One robot to be: its logs, and the namespace that is its own where a log holds several robots."""
+    """One robot to be: its logs, and the name that its topics are known by where a log holds several robots."""
 
     robot_id: str
-    surveys: tuple[_Survey, ...]
+    surveys: tuple[Survey, ...]
     namespace: str | None
 
 
@@ -149,45 +124,59 @@ def discover(logs: Sequence[Path]) -> tuple[RobotConfig, ...]:
     such namespaces hold a sensor and a pose each. Raises ConfigError where several topics could be meant (its text
     lists them as lines of a team file), InputError where a log has no depth image, point cloud or pose.
     """
-    return tuple(_find(_blank(group), group) for group in _groups([_survey(path) for path in logs]))
+    with ExitStack() as stack:
+        surveys = [survey_log(stack.enter_context(open_log(path))) for path in logs]
+        return tuple(_find(_blank(group), group) for group in _groups(surveys))
 
 
 def resolve(config: RunConfig) -> RunConfig:
     """The configuration with every topic and frame that a robot leaves out, and the class table, filled from the logs.
 
-    The class table is the configured one; else that of the logs' LabelInfo, united by name over the robots; else, where
-    no robot has labels, the single class 'occupied'. Raises InputError where a named topic is missing or of another
-    type, ConfigError as ``discover`` does, and where there are labels without a class table or for some robots only.
+    The class table is the configured one; else that of the logs' LabelInfo, united by name over the robots, merged and
+    ignored as configured; else, where no robot has labels, the single class 'occupied'. Raises InputError where a named
+    topic is missing or of another type, ConfigError as ``discover`` does, and where there are labels without a class
+    table or for some robots only.
     """
-    surveys = {path: _survey(path) for path in dict.fromkeys(itertools.chain(*(r.logs for r in config.robots)))}
-    robots, labelled = [], []
-    for robot in config.robots:
-        group = _group_of(robot, tuple(surveys[path] for path in robot.logs))
-        robots.append(_find(robot, group))
-        labelled.append(_has_labels(robots[-1], group))
-    classes = config.classes or _class_table(robots, labelled)
-    if classes.num_classes > 1 and not all(labelled):
-        without = robots[labelled.index(False)].robot_id
-        raise ConfigError(
-            f"robot '{without}' has no labels, but the team has {classes.num_classes} classes; name its label_topic, "
-            f"or map all robots without labels (label_topic: '' and one class)"
-        )
-    return dataclasses.replace(config, robots=tuple(robots), classes=classes)
+    with ExitStack() as stack:
+        paths = dict.fromkeys(itertools.chain(*(robot.logs for robot in config.robots)))
+        surveys = {path: survey_log(stack.enter_context(open_log(path))) for path in paths}
+        groups = [_group_of(robot, tuple(surveys[path] for path in robot.logs)) for robot in config.robots]
+        robots = [_find(robot, group) for robot, group in zip(config.robots, groups, strict=True)]
+        labelled = [_has_labels(robot, group) for robot, group in zip(robots, groups, strict=True)]
+        classes = config.classes
+        if classes is None:
+            classes = edited(_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
+    _check_labelled(classes, robots, labelled)
+    return dataclasses.replace(config, robots=tuple(robots), classes=classes, merge_classes=(), ignore_hits=())
 
 
 def describe(logs: Sequence[Path]) -> LogDescription:
-    """What is in some logs, and what they lack for a run. Raises InputError where a log cannot be opened."""
-    surveys = [_survey(path) for path in logs]
-    missing: list[str] = []
-    groups = _attempt(lambda: _groups(surveys), missing) or []
-    robots = [_robot_summary(group) for group in groups]
+    """What is in some logs, and what they lack for a run; a log that cannot be opened says why in its summary."""
+    with ExitStack() as stack:
+        errors: dict[Path, list[str]] = {path: [] for path in logs}
+
+        def look(path: Path) -> Survey:
+            return survey_log(stack.enter_context(open_log(path)))
+
+        found = {path: _attempt(functools.partial(look, path), errors[path]) for path in logs}
+        surveys = [survey for survey in found.values() if survey is not None]
+        missing: list[str] = []
+        groups = (_attempt(lambda: _groups(surveys), missing) or []) if surveys else []
+        robots = [_robot_summary(group) for group in groups]
+        configs = [summary.robot for summary in robots]
+        labelled = [_has_labels(config, group) for config, group in zip(configs, groups, strict=True)]
+        classes = None
+        if configs:
+            classes = _attempt(lambda: edited(_class_table(configs, groups, labelled), (), ()), missing)
+        if classes is not None:
+            _attempt(functools.partial(_check_labelled, classes, configs, labelled), missing)
     spans = [(r.start_ns, r.end_ns) for r in robots if r.start_ns is not None and r.end_ns is not None]
     start, end = max((s for s, _ in spans), default=0), min((e for _, e in spans), default=0)
-    configs = [summary.robot for summary in robots]
-    labelled = [_has_labels(config, group) for config, group in zip(configs, groups, strict=True)]
-    classes = _attempt(lambda: _class_table(configs, labelled), missing) if configs else None
     return LogDescription(
-        logs=tuple(_log_summary(survey) for survey in surveys),
+        logs=tuple(
+            _log_summary(survey) if survey else LogSummary(path, None, None, 0, (), None, error=errors[path][0])
+            for path, survey in found.items()
+        ),
         robots=tuple(robots),
         overlap_ns=(start, end) if spans and start <= end else None,
         class_table=classes,
@@ -195,48 +184,19 @@ def describe(logs: Sequence[Path]) -> LogDescription:
     )
 
 
-# --- surveying logs --------------------------------------------------------------------------------------------------
+# --- what is there ---------------------------------------------------------------------------------------------------
 
 
-def _survey(path: Path) -> _Survey:
-    """A log's topics; of each image and cloud topic the first message is looked at."""
-    with open_log(path) as log:
-        looks = {}
-        for topic in log.topics:
-            if topic.type_name in (IMAGE, CLOUD) and topic.encoding in DECODABLE_ENCODINGS and topic.num_messages:
-                look = _look(log, topic)
-                if look is not None:
-                    looks[topic.name] = look
-        return _Survey(path, log.start_ns, log.end_ns, log.message_count, log.topics, looks, log.damage)
-
-
-def _look(log: LogReader, topic: TopicInfo) -> _Look | None:
-    """What a topic's first message shows; None where it cannot be decoded."""
-    message = first_message(log, topic.name)
-    if message is None or message.type_name not in (IMAGE, CLOUD):
-        return None
-    try:
-        value = message.decode()
-    except InputError:
-        return None
-    size = (int(value.width), int(value.height))
-    frame_id = frame_name(value.header.frame_id)
-    if message.type_name == IMAGE:
-        return _Look(value.encoding, size, frame_id, False, f"{value.encoding} {size[0]}x{size[1]}")
-    fields = ", ".join(field.name for field in value.fields)
-    return _Look("", size, frame_id, label_field(value) is not None, f"{size[0]}x{size[1]}: {fields}")
-
-
-def _log_summary(survey: _Survey) -> LogSummary:
+def _log_summary(found: Survey) -> LogSummary:
     """A survey as the user sees it."""
-    span = 0.0 if survey.start_ns is None or survey.end_ns is None else (survey.end_ns - survey.start_ns) / 1e9
+    span = 0.0 if found.start_ns is None or found.end_ns is None else (found.end_ns - found.start_ns) / 1e9
     topics = []
-    for topic in survey.topics:
-        look = survey.looks.get(topic.name)
+    for topic in found.topics:
+        look = found.looks.get(topic.name)
         rate = (topic.num_messages - 1) / span if topic.num_messages > 1 and span > 0 else None
-        detail = look.detail if look is not None and topic.type_name in (IMAGE, CLOUD) else ""
+        detail = look.detail if look is not None and kind_of(topic.type_name) is look.kind else ""
         topics.append(TopicSummary(topic.name, topic.type_name, topic.encoding, topic.num_messages, rate, detail))
-    return LogSummary(survey.path, survey.start_ns, survey.end_ns, survey.num_messages, tuple(topics), survey.damage)
+    return LogSummary(found.path, found.start_ns, found.end_ns, found.num_messages, tuple(topics), found.damage)
 
 
 def _robot_summary(group: _Group) -> RobotSummary:
@@ -244,7 +204,7 @@ def _robot_summary(group: _Group) -> RobotSummary:
     missing: list[str] = []
     robot = _find(_blank(group), group, missing)
     if not missing:
-        _attempt(lambda: RobotLog(robot, TimeConfig(), None).close(), missing)
+        _attempt(lambda: RobotLog(robot, TimeConfig(), None, logs=[survey.log for survey in group.surveys]), missing)
     starts = [s.start_ns for s in group.surveys if s.start_ns is not None]
     ends = [s.end_ns for s in group.surveys if s.end_ns is not None]
     return RobotSummary(robot, min(starts, default=None), max(ends, default=None), tuple(missing))
@@ -269,15 +229,15 @@ def _blank(group: _Group) -> RobotConfig:
     return RobotConfig(group.robot_id, tuple(survey.path for survey in group.surveys))
 
 
-def _groups(surveys: Sequence[_Survey]) -> list[_Group]:
+def _groups(surveys: Sequence[Survey]) -> list[_Group]:
     """The robots of some logs: several of one log by namespace, each of the others by its file."""
     if not surveys:
         raise ConfigError("no logs given")
-    shared: dict[str, list[_Survey]] = {}
+    shared: dict[str, list[Survey]] = {}
     groups: list[_Group] = []
-    names = _file_names([survey.path for survey in surveys if not _namespaces(survey)])
+    names = _file_names([survey.path for survey in surveys if not survey.robots])
     for survey in surveys:
-        namespaces = _namespaces(survey)
+        namespaces = survey.robots
         for namespace in namespaces:
             shared.setdefault(namespace, []).append(survey)
         if not namespaces:
@@ -295,34 +255,15 @@ def _file_names(paths: Sequence[Path]) -> dict[Path, str]:
     raise ConfigError(f"{repeated}: two logs would both be robot '{repeated.stem}'; name the robots in a team file")
 
 
-def _namespaces(survey: _Survey) -> tuple[str, ...]:
-    """The namespaces of a log's robots where it holds several, else nothing."""
-    found = []
-    for namespace in dict.fromkeys(_first_part(topic) for topic in _sensor_topics(survey)):
-        has_pose = any(
-            _first_part(topic.name) == namespace and topic.name.count("/") > 1 and topic.type_name in POSE_TYPES
-            for topic in survey.topics
-        )
-        has_frame = any(
-            look.frame_id.startswith(f"{namespace}/")
-            for topic, look in survey.looks.items()
-            if _first_part(topic) == namespace
-        )
-        if has_pose or has_frame:
-            found.append(namespace)
-    return tuple(found) if len(found) > 1 else ()
-
-
-def _sensor_topics(survey: _Survey) -> list[str]:
-    """The topics of a log that a map can be made from."""
-    return [topic for topic, look in survey.looks.items() if _is_depth(topic, look) or not look.encoding]
-
-
-def _group_of(robot: RobotConfig, surveys: tuple[_Survey, ...]) -> _Group:
+def _group_of(robot: RobotConfig, surveys: tuple[Survey, ...]) -> _Group:
     """The part of its logs in which a robot's missing topics are looked for."""
-    namespaces = set(itertools.chain(*(_namespaces(survey) for survey in surveys)))
+    namespaces = set(itertools.chain(*(survey.robots for survey in surveys)))
     named = robot.depth_topic or robot.cloud_topic
-    namespace = _first_part(named) if named else robot.robot_id
+    owners = {topic: owner for survey in surveys for topic, owner in survey.owners.items()}
+    if named and named not in owners:
+        # A sensor that is none of theirs; what else the robot has must be named too.
+        return _Group(robot.robot_id, surveys, None)
+    namespace = owners[named] if named else robot.robot_id
     if namespaces and namespace not in namespaces:
         raise ConfigError(
             f"robot '{robot.robot_id}': {surveys[0].path} holds the robots {', '.join(sorted(namespaces))}; "
@@ -338,8 +279,10 @@ def _find(robot: RobotConfig, group: _Group, problems: list[str] | None = None) 
     """The robot with its missing topics and frames filled; problems are raised, or noted and stepped over."""
     _attempt(lambda: _check_named_topics(robot, group), problems)
     found = _fill(robot, _attempt(lambda: _find_sensor(robot, group), problems))
+    _attempt(lambda: _check_named_fields(found, group), problems)
     if found.depth_topic is not None:
         found = _fill(found, _attempt(lambda: _find_labels(found, group), problems))
+        found = _fill(found, _attempt(lambda: _find_confidences(found, group), problems))
         found = _fill(found, _attempt(lambda: _find_camera_info(found, group), problems))
     found = _fill(found, _attempt(lambda: _find_label_info(found, group), problems))
     found = _fill(found, _attempt(lambda: _find_pose(found, group), problems))
@@ -358,21 +301,32 @@ def _fill(robot: RobotConfig, found: Mapping[str, str | None] | None) -> RobotCo
 
 def _check_named_topics(robot: RobotConfig, group: _Group) -> None:
     """Raise InputError where a topic that the robot names is not in its logs, or is of another type."""
-    for role, (types, what) in _ROLE_TYPES.items():
+    for role, (kinds, what) in _ROLE_KINDS.items():
         name = getattr(robot, role)
         if not name:
             continue
         infos = [topic for survey in group.surveys for topic in survey.topics if topic.name == name]
-        alike = sorted({t.name for survey in group.surveys for t in survey.topics if t.type_name in types})
+        alike = sorted({t.name for survey in group.surveys for t in survey.topics if kind_of(t.type_name) in kinds})
         offer = f"{what} topics: {', '.join(repr(n) for n in alike)}" if alike else f"there are no {what} topics"
         if not infos:
             raise InputError(f"{_paths(group)}: topic '{name}' not found; {offer}")
-        if not any(info.type_name in types for info in infos):
+        if not any(kind_of(info.type_name) in kinds for info in infos):
             raise InputError(f"{_paths(group)}: topic '{name}' is of type {infos[0].type_name}, no {role}; {offer}")
-        bad = next((info for info in infos if info.encoding not in DECODABLE_ENCODINGS), None)
+        bad = next((info for info in infos if info.encoding not in ENCODINGS), None)
         if bad is not None:
             raise InputError(
-                f"{_paths(group)}: topic '{name}' is encoded as {bad.encoding}; only ROS messages are read"
+                f"{_paths(group)}: topic '{name}' is encoded as {bad.encoding}; {', '.join(ENCODINGS)} can be read"
+            )
+
+
+def _check_named_fields(robot: RobotConfig, group: _Group) -> None:
+    """Raise InputError where a field that the robot names is not in its clouds."""
+    look = _looks(group).get(robot.cloud_topic or "")
+    for name in (robot.label_field, robot.confidence_field):
+        if name and look is not None and look.fields and name not in look.fields:
+            raise InputError(
+                f"{_paths(group)}: the points of '{robot.cloud_topic}' have no field '{name}'; their fields are "
+                f"{', '.join(look.fields)}"
             )
 
 
@@ -381,18 +335,21 @@ def _find_sensor(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
     if robot.depth_topic or robot.cloud_topic:
         return {}
     looks = _looks(group)
-    depths = [topic for topic, look in looks.items() if _is_depth(topic, look)]
+    depths = [topic for topic, look in looks.items() if look.is_depth]
     if len(depths) > 1:
         # Depth that is registered to the camera of the labels has their size and frame.
-        label_looks = {(look.size, look.frame_id) for topic, look in looks.items() if _is_label(topic, look)}
+        label_looks = {(look.size, look.frame_id) for look in looks.values() if look.is_label}
         registered = [topic for topic in depths if (looks[topic].size, looks[topic].frame_id) in label_looks]
         depths = registered if len(registered) == 1 else depths
     if depths:
         return {"depth_topic": _only(depths, "depth_topic", "depth images", robot, group)}
-    clouds = [topic for topic, look in looks.items() if not look.encoding]
-    if clouds:
-        return {"cloud_topic": _only(clouds, "cloud_topic", "point clouds", robot, group)}
-    raise InputError(f"{_paths(group)}: no depth image and no point cloud to map; {_contents(group)}")
+    for kind, what in ((Kind.CLOUD, "point clouds"), (Kind.SCAN, "laser scans")):
+        clouds = [topic for topic, look in looks.items() if look.kind is kind]
+        # Of several clouds the one with labels is the one to map.
+        labelled = [topic for topic in clouds if looks[topic].has_labels]
+        if clouds:
+            return {"cloud_topic": _only(labelled if len(labelled) == 1 else clouds, "cloud_topic", what, robot, group)}
+    raise InputError(f"{_paths(group)}: no depth image, point cloud or laser scan to map; {_contents(group)}")
 
 
 def _find_labels(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
@@ -400,18 +357,33 @@ def _find_labels(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
     if robot.label_topic is not None:
         return {}
     looks = _looks(group)
-    labels = [t for t, look in looks.items() if t != robot.depth_topic and _is_label(t, look)]
+    labels = [topic for topic, look in looks.items() if topic != robot.depth_topic and look.is_label]
     depth = looks.get(robot.depth_topic or "")
     alike = [topic for topic in labels if depth is not None and looks[topic].size == depth.size]
-    nearest = _nearest(alike or labels, str(robot.depth_topic))
+    # Labels as ids say more than their picture in colours.
+    ids = [topic for topic in alike or labels if not looks[topic].is_color]
+    nearest = _nearest(ids or alike or labels, str(robot.depth_topic))
     return {"label_topic": _only(nearest, "label_topic", "label images", robot, group) if nearest else None}
+
+
+def _find_confidences(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
+    """The image that says how sure the labels are; nothing where the log has none."""
+    if robot.confidence_topic is not None or not robot.label_topic:
+        return {}
+    looks = _looks(group)
+    depth = looks.get(robot.depth_topic or "")
+    alike = [topic for topic, look in looks.items() if look.is_confidence and depth and look.size == depth.size]
+    nearest = _nearest(alike, robot.label_topic)
+    return (
+        {"confidence_topic": _only(nearest, "confidence_topic", "confidence images", robot, group)} if nearest else {}
+    )
 
 
 def _find_camera_info(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
     """The CameraInfo nearest to the depth image in name."""
     if robot.camera_info_topic is not None or robot.intrinsics is not None:
         return {}
-    infos = _nearest(_topics_of(group, (CAMERA_INFO,)), str(robot.depth_topic))
+    infos = _nearest(_topics_of(group, (Kind.CAMERA_INFO,)), str(robot.depth_topic))
     if not infos:
         raise InputError(
             f"{_paths(group)}: there is no CameraInfo for '{robot.depth_topic}'; "
@@ -424,26 +396,33 @@ def _find_label_info(robot: RobotConfig, group: _Group) -> dict[str, str | None]
     """The LabelInfo that goes with the labels; nothing where the log has none."""
     if robot.label_info_topic is not None or not (robot.label_topic or robot.cloud_topic):
         return {}
-    infos = _nearest(_topics_of(group, (LABEL_INFO,)), str(robot.label_topic or robot.cloud_topic))
+    # One for all robots of a log belongs to none of them.
+    there = _topics_of(group, (Kind.LABEL_INFO,)) or _topics_of_nobody(group, Kind.LABEL_INFO)
+    infos = _nearest(there, str(robot.label_topic or robot.cloud_topic))
     return {"label_info_topic": _only(infos, "label_info_topic", "LabelInfo topics", robot, group) if infos else None}
 
 
 def _find_pose(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
     """Where the poses come from: odometry, else stamped poses that can be used, else TF."""
-    if robot.pose_topic is not None:
+    if robot.pose_topic is not None or robot.pose_file is not None:
         return {}
-    odometry = _topics_of(group, (ODOMETRY,))
+    odometry = _topics_of(group, (Kind.ODOMETRY,))
     if odometry:
         return {"pose_topic": _only(odometry, "pose_topic", "odometry topics", robot, group)}
-    stamped = [t for t in _topics_of(group, STAMPED_POSES) if not any(hint in t.lower() for hint in _NO_POSE_HINTS)]
-    moving = [topic for topic in _tf_of(robot, group) if not is_static_tf(topic)]
+    stamped = [
+        t for t in _topics_of(group, (Kind.POSE, Kind.PATH)) if not any(hint in t.lower() for hint in _NO_POSE_HINTS)
+    ]
+    moving = moving_tf_names(_tf_of(robot, group))
     # A stamped pose does not say what it is the pose of, so TF is better unless the team file says it.
     if stamped and (robot.T_body_sensor is not None or not moving):
         return {"pose_topic": _only(stamped, "pose_topic", "pose topics", robot, group)}
     if moving:
         return {"pose_topic": moving[0]}
-    still = "; if the sensor stands still, give pose_topic: /tf_static" if _tf_of(robot, group) else ""
-    raise InputError(f"{_paths(group)}: no poses (Odometry, PoseStamped or /tf) for robot '{robot.robot_id}'{still}")
+    still = ", or, if the sensor stands still, pose_topic: /tf_static" if _tf_of(robot, group) else ""
+    raise InputError(
+        f"{_paths(group)}: no poses (odometry, stamped poses, a path or TF) for robot '{robot.robot_id}'; give "
+        f"pose_file: a trajectory in TUM's or KITTI's format{still}"
+    )
 
 
 def _find_frames(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
@@ -453,44 +432,55 @@ def _find_frames(robot: RobotConfig, group: _Group) -> dict[str, str | None]:
     found = {"sensor_frame": sensor_frame}
     if robot.map_frame is not None:
         return found
-    paths = [survey.path for survey in group.surveys]
-    is_tf = any(t.name == robot.pose_topic and t.type_name in TF_TYPES for s in group.surveys for t in s.topics)
-    found["map_frame"] = _root_frame(robot, paths, sensor_frame) if is_tf else _pose_frame(paths, str(robot.pose_topic))
+    infos = [topic for survey in group.surveys for topic in survey.topics if topic.name == robot.pose_topic]
+    is_tf = any(kind_of(topic.type_name) is Kind.TF for topic in infos)
+    if is_tf:
+        found["map_frame"] = _root_frame(robot, group, sensor_frame)
+    else:
+        found["map_frame"] = _pose_frame(group.surveys, str(robot.pose_topic))
     return found
 
 
-def _pose_frame(paths: Sequence[Path], topic: str) -> str | None:
+def _pose_frame(surveys: Sequence[Survey], topic: str) -> str | None:
     """The frame that a pose topic's poses are in."""
-    for path in paths:
-        with open_log(path) as log:
-            message = first_message(log, topic)
-            if message is not None:
-                return frame_name(message.header_frame_id()) or None
+    for survey in surveys:
+        message = first_whole_message(survey.log, topic, POSE_KINDS)
+        if message is not None:
+            poses = message.sensor_message()
+            parents = [pose.parent for pose in poses.transforms] if isinstance(poses, Transforms) else []
+            return frame_name(parents[0]) or None if parents else None
     return None
 
 
-def _root_frame(robot: RobotConfig, paths: Sequence[Path], sensor_frame: str | None) -> str:
+def _root_frame(robot: RobotConfig, group: _Group, sensor_frame: str | None) -> str:
     """The frame at the top of TF above the sensor, from the static transforms and the first seconds of the others."""
     if sensor_frame is None:
         raise InputError(
-            f"{paths[0]}: the messages of '{robot.depth_topic or robot.cloud_topic}' name no frame; give sensor_frame"
+            f"{_paths(group)}: the messages of '{robot.depth_topic or robot.cloud_topic}' name no frame; "
+            f"give sensor_frame"
         )
     tree = FrameTree(0)
     sensor_topic = str(robot.depth_topic or robot.cloud_topic)
-    for path in paths:
-        with open_log(path) as log:
-            topics = tf_topics(log.topics, sensor_topic)
-            load_static_transforms(tree, [log], topics)
-            moving = [topic for topic in topics if not is_static_tf(topic)]
-            end = (log.start_ns or 0) + _TF_SAMPLE_NS
-            for message in itertools.islice(log.messages(moving), _TF_SAMPLE_MESSAGES):
-                if message.log_time_ns > end:
-                    break
-                tree.add_message(message.decode(), is_static=False)
+    for log in (survey.log for survey in group.surveys):
+        topics = tf_topics(log.topics, sensor_topic)
+        load_static_transforms(tree, [log], topics)
+        moving = moving_tf_names(topics)
+        end = (log.start_ns or 0) + _TF_SAMPLE_NS
+        for message in itertools.islice(log.messages(moving), _TF_SAMPLE_MESSAGES):
+            if message.log_time_ns > end:
+                break
+            try:
+                found = message.sensor_message()
+            except DamagedMessageError:
+                continue
+            if isinstance(found, Transforms):
+                tree.add_transforms(found, is_static=False)
     root = tree.root_of(sensor_frame)
     if root == sensor_frame:
         known = ", ".join(tree.frames[:12]) or "none"
-        raise InputError(f"{paths[0]}: TF knows no frame above the sensor's frame '{sensor_frame}'; frames: {known}")
+        raise InputError(
+            f"{_paths(group)}: TF knows no frame above the sensor's frame '{sensor_frame}'; frames: {known}"
+        )
     return root
 
 
@@ -501,91 +491,96 @@ def _has_labels(robot: RobotConfig, group: _Group) -> bool:
     """True where the robot's log gives labels."""
     if robot.cloud_topic is not None and robot.label_topic is None:
         look = _looks(group).get(robot.cloud_topic)
+        if robot.label_field is not None:
+            return robot.label_field != ""
         return look is not None and look.has_labels
     return bool(robot.label_topic)
 
 
-def _class_table(robots: Sequence[RobotConfig], labelled: Sequence[bool]) -> ClassTable:
+def _class_table(robots: Sequence[RobotConfig], groups: Sequence[_Group], labelled: Sequence[bool]) -> ClassTable:
     """The team's class table from the LabelInfo of the robots with labels; 'occupied' where none has labels."""
     if not any(labelled):
         return OCCUPIED
     names: dict[str, Mapping[int, str]] = {}
-    for robot in itertools.compress(robots, labelled):
-        message = _label_info(robot)
-        if message is not None:
-            names[robot.robot_id] = label_names(message)
+    for robot, group in itertools.compress(zip(robots, groups, strict=True), labelled):
+        found = _label_info(robot, group)
+        if found is not None:
+            names[robot.robot_id] = found.names
     if not names:
         topics = [str(robot.label_topic or robot.cloud_topic) for robot in itertools.compress(robots, labelled)]
         raise ConfigError(
             f"labels on '{topics[0]}' but no LabelInfo says what they mean; give 'classes' in the team file, "
-            f"such as classes: [{{name: ground, raw_labels: [1]}}, {{name: tree, raw_labels: [2]}}]"
+            f"such as classes: [{{name: ground, raw_labels: [1]}}, {{name: tree, raw_labels: [2]}}], or --classes"
         )
     return class_table_from_names(names)
 
 
-def _label_info(robot: RobotConfig) -> Any | None:
+def _check_labelled(classes: ClassTable, robots: Sequence[RobotConfig], labelled: Sequence[bool]) -> None:
+    """Raise ConfigError where only some robots have labels."""
+    if classes.num_classes > 1 and not all(labelled):
+        without = robots[labelled.index(False)].robot_id
+        raise ConfigError(
+            f"robot '{without}' has no labels, but the team has {classes.num_classes} classes; name its label_topic, "
+            f"or map all robots without labels (label_topic: '' and one class)"
+        )
+
+
+def _label_info(robot: RobotConfig, group: _Group) -> LabelNames | None:
     """The robot's first LabelInfo message, from anywhere in its logs."""
     if robot.label_info_topic is None:
         return None
-    for path in robot.logs:
-        with open_log(path) as log:
-            message = first_message(log, robot.label_info_topic)
-            if message is not None:
-                return message.decode()
+    for survey in group.surveys:
+        message = first_whole_message(survey.log, robot.label_info_topic, (Kind.LABEL_INFO,))
+        found = None if message is None else message.sensor_message()
+        if isinstance(found, LabelNames):
+            return found
     return None
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
 
 
-def _is_depth(topic: str, look: _Look) -> bool:
-    """True for a depth image, by its encoding and, where labels and thermal images share that, by its name."""
-    name = topic.lower()
-    if look.encoding not in DEPTH_ENCODINGS or any(hint in name for hint in _LABEL_HINTS):
-        return False
-    return look.encoding in ("32FC1", "16UC1") or any(hint in name for hint in _DEPTH_HINTS)
-
-
-def _is_label(topic: str, look: _Look) -> bool:
-    """True for a label image: an encoding that only labels have, or one that they share and a name that says so."""
-    if look.encoding not in LABEL_ENCODINGS:
-        return False
-    return look.encoding in ("16SC1", "32SC1") or any(hint in topic.lower() for hint in _LABEL_HINTS)
-
-
-def _looks(group: _Group) -> dict[str, _Look]:
+def _looks(group: _Group) -> dict[str, Look]:
     """The sensor topics of a robot, sorted by name."""
     looks = {topic: look for survey in reversed(group.surveys) for topic, look in survey.looks.items()}
     return {topic: looks[topic] for topic in sorted(looks) if _is_own(topic, group)}
 
 
-def _topics_of(group: _Group, types: Collection[str]) -> list[str]:
-    """The names of a robot's topics of some types that hold messages that can be read, sorted."""
+def _topics_of(group: _Group, kinds: Collection[Kind]) -> list[str]:
+    """The names of a robot's topics of some kinds that hold messages that can be read, sorted."""
     return sorted(
         {
             topic.name
             for survey in group.surveys
             for topic in survey.topics
-            if topic.type_name in types and topic.num_messages and topic.encoding in DECODABLE_ENCODINGS
+            if kind_of(topic.type_name) in kinds and _is_readable(topic)
             if _is_own(topic.name, group)
         }
     )
 
 
-def _tf_of(robot: RobotConfig, group: _Group) -> tuple[str, ...]:
+def _is_readable(topic: TopicInfo) -> bool:
+    """True for a topic with messages that can be decoded."""
+    return topic.num_messages > 0 and topic.encoding in ENCODINGS
+
+
+def _topics_of_nobody(group: _Group, kind: Kind) -> list[str]:
+    """The names of topics of a kind that belong to none of the robots that share the logs, sorted."""
+    shared = (topic for survey in group.surveys for topic in survey.topics if topic.name not in survey.owners)
+    return sorted(
+        {t.name for t in shared if kind_of(t.type_name) is kind and t.num_messages and t.encoding in ENCODINGS}
+    )
+
+
+def _tf_of(robot: RobotConfig, group: _Group) -> tuple[TopicInfo, ...]:
     """The TF topics that concern a robot."""
     infos = [topic for survey in group.surveys for topic in survey.topics if topic.num_messages]
     return tf_topics(infos, str(robot.depth_topic or robot.cloud_topic))
 
 
 def _is_own(topic: str, group: _Group) -> bool:
-    """True where a topic belongs to the robot's namespace, or the log to it alone."""
-    return group.namespace is None or _first_part(topic) == group.namespace
-
-
-def _first_part(topic: str) -> str:
-    """The first part of a topic's name."""
-    return topic.strip("/").split("/", 1)[0]
+    """True where a topic belongs to the robot, or the log to it alone."""
+    return group.namespace is None or any(s.owners.get(topic) == group.namespace for s in group.surveys)
 
 
 def _nearest(topics: Iterable[str], to: str) -> list[str]:
@@ -623,7 +618,7 @@ def _contents(group: _Group) -> str:
     if not topics:
         return "the log holds no messages"
     encodings = {topic.encoding for topic in topics}
-    if encodings.isdisjoint(DECODABLE_ENCODINGS):
-        return f"its messages are encoded as {', '.join(sorted(encodings))}, and only ROS messages are read"
+    if encodings.isdisjoint(ENCODINGS):
+        return f"its messages are encoded as {', '.join(sorted(encodings))}; {', '.join(ENCODINGS)} can be read"
     names = sorted({topic.type_name for topic in topics})
     return f"its messages are {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"

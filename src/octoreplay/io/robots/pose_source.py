@@ -1,55 +1,66 @@
-"""Where a robot's sensor is at a stamp: from a pose topic and TF, or from TF alone."""
+"""Where a robot's sensor is at a stamp: from a pose topic or a trajectory file and TF, or from TF alone."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
-from typing import Any, TypeAlias
+from contextlib import suppress
+from typing import Self, TypeAlias
 
 import numpy as np
 
 from octoreplay.config import RobotConfig
 from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo, first_message
-from octoreplay.io.messages.ros_types import stamp_to_ns
-from octoreplay.io.robots.poses import FrameTree, PoseTrack, frame_name, transform_of
+from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.messages.sensor_messages import Kind, Transforms, kind_of
+from octoreplay.io.robots.poses import FrameTree, PoseTrack, frame_name
+from octoreplay.io.robots.trajectories import Trajectory, TrajectoryRows, read_rows, read_times, trajectory
 from octoreplay.records import Float64Array
+from octoreplay.transforms import normalise, transform_of
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-STAMPED_POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 Link: TypeAlias = tuple[str, str]
 """A transform that TF must give: its target frame and its source frame."""
 
-POSE_TYPES = (ODOMETRY, *STAMPED_POSES, *TF_TYPES)
-"""Message types that a pose topic can have."""
+POSE_KINDS = (Kind.ODOMETRY, Kind.POSE, Kind.PATH, Kind.TF)
+"""What a pose topic can be."""
 
 
-def is_static_tf(topic: str) -> bool:
-    """True for the topic of transforms that never change."""
-    return topic.rsplit("/", 1)[-1] == "tf_static"
+def is_static_tf(topic: TopicInfo) -> bool:
+    """True for a topic of transforms that never change: by its name, or a Foxglove topic that says it only once."""
+    return "static" in topic.name.rsplit("/", 1)[-1] or (
+        topic.type_name.startswith("foxglove") and topic.num_messages == 1
+    )
 
 
-def tf_topics(topics: Collection[TopicInfo], sensor_topic: str) -> tuple[str, ...]:
+def tf_topics(topics: Collection[TopicInfo], sensor_topic: str) -> tuple[TopicInfo, ...]:
     """The TF topics that concern a sensor topic: those in a namespace above it, else all."""
-    names = sorted({topic.name for topic in topics if topic.type_name in TF_TYPES})
-    above = [name for name in names if f"/{sensor_topic.lstrip('/')}".startswith(_folder(name))]
-    return tuple(above or names)
+    tf = sorted((topic for topic in topics if kind_of(topic.type_name) is Kind.TF), key=lambda topic: topic.name)
+    above = [topic for topic in tf if f"/{sensor_topic.lstrip('/')}".startswith(_folder(topic.name))]
+    return tuple(above or tf)
 
 
-def load_static_transforms(tree: FrameTree, logs: Sequence[LogReader], topics: Collection[str]) -> None:
+def moving_tf_names(topics: Collection[TopicInfo]) -> tuple[str, ...]:
+    """The names of the topics of transforms that change, once each."""
+    return tuple(dict.fromkeys(topic.name for topic in topics if not is_static_tf(topic)))
+
+
+def load_static_transforms(tree: FrameTree, logs: Sequence[LogReader], topics: Collection[TopicInfo]) -> None:
     """Put every static transform of the logs into a tree, wherever in the files it stands."""
-    static = [topic for topic in topics if is_static_tf(topic)]
+    static = {topic.name for topic in topics if is_static_tf(topic)}
     for log in logs:
         for message in log.messages(static):
-            tree.add_message(message.decode(), is_static=True)
+            with suppress(DamagedMessageError):
+                tree.add_transforms(_transforms(message), is_static=True)
 
 
 class PoseSource:
     """The pose of one robot's sensor in its map frame over time.
 
+    ``known`` is an earlier source of the same robot, whose trajectory file or path need not be read again.
     ``topics`` are those whose messages it must be given through ``take``, in the order of the log. A pose is the
-    product T_map_origin T_origin_body T_body_sensor: the middle one from the pose topic, the others from TF where they
-    are not the identity or given; without a pose topic the whole of it comes from TF.
+    product T_map_origin T_origin_body T_body_sensor: the middle one from the pose topic or file, the others from TF
+    where they are not the identity or given; without either the whole of it comes from TF.
     Raises InputError where the log cannot give such a pose at any time.
     """
 
@@ -62,22 +73,28 @@ class PoseSource:
         sensor_frame: str,
         pose_gap_ns: int,
         use_log_time: bool,
+        known: Self | None = None,
     ) -> None:
         self._robot = robot
         self._logs = logs
         self._use_log_time = use_log_time
+        self._pose_gap_ns = pose_gap_ns
+        self._sensor_topic = sensor_topic
         self._sensor_frame = frame_name(robot.sensor_frame or sensor_frame)
         infos = [topic for log in logs for topic in log.topics]
         tf = tf_topics(infos, sensor_topic)
         self._tree = FrameTree(pose_gap_ns)
         self._T_given = None if robot.T_body_sensor is None else transform_of(robot.T_body_sensor)
         load_static_transforms(self._tree, logs, tf)
-        is_tf = any(topic.name == robot.pose_topic and topic.type_name in TF_TYPES for topic in infos)
-        self._track = None if is_tf else PoseTrack(pose_gap_ns)
-        self._before, self._after = self._tf_link() if is_tf else self._links_of_pose_topic()
-        self._links = [link for link in (self._before, self._after) if link is not None]
+        kinds = {kind_of(topic.type_name) for topic in infos if topic.name == robot.pose_topic}
+        self.trajectory: Trajectory | None = known.trajectory if known else self._whole_trajectory(Kind.PATH in kinds)
+        """The poses where they are known from the beginning, from a file or a path; else None."""
+        self._track = PoseTrack(pose_gap_ns) if self.trajectory is None and Kind.TF not in kinds else None
+        self._before, self._after = self._tf_link() if Kind.TF in kinds else self._links_of_poses()
+        self._body = self._body_link()
+        self._links = [link for link in (self._before, self._after, self._body) if link is not None]
         self._moving_links = [link for link in self._links if not self._tree.is_fixed(*link)]
-        moving_topics = tuple(topic for topic in tf if not is_static_tf(topic)) if self._moving_links else ()
+        moving_topics = moving_tf_names(tf) if self._moving_links else ()
         self.topics = moving_topics if self._track is None else (str(robot.pose_topic), *moving_topics)
         if not moving_topics:
             self.check_connected()
@@ -90,27 +107,26 @@ class PoseSource:
 
     def take(self, message: RawMessage) -> None:
         """Take a message of one of the topics. Raises DamagedMessageError where it cannot be decoded."""
-        value = message.decode()
-        if message.type_name in TF_TYPES:
-            stamp = message.log_time_ns if self._use_log_time else None
-            self._tree.add_message(value, is_static=False, stamp_ns=stamp)
+        found = _transforms(message)
+        stamp = message.log_time_ns if self._use_log_time else None
+        if kind_of(message.type_name) is Kind.TF:
+            self._tree.add_transforms(found, is_static=False, stamp_ns=stamp)
         elif self._track is not None:
-            stamp = message.log_time_ns if self._use_log_time else stamp_to_ns(value.header.stamp)
-            pose = _pose_of(value)
-            p, q = pose.position, pose.orientation
-            self._track.add(stamp, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+            for pose in found.transforms:
+                self._track.add(pose.stamp_ns if stamp is None else stamp, pose.translation, pose.rotation)
 
     def at(self, stamp_ns: int) -> Float64Array | None:
         """T_map_sensor at a stamp, (4, 4) float64; None where the poses around it are missing or too far apart."""
         result = np.eye(4)
-        for link in (self._before, self._track, self._after):
-            if link is None:
-                continue
-            part = link.matrix_at(stamp_ns) if isinstance(link, PoseTrack) else self._link_at(link, stamp_ns)
+        for part in (self._link_at(self._before, stamp_ns), self._pose_at(stamp_ns), self._sensor_at(stamp_ns)):
             if part is None:
                 return None
             result = result @ part
-        return result if self._T_given is None else result @ self._T_given
+        return result
+
+    def T_body_sensor_at(self, stamp_ns: int) -> Float64Array | None:
+        """From the sensor to the frame of ``body_box`` at a stamp, (4, 4) float64; None where TF does not say it."""
+        return self._sensor_at(stamp_ns) if self._body is None else self._link_at(self._body, stamp_ns)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop what no stamp from ``stamp_ns`` on needs."""
@@ -129,15 +145,33 @@ class PoseSource:
         """The robot's logs, as errors begin."""
         return ", ".join(str(log.path) for log in self._logs)
 
-    def _link_at(self, link: Link, stamp_ns: int) -> Float64Array | None:
+    # --- the three parts of a pose ------------------------------------------------------------------------------------
+
+    def _pose_at(self, stamp_ns: int) -> Float64Array | None:
+        """T_origin_body at a stamp: the identity where the whole pose comes from TF."""
+        if self.trajectory is not None:
+            return self.trajectory.matrix_at(stamp_ns, self._pose_gap_ns)
+        return np.eye(4) if self._track is None else self._track.matrix_at(stamp_ns)
+
+    def _sensor_at(self, stamp_ns: int) -> Float64Array | None:
+        """T_body_sensor at a stamp."""
+        return self._link_at(self._after, stamp_ns) if self._T_given is None else self._T_given
+
+    def _link_at(self, link: Link | None, stamp_ns: int) -> Float64Array | None:
         """The transform of a TF link at a stamp; None also where nothing joins its frames yet."""
+        if link is None:
+            return np.eye(4)
         return self._tree.T_a_b(*link, stamp_ns) if self._tree.is_connected(*link) else None
 
     def _remedy(self, link: Link) -> str:
         """What to put into a team file where a link cannot be made."""
         if link == self._before:
             return "name another map_frame, sensor_frame or pose_topic"
+        if link == self._body:
+            return "name another body_frame"
         return "name the sensor_frame, or give T_body_sensor: [x, y, z, qx, qy, qz, qw]"
+
+    # --- what the parts are -------------------------------------------------------------------------------------------
 
     def _tf_link(self) -> tuple[Link | None, Link | None]:
         """What to take from TF where the whole pose comes from it."""
@@ -145,32 +179,101 @@ class PoseSource:
             raise InputError(f"{self._name}: poses from TF need a map_frame for robot '{self._robot.robot_id}'")
         return (frame_name(self._robot.map_frame), self._sensor_frame), None
 
-    def _links_of_pose_topic(self) -> tuple[Link | None, Link | None]:
-        """What to take from TF before and after the pose topic's poses, by the frames that these are in and of."""
+    def _body_link(self) -> Link | None:
+        """What to take from TF for the robot's own box: None where its frame is that of the poses."""
+        frame = self._robot.body_frame
+        return None if frame is None or self._robot.body_box is None else (frame_name(frame), self._sensor_frame)
+
+    def _links_of_poses(self) -> tuple[Link | None, Link | None]:
+        """What to take from TF before and after the poses, by the frames that these are in and of."""
+        if self._robot.pose_file is not None:
+            # A file names no frames: it holds the sensor's poses, or those of the body that T_body_sensor is given for.
+            return None, None
         topic = str(self._robot.pose_topic)
-        found = [message for log in self._logs if (message := first_message(log, topic)) is not None]
-        if not found:
+        # A path that grows is empty at first.
+        messages = (message for log in self._logs for message in log.messages((topic,)))
+        first = next((message for message in messages if _holds_poses(message)), None)
+        if first is None:
             raise InputError(f"{self._name}: topic '{topic}' holds no poses for robot '{self._robot.robot_id}'")
-        value = found[0].decode()
-        origin = frame_name(value.header.frame_id)
-        body = frame_name(getattr(value, "child_frame_id", ""))
+        pose = _transforms(first).transforms[0]
+        origin, body = frame_name(pose.parent), frame_name(pose.child)
         map_frame = frame_name(self._robot.map_frame or "")
         before = (map_frame, origin) if map_frame and origin and map_frame != origin else None
         if self._T_given is not None or body == self._sensor_frame:
             return before, None
         if not body:
             raise InputError(
-                f"{found[0].where}: the poses do not name the frame they are of; "
+                f"{first.where}: the poses do not name the frame they are of; "
                 f"give T_body_sensor: [x, y, z, qx, qy, qz, qw] ([0, 0, 0, 0, 0, 0, 1] for the sensor's own poses)"
             )
         return before, (body, self._sensor_frame)
+
+    def _whole_trajectory(self, is_path: bool) -> Trajectory | None:
+        """The robot's poses where they are known from the beginning: from a file, or from the last Path message."""
+        if self._robot.pose_file is not None:
+            return self._file_trajectory(read_rows(self._robot.pose_file))
+        if not is_path:
+            return None
+        if self._use_log_time:
+            raise InputError(
+                f"{self._name}: the path '{self._robot.pose_topic}' has stamps of its own, which clock: log cannot go "
+                f"by; use clock: header, or give pose_file"
+            )
+        last: RawMessage | None = None
+        for log in self._logs:
+            for message in log.messages((str(self._robot.pose_topic),)):
+                last = message
+        poses = [] if last is None else _finite(_transforms(last))
+        if not poses:
+            raise InputError(f"{self._name}: topic '{self._robot.pose_topic}' holds no poses")
+        stamps = np.array([stamp for stamp, _, _ in poses], dtype=np.int64)
+        rows = TrajectoryRows(stamps, np.array([p for _, p, _ in poses]), np.array([q for _, _, q in poses]))
+        return trajectory(stamps, rows)
+
+    def _file_trajectory(self, rows: TrajectoryRows) -> Trajectory:
+        """The poses of a trajectory file with the stamps that belong to them."""
+        path, times = self._robot.pose_file, self._robot.pose_times
+        if times is not None and rows.stamps_ns is not None:
+            raise InputError(f"{path}: its rows have times of their own; leave pose_times out")
+        if times is not None:
+            stamps = read_times(times)
+        elif rows.stamps_ns is not None:
+            return trajectory(rows.stamps_ns, rows)
+        else:
+            messages = (message for log in self._logs for message in log.messages((self._sensor_topic,)))
+            stamps = np.sort(
+                np.array([m.log_time_ns if self._use_log_time else m.header_stamp_ns() for m in messages], np.int64)
+            )
+        if stamps.size != len(rows.positions):
+            whose = f"{times} has {stamps.size} times" if times else f"'{self._sensor_topic}' {stamps.size} messages"
+            raise InputError(
+                f"{path}: has {len(rows.positions)} poses, but {whose}; give pose_times: a file with a time [s] for "
+                f"every pose"
+            )
+        return trajectory(stamps, rows)
+
+
+def _transforms(message: RawMessage) -> Transforms:
+    """The poses or transforms in a message. Raises DamagedMessageError for others that the topic may carry too."""
+    found = message.sensor_message()
+    if not isinstance(found, Transforms):
+        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no pose")
+    return found
+
+
+def _holds_poses(message: RawMessage) -> bool:
+    """True where a message is whole and has a pose."""
+    with suppress(DamagedMessageError):
+        return bool(_transforms(message).transforms)
+    return False
+
+
+def _finite(found: Transforms) -> list[tuple[int, tuple[float, float, float], tuple[float, float, float, float]]]:
+    """Stamps, positions and unit quaternions of the poses that are finite."""
+    poses = [(pose.stamp_ns, pose.translation, normalise(pose.rotation)) for pose in found.transforms]
+    return [(stamp, p, q) for stamp, p, q in poses if q is not None and all(map(math.isfinite, p))]
 
 
 def _folder(topic: str) -> str:
     """The namespace of a topic with slashes at both ends."""
     return "/" + "/".join([*topic.strip("/").split("/")[:-1], ""])
-
-
-def _pose_of(value: Any) -> Any:
-    """The geometry_msgs/Pose in an Odometry, PoseStamped or PoseWithCovarianceStamped."""
-    return value.pose.pose if hasattr(value.pose, "pose") else value.pose

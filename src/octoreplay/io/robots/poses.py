@@ -1,88 +1,17 @@
-"""Poses in time: tracks that are interpolated, and trees of frames.
-
-Positions are metres; quaternions are (x, y, z, w) of length 1; ``T_a_b`` is (4, 4) float64 and maps coordinates of
-frame b to frame a.
-"""
+"""Poses in time: tracks that are interpolated, and trees of frames."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeAlias
 
 import numpy as np
 
 from octoreplay.errors import InputError
-from octoreplay.io.messages.ros_types import stamp_to_ns
+from octoreplay.io.messages.sensor_messages import Transforms
 from octoreplay.records import Float64Array
-
-Position: TypeAlias = tuple[float, float, float]
-Quaternion: TypeAlias = tuple[float, float, float, float]
-Pose: TypeAlias = tuple[Position, Quaternion]
-
-# Below this angle's cosine distance sin(angle) loses digits, and the straight line between the quaternions is as good.
-_NEARLY_PARALLEL = 1.0 - 1e-9
-
-
-def normalise(quaternion: Sequence[float]) -> Quaternion | None:
-    """The quaternion (x, y, z, w) of length 1; None where it has no direction (zero or not finite)."""
-    x, y, z, w = (float(value) for value in quaternion)
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    if not math.isfinite(length) or length < 1e-6:
-        return None
-    return x / length, y / length, z / length, w / length
-
-
-def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """The rotation at a fraction in [0, 1] of the shorter great arc between two rotations (Shoemake 1985)."""
-    cosine = sum(a * b for a, b in zip(first, second, strict=True))
-    sign = 1.0
-    if cosine < 0.0:
-        cosine, sign = -cosine, -1.0
-    if cosine > _NEARLY_PARALLEL:
-        from_first, from_second = 1.0 - fraction, fraction
-    else:
-        angle = math.acos(cosine)
-        from_first = math.sin((1.0 - fraction) * angle) / math.sin(angle)
-        from_second = math.sin(fraction * angle) / math.sin(angle)
-    from_second *= sign
-    x, y, z, w = (from_first * a + from_second * b for a, b in zip(first, second, strict=True))
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    return x / length, y / length, z / length, w / length
-
-
-def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> Float64Array:
-    """The (4, 4) transform of a position and a quaternion (x, y, z, w) of length 1."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), position[0]],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), position[1]],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), position[2]],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def inverse(transform: Float64Array) -> Float64Array:
-    """The inverse of a (4, 4) rigid transform."""
-    result = np.eye(4)
-    rotation = transform[:3, :3].T
-    result[:3, :3] = rotation
-    result[:3, 3] = -rotation @ transform[:3, 3]
-    return result
-
-
-def transform_of(numbers: Sequence[float]) -> Float64Array:
-    """The (4, 4) transform of seven numbers x, y, z, qx, qy, qz, qw; the quaternion is normalised.
-
-    Raises ValueError where the quaternion has no direction.
-    """
-    quaternion = normalise(numbers[3:7])
-    if quaternion is None:
-        raise ValueError("a quaternion must have a direction")
-    return pose_matrix(numbers[:3], quaternion)
+from octoreplay.transforms import Pose, interpolate, inverse, normalise, pose_matrix
 
 
 class PoseTrack:
@@ -96,6 +25,8 @@ class PoseTrack:
         self._pose_gap_ns = pose_gap_ns
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
+        self.num_added = 0
+        """Poses that were added, the dropped ones too."""
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -112,6 +43,7 @@ class PoseTrack:
         if rotation is None or not math.isfinite(x + y + z):
             return False
         pose = ((x, y, z), rotation)
+        self.num_added += 1
         if not self._stamps or stamp_ns > self._stamps[-1]:
             self._stamps.append(stamp_ns)
             self._poses.append(pose)
@@ -134,15 +66,17 @@ class PoseTrack:
         before, after = self._stamps[index - 1], self._stamps[index]
         if after - before > self._pose_gap_ns:
             return None
-        fraction = (stamp_ns - before) / (after - before)
-        (p, q), (r, s) = self._poses[index - 1], self._poses[index]
-        x, y, z = (a + fraction * (b - a) for a, b in zip(p, r, strict=True))
-        return (x, y, z), slerp(q, s, fraction)
+        return interpolate(self._poses[index - 1], self._poses[index], (stamp_ns - before) / (after - before))
 
     def matrix_at(self, stamp_ns: int) -> Float64Array | None:
         """The pose at a stamp as a (4, 4) transform, or None."""
         pose = self.at(stamp_ns)
         return None if pose is None else pose_matrix(*pose)
+
+    @property
+    def only_matrix(self) -> Float64Array:
+        """The one pose of a track that has one, as a (4, 4) transform."""
+        return pose_matrix(*self._poses[0])
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop poses that no stamp from ``stamp_ns`` on needs."""
@@ -161,6 +95,7 @@ class FrameTree:
         self._other_parents: dict[str, str] = {}
         self._fixed: dict[str, Float64Array] = {}
         self._moving: dict[str, PoseTrack] = {}
+        self._holding: set[str] = set()
 
     def add(
         self,
@@ -188,19 +123,13 @@ class FrameTree:
             self._moving[child] = PoseTrack(self._pose_gap_ns)
         self._moving[child].add(stamp_ns, translation, quaternion)
 
-    def add_message(self, message: Any, *, is_static: bool, stamp_ns: int | None = None) -> int | None:
-        """Add all transforms of a TFMessage at their own stamps, or all at ``stamp_ns``; the newest stamp added."""
-        newest: int | None = None
-        for entry in message.transforms:
-            stamp = stamp_to_ns(entry.header.stamp) if stamp_ns is None else stamp_ns
-            t, q = entry.transform.translation, entry.transform.rotation
-            self.add(
-                entry.header.frame_id, entry.child_frame_id, None if is_static else stamp, (t.x, t.y, t.z),
-                (q.x, q.y, q.z, q.w),
-            )  # fmt: skip
-            if not is_static:
-                newest = stamp if newest is None else max(newest, stamp)
-        return newest
+    def add_transforms(self, found: Transforms, *, is_static: bool, stamp_ns: int | None = None) -> None:
+        """Add the transforms of a message at their own stamps, or all at ``stamp_ns``."""
+        for entry in found.transforms:
+            stamp = entry.stamp_ns if stamp_ns is None else stamp_ns
+            self.add(entry.parent, entry.child, None if is_static else stamp, entry.translation, entry.rotation)
+            if found.holds:
+                self._holding.add(frame_name(entry.child))
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -279,7 +208,10 @@ class FrameTree:
             )
         if child in self._fixed:
             return self._fixed[child]
-        return self._moving[child].matrix_at(stamp_ns) if child in self._moving else None
+        track = self._moving.get(child)
+        if track is None:
+            return None
+        return track.only_matrix if child in self._holding and track.num_added == 1 else track.matrix_at(stamp_ns)
 
     def _ancestors(self, frame: str) -> Iterator[str]:
         """A frame, its parent, and so on to the root; a loop ends where it closes."""

@@ -1,33 +1,37 @@
-"""One robot's log as a stream of frames: depth and labels paired, poses interpolated, in the order of their stamps."""
+"""One robot's log as a stream of frames: images and labels paired, poses interpolated, in the order of their stamps."""
 
 from __future__ import annotations
 
+import contextlib
 import heapq
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
+import numpy as np
+
 from octoreplay.config import RobotConfig, TimeConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.containers.log_reader import DamagedMessageError, LogReader, RawMessage, first_message
+from octoreplay.io.containers.log_reader import LogReader, RawMessage, first_whole_message
 from octoreplay.io.containers.logs import open_log
-from octoreplay.io.robots.frame_queue import FrameQueue, Settled
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker, FrameMaker
+from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
 from octoreplay.io.robots.pose_source import PoseSource
-from octoreplay.io.robots.poses import transform_of
-from octoreplay.io.sensors.clouds import decode_cloud
-from octoreplay.io.sensors.images import camera_model, check_same_size, decode_depth, decode_labels
+from octoreplay.io.robots.stamp_check import StampCheck
+from octoreplay.io.robots.thinning import Thinning
 from octoreplay.io.sensors.labels import LabelLookup
-from octoreplay.records import (
-    CameraModel,
-    ClassTable,
-    CloudFrame,
-    DepthFrame,
-    Float64Array,
-    Frame,
-    FrameCounts,
-    UInt8Array,
-)
+from octoreplay.records import BodyBox, ClassTable, Float64Array, Frame, FrameCounts
+from octoreplay.transforms import inverse, transform_of
+
+# A message that a robot recorded may have been under way for this long, and its poses too.
+_LOG_DELAY_NS = 10_000_000_000
+# Messages between two looks at which poses are needed no more.
+_FORGET_EVERY = 64
+_STAMPED_KINDS = (Kind.IMAGE, Kind.COMPRESSED_IMAGE, Kind.CLOUD, Kind.SCAN)
 
 
 class RobotLog:
@@ -36,35 +40,55 @@ class RobotLog:
     ``robot`` names its topics (``discover.resolve`` fills those that a team file leaves out). With a ``class_table``
     raw labels become class ids; without one, or without labels in the log, frames carry no classes. An empty
     ``label_topic`` means that labels in the log, also those in a point cloud, are not used.
-    A frame's stamp is that of its depth image or point cloud plus the robot's clock offset; its pose is in the team's
-    frame. A stamp is settled, and its frame given, once the sensor's stream is ``reorder_window`` further.
-    Raises InputError where a log cannot be opened or lacks intrinsics, frames or poses altogether.
+    A frame's stamp is that of its image or point cloud plus the robot's clock offset; its pose is in the team's frame.
+    A stamp is settled, and its frame given, once the sensor's stream is ``reorder_window`` further. A stamp that no
+    clock can have given (``StampCheck``) makes its message unreadable, and a sensor that would be further than
+    ``reach`` [m] from the team's origin along an axis has no pose.
+    ``logs`` are the robot's logs where they are open already, and stay open. Raises InputError where a log cannot be
+    opened or lacks intrinsics, frames or poses altogether.
     """
 
-    def __init__(self, robot: RobotConfig, time: TimeConfig, class_table: ClassTable | None) -> None:
+    def __init__(
+        self,
+        robot: RobotConfig,
+        time: TimeConfig,
+        class_table: ClassTable | None,
+        *,
+        reach: float = math.inf,
+        logs: Sequence[LogReader] | None = None,
+    ) -> None:
         self.robot = robot
         self.counts = FrameCounts()
         self._time = time
+        self._reach = reach
+        self._num_beyond = 0
         self._use_log_time = time.clock == "log"
         self._offset_ns = round(robot.clock_offset * 1e9)
-        self._T_team_map = transform_of(robot.T_team_map)
-        is_labelled = class_table is not None and robot.label_topic != ""
+        self._stamp_check = StampCheck(self._offset_ns)
+        self.T_team_map = transform_of(robot.T_team_map)
+        is_labelled = class_table is not None and "" not in (robot.label_topic, robot.label_field)
         self._labels = LabelLookup(class_table, strict=time.strict_labels) if class_table and is_labelled else None
         sensor_topic = robot.depth_topic or robot.cloud_topic
-        if sensor_topic is None or robot.pose_topic is None:
-            missing = "depth_topic or cloud_topic" if sensor_topic is None else "pose_topic"
+        if sensor_topic is None or (robot.pose_topic or robot.pose_file) is None:
+            missing = "depth_topic or cloud_topic" if sensor_topic is None else "pose_topic or pose_file"
             raise ConfigError(f"robot '{robot.robot_id}': needs a {missing}")
-        self._sensor_topic = sensor_topic
-        self._label_topic = robot.label_topic if robot.depth_topic and self._labels else None
+        self.sensor_topic = sensor_topic
+        self._known_poses: PoseSource | None = None
         with ExitStack() as stack:
-            self._logs: list[LogReader] = [stack.enter_context(open_log(path)) for path in robot.logs]
-            first = self._first_of(sensor_topic)
+            if logs is None:
+                logs = [stack.enter_context(open_log(path)) for path in robot.logs]
+            self._logs = tuple(logs)
+            first = self._first_of(sensor_topic, _STAMPED_KINDS)
             if first is None:
                 raise InputError(f"{self._name}: topic '{sensor_topic}' holds no messages")
             self._sensor_frame = first.header_frame_id()
-            self._camera = self._read_camera()
+            self.first_log_time_ns = first.log_time_ns
+            """Log time of the sensor's first message, without the clock offset."""
+            self.first_stamp_ns = self._first_stamp(first)
+            """The sensor's first stamp, clock offset applied."""
+            self._maker = self._frame_maker()
             # Fails here rather than after a long run where poses cannot come about.
-            self._pose_source()
+            self.pose_source()
             self._closing = stack.pop_all()
 
     @property
@@ -96,130 +120,237 @@ class RobotLog:
         """Close the logs; a second call does nothing."""
         self._closing.close()
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(
+        self, team_start_ns: int | None = None, *, is_wanted: Callable[[], bool] = lambda: True
+    ) -> Iterator[Frame]:
         """The robot's frames in order of stamp, decoded as they are taken; ``counts`` says what became of the rest.
 
-        Every call starts from the beginning, with fresh counts. Raises InputError with file, topic and time for an
-        encoding that holds no depth or no labels, for images whose sizes differ, and for frames that TF never joins.
+        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. Reading ends
+        when ``is_wanted`` says no, which it is asked for every message. Every call starts from the beginning, with
+        fresh counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for
+        images whose sizes differ, and for frames that TF never joins.
         """
-        self.counts = FrameCounts(truncated_files=self._damaged_files())
+        self.counts = FrameCounts(truncated_files=self._damage())
         if self._labels is not None:
             self._labels.unknown = self.counts.unknown_label_pixels
-        poses = self._pose_source()
+            self._labels.unknown_colors = self.counts.unknown_colors
+        start_ns = self.first_stamp_ns if team_start_ns is None else team_start_ns
+        self._stamp_check, self._num_beyond = StampCheck(self._offset_ns), 0
+        thinning = Thinning(self._time, start_ns - self._offset_ns)
+        poses = self.pose_source()
+        for settled in self._settled(poses, thinning, is_wanted):
+            if thinning.keeps(settled.stamp_ns):
+                yield from self._frame(settled, poses)
+        # Reading on may have come upon more damage than opening did.
+        self.counts.truncated_files = self._damage()
+        if self.counts.used == 0 and self.counts.no_pose > 0:
+            poses.check_connected()
+            self._check_within_reach()
+
+    def pose_source(self) -> PoseSource:
+        """The robot's poses, before any message of the logs is taken."""
+        self._known_poses = PoseSource(
+            self.robot,
+            self._logs,
+            sensor_topic=self.sensor_topic,
+            sensor_frame=self._sensor_frame,
+            pose_gap_ns=round(self._time.pose_gap * 1e9),
+            use_log_time=self._use_log_time,
+            known=self._known_poses,
+        )
+        return self._known_poses
+
+    def pose_messages(self, poses: PoseSource) -> Iterator[RawMessage]:
+        """Gives a pose source its messages one by one, and each of them when it has been taken."""
+        for message in self._messages(poses.topics):
+            self._give(message, poses)
+            yield message
+
+    def _settled(
+        self, poses: PoseSource, thinning: Thinning, is_wanted: Callable[[], bool]
+    ) -> Iterator[Settled[RawMessage]]:
+        """The sensor's messages in the order of their stamps, with what goes with them."""
+        partner_topics = self._maker.partner_topics
         queue: FrameQueue[RawMessage] = FrameQueue(
             poses,
             reorder_window_ns=round(self._time.reorder_window * 1e9),
             pair_tolerance_ns=round(self._time.pair_tolerance * 1e9),
             pose_gap_ns=round(self._time.pose_gap * 1e9),
-            has_labels=self._label_topic is not None,
+            num_partners=len(partner_topics),
         )
-        topics = {self._sensor_topic, *poses.topics, *([self._label_topic] if self._label_topic else [])}
-        for message in heapq.merge(*(log.messages(topics) for log in self._logs), key=lambda m: m.log_time_ns):
-            self._take(message, queue, poses)
+        topics = {self.sensor_topic, *poses.topics, *partner_topics}
+        last_log_time_ns: int | None = None
+        num_left = sum(t.num_messages for log in self._logs for t in log.topics if t.name == self.sensor_topic)
+        for number, message in enumerate(self._messages(topics)):
+            if not is_wanted():
+                return
+            if last_log_time_ns is not None and message.log_time_ns > last_log_time_ns:
+                break
+            if self._is_over(thinning, queue.newest_ns, message.log_time_ns):
+                break
+            if message.topic == self.sensor_topic:
+                num_left -= 1
+                if num_left == 0:
+                    last_log_time_ns = message.log_time_ns + _LOG_DELAY_NS
+            self._take(message, queue, poses, partner_topics)
             while (ready := queue.pop(final=False)) is not None:
-                yield from self._frame(ready)
+                yield ready
+            if number % _FORGET_EVERY == 0:
+                # Poses without images would pile up.
+                poses.forget_before(queue.needed_from_ns(self.first_stamp_ns - self._offset_ns))
         while (ready := queue.pop(final=True)) is not None:
-            yield from self._frame(ready)
-        # Reading on may have come upon more damage than opening did.
-        self.counts.truncated_files = self._damaged_files()
-        if self.counts.used == 0 and self.counts.no_pose > 0:
-            poses.check_connected()
+            yield ready
+
+    def _is_over(self, thinning: Thinning, newest_ns: int | None, log_time_ns: int) -> bool:
+        """True once nothing can come that is wanted, by the stamps and by the log's time: one stamp may be wrong."""
+        # Stamps may be of another clock than the log, but run as quickly.
+        elapsed_ns = log_time_ns - self.first_log_time_ns
+        by_log_ns = self.first_stamp_ns - self._offset_ns + elapsed_ns
+        return newest_ns is not None and thinning.is_over(newest_ns) and thinning.is_over(by_log_ns)
 
     @property
     def _name(self) -> str:
         """The robot's logs, as errors begin."""
         return ", ".join(str(path) for path in self.robot.logs)
 
-    def _damaged_files(self) -> list[str]:
-        """The logs that are cut or damaged, as far as they have been read."""
-        return [str(log.path) for log in self._logs if log.damage is not None]
+    def _damage(self) -> list[str]:
+        """A sentence for each log that is cut or damaged, as far as they have been read."""
+        return [log.damage for log in self._logs if log.damage is not None]
 
-    def _first_of(self, topic: str) -> RawMessage | None:
-        """The first message of a topic in the logs, in their order."""
-        return next((m for log in self._logs if (m := first_message(log, topic)) is not None), None)
+    def _first_of(self, topic: str, kinds: Collection[Kind]) -> RawMessage | None:
+        """The first message of a topic in all the robot's logs that says one of some kinds of things and is whole."""
+        found = [first_whole_message(log, topic, kinds) for log in self._logs]
+        return min((m for m in found if m is not None), key=lambda message: message.log_time_ns, default=None)
 
-    def _read_camera(self) -> CameraModel | None:
-        """The camera of a depth robot from its CameraInfo; None where the team file gives intrinsics, or for clouds."""
-        if self.robot.depth_topic is None or self.robot.intrinsics is not None:
-            return None
+    def _first_stamp(self, first: RawMessage) -> int:
+        """The least stamp of the sensor's messages in the first ``reorder_window`` that is not late from the start."""
+        # A log may begin at 0; a header that was never stamped is 0 at any time.
+        if not self._use_log_time and first.header_stamp_ns() == 0 and first.log_time_ns != 0:
+            raise InputError(f"{first.where}: the header's stamp is 0; give clock: log to go by the log's times")
+        window_ns = round(self._time.reorder_window * 1e9)
+        stamps, check = [], StampCheck(self._offset_ns)
+        for message in self._messages((self.sensor_topic,)):
+            if message.log_time_ns > first.log_time_ns + window_ns:
+                break
+            with contextlib.suppress(DamagedMessageError):
+                stamps.append(self._stamp_of(message, check))
+        stamp_ns = min((stamp for stamp in stamps if stamp >= max(stamps) - window_ns), default=None)
+        if stamp_ns is None:
+            stamp_ns = first.log_time_ns if self._use_log_time else first.header_stamp_ns()
+            raise InputError(
+                f"{first.where}: the stamp {stamp_ns / 1e9:.6g} s with the clock_offset {self.robot.clock_offset:g} s "
+                f"is not from 0 to 2^31 s, the year 2038; give another clock_offset or the other clock (header, log)"
+            )
+        return stamp_ns + self._offset_ns
+
+    def _stamp_of(self, message: RawMessage, check: StampCheck) -> int:
+        """A message's stamp, without the clock offset. Raises DamagedMessageError where it has none that can be."""
+        if kind_of(message.type_name) not in _STAMPED_KINDS:
+            # What stands first in its bytes is no stamp.
+            raise DamagedMessageError(f"{message.where}: is of type {message.type_name}")
+        stamp = message.log_time_ns if self._use_log_time else message.header_stamp_ns()
+        if not check.is_good(message.topic, stamp, message.log_time_ns):
+            raise DamagedMessageError(f"{message.where}: no clock gave the stamp {stamp} ns")
+        return stamp
+
+    def _check_within_reach(self) -> None:
+        """Raise InputError where every frame had a pose, and each of them was out of reach."""
+        if self._num_beyond == self.counts.no_pose:
+            raise InputError(
+                f"{self._name}: all poses of robot '{self.robot_id}' lie outside the map, where the sensor may be "
+                f"{self._reach:g} m from the origin; check the poses, or give T_team_map or a coarser resolution"
+            )
+
+    def _frame_maker(self) -> FrameMaker:
+        """What decodes the sensor's messages."""
+        if self.robot.depth_topic is None:
+            return CloudFrameMaker(self.robot, self._labels)
+        if self.robot.intrinsics is not None:
+            return DepthFrameMaker(self.robot, self._labels, None)
         topic = self.robot.camera_info_topic
-        message = None if topic is None else self._first_of(topic)
+        message = None if topic is None else self._first_of(topic, (Kind.CAMERA_INFO,))
         if message is None:
             missing = f"topic '{topic}' holds no CameraInfo" if topic else "there is no CameraInfo topic"
-            raise InputError(f"{self._name}: {missing} for '{self._sensor_topic}'; give intrinsics: [fx, fy, cx, cy]")
-        return camera_model(message.decode(), message.where)
+            raise InputError(f"{self._name}: {missing} for '{self.sensor_topic}'; give intrinsics: [fx, fy, cx, cy]")
+        return DepthFrameMaker(self.robot, self._labels, message)
 
-    def _pose_source(self) -> PoseSource:
-        """A new source of poses, at the beginning of the logs."""
-        return PoseSource(
-            self.robot,
-            self._logs,
-            sensor_topic=self._sensor_topic,
-            sensor_frame=self._sensor_frame,
-            pose_gap_ns=round(self._time.pose_gap * 1e9),
-            use_log_time=self._use_log_time,
-        )
+    def _messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """The messages of some topics of all the robot's logs, in order of log time."""
+        return heapq.merge(*(log.messages(topics) for log in self._logs), key=lambda message: message.log_time_ns)
 
-    def _take(self, message: RawMessage, queue: FrameQueue[RawMessage], poses: PoseSource) -> None:
-        """Put one message where it belongs."""
-        if message.topic not in (self._sensor_topic, self._label_topic):
-            try:
-                poses.take(message)
-            except DamagedMessageError:
-                # Frames that miss this pose are counted as frames without one.
-                return
+    @staticmethod
+    def _give(message: RawMessage, poses: PoseSource) -> None:
+        """Give a message to the poses; frames that miss a damaged one are counted as frames without a pose."""
+        with contextlib.suppress(DamagedMessageError):
+            poses.take(message)
+
+    def _take(
+        self, message: RawMessage, queue: FrameQueue[RawMessage], poses: PoseSource, partner_topics: tuple[str, ...]
+    ) -> None:
+        """Give a message to the poses or to the queue, or count it as one that cannot be used."""
+        if message.topic in poses.topics:
+            self._give(message, poses)
             return
         try:
-            stamp = message.log_time_ns if self._use_log_time else message.header_stamp_ns()
+            stamp = self._stamp_of(message, self._stamp_check)
         except DamagedMessageError:
-            self.counts.undecodable += message.topic == self._sensor_topic
+            self.counts.undecodable += message.topic == self.sensor_topic
             return
-        if message.topic == self._label_topic:
-            queue.add_label(stamp, message)
-        elif not queue.add_sensor(stamp, message):
+        for kind in (kind for kind, topic in enumerate(partner_topics) if topic == message.topic):
+            queue.add_partner(kind, stamp, message)
+        if message.topic != self.sensor_topic:
+            return
+        newest_ns = queue.newest_ns
+        fate = queue.add_sensor(stamp, message)
+        if fate is Fate.LATE:
             self.counts.late += 1
-
-    def _frame(self, settled: Settled[RawMessage]) -> Iterator[Frame]:
-        """The frame of a settled sensor message, or nothing where a part is missing (which is counted)."""
-        if self._label_topic is not None and settled.label is None:
-            self.counts.no_label += 1
-        elif settled.T_map_sensor is None:
-            self.counts.no_pose += 1
-        else:
-            try:
-                frame = self._decode(settled, self._T_team_map @ settled.T_map_sensor)
-            except DamagedMessageError:
-                self.counts.undecodable += 1
-                return
-            self.counts.used += 1
-            yield frame
-
-    def _decode(self, settled: Settled[RawMessage], T_team_sensor: Float64Array) -> Frame:
-        """The frame of a sensor message with its labels and pose."""
-        message, stamp = settled.message, settled.stamp_ns + self._offset_ns
-        if self.robot.depth_topic is None:
-            points, raw = decode_cloud(message.decode(), message.where)
-            class_ids = None
-            if raw is not None and self._labels is not None:
-                class_ids = self._labels.class_ids(raw, message.where)
-            return CloudFrame(self.robot_id, stamp, points, class_ids, T_team_sensor)
-        image, unit = decode_depth(message.decode(), message.where)
-        if self._camera is None:
-            fx, fy, cx, cy = self.robot.intrinsics or (0.0, 0.0, 0.0, 0.0)
-            self._camera = CameraModel(image.shape[1], image.shape[0], fx, fy, cx, cy)
-        check_same_size(image, self._camera, message.where)
-        class_image = None if settled.label is None else self._class_image(settled.label, image.shape, message)
-        unit = unit if self.robot.depth_unit is None else self.robot.depth_unit
-        return DepthFrame(self.robot_id, stamp, image, unit, class_image, self._camera, T_team_sensor)
-
-    def _class_image(self, label: RawMessage, shape: tuple[int, ...], depth: RawMessage) -> UInt8Array | None:
-        """The class ids of a label image, which must have the depth image's size."""
-        if self._labels is None:
-            return None
-        raw = decode_labels(label.decode(), label.where)
-        if raw.shape != shape:
-            raise InputError(
-                f"{label.where}: the label image is {raw.shape[1]}x{raw.shape[0]}, but the depth image of "
-                f"'{depth.topic}' is {shape[1]}x{shape[0]}; name topics of one size"
+            back = ((newest_ns or stamp) - stamp) / 1e9
+            self.counts.first_missing.setdefault(
+                "late", f"{message.where}: {back:.3f} s before the newest stamp so far"
             )
-        return self._labels.class_ids(raw, label.where)
+        elif fate is Fate.DUPLICATE:
+            self.counts.duplicate += 1
+
+    def _frame(self, settled: Settled[RawMessage], poses: PoseSource) -> Iterator[Frame]:
+        """The frame of a settled sensor message, or nothing where a part is missing (which is counted)."""
+        if None in settled.partners:
+            self._count_missing("no_label", settled)
+            return
+        if settled.T_map_sensor is None:
+            self._count_missing("no_pose", settled)
+            return
+        T_team_sensor = self.T_team_map @ settled.T_map_sensor
+        boxes = self._own_boxes(poses, settled.stamp_ns, T_team_sensor)
+        if boxes is None:
+            self._count_missing("no_pose", settled)
+            return
+        if not (np.abs(T_team_sensor[:3, 3]) <= self._reach).all():
+            # It is the pose that is broken, and the next one may be good.
+            self._num_beyond += 1
+            self._count_missing("no_pose", settled)
+            return
+        try:
+            frame = self._maker.make(settled, settled.stamp_ns + self._offset_ns, T_team_sensor, boxes)
+        except DamagedMessageError:
+            self.counts.undecodable += 1
+            return
+        if frame is None:
+            self._count_missing("no_label", settled)
+            return
+        self.counts.used += 1
+        yield frame
+
+    def _count_missing(self, cause: str, settled: Settled[RawMessage]) -> None:
+        """Count a sensor message that lacks something, and remember which was the first."""
+        setattr(self.counts, cause, getattr(self.counts, cause) + 1)
+        self.counts.first_missing.setdefault(cause, settled.message.where)
+
+    def _own_boxes(self, poses: PoseSource, stamp_ns: int, T_team_sensor: Float64Array) -> tuple[BodyBox, ...] | None:
+        """The robot's own box where it is at a stamp; None where TF does not say it."""
+        if self.robot.body_box is None:
+            return ()
+        T_body_sensor = poses.T_body_sensor_at(stamp_ns)
+        if T_body_sensor is None:
+            return None
+        corners = np.array(self.robot.body_box).reshape(2, 3)
+        return (BodyBox(corners[0], corners[1], T_body_sensor @ inverse(T_team_sensor), is_own=True),)

@@ -1,8 +1,7 @@
-"""One robot's ordinary log: depth, labels, intrinsics, TF, odometry and class names, as a ROS 2 robot records them."""
+"""One robot's ordinary log, as ROS 2 robots record it: depth images or clouds, labels, TF, odometry, class names."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +13,7 @@ from octoreplay.errors import InputError
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.records import CameraModel, ClassTable, Float64Array
+from octoreplay.transforms import rotation_to_quaternion
 
 MAP_FRAME = "map"
 """The frame that the logs' poses are given in."""
@@ -21,24 +21,28 @@ MAP_FRAME = "map"
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a forward looking optical frame (z forward, x right, y down) in a body (x forward, y left): REP 103."""
 
+_POINT_TYPES = {"u2": 4, "u4": 6, "f4": 7}
+"""NumPy types of a point's fields to sensor_msgs/PointField datatypes."""
+
 
 class RobotLogWriter:
     """Writes one robot's log as MCAP; a context manager that finishes the file.
 
     Topics of robot R: ``/R/camera/depth/image_raw`` (16UC1 in millimetres or 32FC1 in metres),
     ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16), ``/R/labels/label_info`` (once),
-    ``/R/odom``, ``/tf`` (map to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame).
+    ``/R/odom``, ``/tf`` (map to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame). Without a
+    ``camera`` it is a lidar's log: ``/R/lidar/points`` in the frame R/lidar takes the place of the images.
 
     ``class_table`` is None for a log without labels. ``T_body_sensor`` is (4, 4) float64, from the camera's optical
-    frame to the base. ``start_ns`` stamps what is written once, before everything else. Calls must come in time order.
-    Raises OutputError where the file cannot be written.
+    frame, or the lidar's, to the base. ``start_ns`` stamps what is written once, before everything else. Calls must
+    come in time order. Raises OutputError where the file cannot be written.
     """
 
     def __init__(
         self,
         path: Path,
         robot_id: str,
-        camera: CameraModel,
+        camera: CameraModel | None,
         class_table: ClassTable | None,
         *,
         T_body_sensor: Float64Array,
@@ -48,9 +52,10 @@ class RobotLogWriter:
         self._camera = camera
         self._depth_topic, self._label_topic, self._info_topic, self._pose_topic, label_info = topics(robot_id)
         self._body_frame = f"{robot_id}/base_link"
-        self._camera_frame = f"{robot_id}/camera_optical_frame"
+        self._cloud_topic = cloud_topic(robot_id)
+        self._sensor_frame = f"{robot_id}/lidar" if camera is None else f"{robot_id}/camera_optical_frame"
         self._writer = RosMcapWriter(path)
-        self._write_transform("/tf_static", start_ns, self._body_frame, self._camera_frame, T_body_sensor)
+        self._write_transform("/tf_static", start_ns, self._body_frame, self._sensor_frame, T_body_sensor)
         if class_table is not None:
             self._writer.write(
                 label_info, "vision_msgs/msg/LabelInfo", self._label_info(class_table, start_ns), start_ns
@@ -92,17 +97,80 @@ class RobotLogWriter:
         """Append one depth image with its CameraInfo, and its label image.
 
         ``depth_image`` is (H, W) uint16 in millimetres or float32 in metres; ``label_image`` (H, W) uint8 or uint16
-        raw labels. Raises InputError for another type or a size other than the camera's.
+        raw labels. Raises InputError for another type or a size other than the camera's, and in a lidar's log.
         """
-        self._write_image(self._depth_topic, stamp_ns, depth_image, {"u2": "16UC1", "f4": "32FC1"})
-        self._writer.write(self._info_topic, "sensor_msgs/msg/CameraInfo", self._camera_info(stamp_ns), stamp_ns)
+        camera = self._camera
+        if camera is None:
+            raise InputError(f"{self.path}: topic '{self._depth_topic}': a lidar's log takes no images")
+        self._write_image(self._depth_topic, stamp_ns, depth_image, {"u2": "16UC1", "f4": "32FC1"}, camera)
+        info = self._camera_info(camera, stamp_ns)
+        self._writer.write(self._info_topic, "sensor_msgs/msg/CameraInfo", info, stamp_ns)
         if label_image is not None:
-            self._write_image(self._label_topic, stamp_ns, label_image, {"u1": "mono8", "u2": "mono16"})
+            self._write_image(self._label_topic, stamp_ns, label_image, {"u1": "mono8", "u2": "mono16"}, camera)
 
-    def _write_image(self, topic: str, stamp_ns: int, image: npt.NDArray[Any], encodings: dict[str, str]) -> None:
+    def write_cloud(
+        self,
+        stamp_ns: int,
+        points: npt.NDArray[Any],
+        *,
+        labels: npt.NDArray[Any] | None = None,
+        rgb: npt.NDArray[Any] | None = None,
+        intensity: npt.NDArray[Any] | None = None,
+    ) -> None:
+        """Append one point cloud.
+
+        ``points`` is (P, 3) float in the sensor's frame, metres, written as float32; ``labels`` (P,) uint16 or uint32
+        raw labels; ``rgb`` (P,) uint32 0x00RRGGBB, declared as float32, which is PCL's habit and what viewers look for;
+        ``intensity`` (P,) float. Raises InputError for other types or lengths, and in a camera's log.
+        """
+        columns = {name: points[:, axis].astype("<f4") for axis, name in enumerate("xyz")}
+        if intensity is not None:
+            columns["intensity"] = intensity.astype("<f4")
+        if rgb is not None:
+            columns["rgb"] = rgb.astype("<u4").view("<f4")
+        if labels is not None:
+            columns["label"] = labels
+        table = self._point_table(columns)
+        fields = [
+            message(
+                "sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_POINT_TYPES[dtype.str[1:]], count=1
+            )
+            for name, (dtype, offset, *_) in (table.dtype.fields or {}).items()
+        ]
+        value = message(
+            "sensor_msgs/msg/PointCloud2",
+            header=header(stamp_ns, self._sensor_frame),
+            height=1,
+            width=len(points),
+            fields=fields,
+            is_bigendian=False,
+            point_step=table.dtype.itemsize,
+            row_step=table.nbytes,
+            data=table.view(np.uint8).reshape(-1),
+            is_dense=bool(np.isfinite(points).all()),
+        )
+        self._writer.write(self._cloud_topic, "sensor_msgs/msg/PointCloud2", value, stamp_ns)
+
+    def _point_table(self, columns: dict[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Points one after another, from their fields."""
+        num_points = len(columns["x"])
+        fit = all(column.shape == (num_points,) and column.dtype.str[1:] in _POINT_TYPES for column in columns.values())
+        if self._camera is not None or not fit:
+            raise InputError(
+                f"{self.path}: topic '{self._cloud_topic}': takes clouds in a lidar's log only, whose points have each "
+                "a label of uint16 or uint32, a colour and an intensity, or none has"
+            )
+        table = np.empty(num_points, [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+        for name, column in columns.items():
+            table[name] = column
+        return table
+
+    def _write_image(
+        self, topic: str, stamp_ns: int, image: npt.NDArray[Any], encodings: dict[str, str], camera: CameraModel
+    ) -> None:
         """Append one image in the encoding of its type."""
         encoding = encodings.get(image.dtype.str[1:])
-        size = (self._camera.height, self._camera.width)
+        size = (camera.height, camera.width)
         if encoding is None or image.shape != size:
             raise InputError(
                 f"{self.path}: topic '{topic}': an image of {image.shape} {image.dtype} does not fit a camera of {size}"
@@ -110,7 +178,7 @@ class RobotLogWriter:
         data = np.ascontiguousarray(image.astype(image.dtype.newbyteorder("<"), copy=False))
         value = message(
             "sensor_msgs/msg/Image",
-            header=header(stamp_ns, self._camera_frame),
+            header=header(stamp_ns, self._sensor_frame),
             height=size[0],
             width=size[1],
             encoding=encoding,
@@ -120,16 +188,15 @@ class RobotLogWriter:
         )
         self._writer.write(topic, "sensor_msgs/msg/Image", value, stamp_ns)
 
-    def _camera_info(self, stamp_ns: int) -> Any:
+    def _camera_info(self, camera: CameraModel, stamp_ns: int) -> Any:
         """CameraInfo of the rectified camera."""
-        camera = self._camera
         projection = np.array([[camera.fx, 0, camera.cx, 0], [0, camera.fy, camera.cy, 0], [0, 0, 1, 0]], np.float64)
         region = message(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         return message(
             "sensor_msgs/msg/CameraInfo",
-            header=header(stamp_ns, self._camera_frame),
+            header=header(stamp_ns, self._sensor_frame),
             height=camera.height,
             width=camera.width,
             distortion_model="plumb_bob",
@@ -151,7 +218,7 @@ class RobotLogWriter:
         ]
         return message(
             "vision_msgs/msg/LabelInfo",
-            header=header(stamp_ns, self._camera_frame),
+            header=header(stamp_ns, self._sensor_frame),
             class_map=class_map,
             threshold=0.0,
         )
@@ -185,24 +252,9 @@ def topics(robot_id: str) -> tuple[str, str, str, str, str]:
     )
 
 
-def rotation_to_quaternion(rotation: npt.ArrayLike) -> tuple[float, float, float, float]:
-    """The quaternion (x, y, z, w), w >= 0, of a (3, 3) rotation matrix.
-
-    Starts from the largest of the four components, so that nothing is divided by a small number (Shepperd 1978).
-    """
-    r = np.asarray(rotation, dtype=np.float64)
-    squares = np.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
-                        1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + r[0, 0] + r[1, 1] + r[2, 2]])  # fmt: skip
-    largest = int(np.argmax(squares))
-    rows = (
-        (squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]),
-        (r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]),
-        (r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]),
-        (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]),
-    )
-    x, y, z, w = (float(value) for value in rows[largest])
-    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
-    return x / norm, y / norm, z / norm, w / norm
+def cloud_topic(robot_id: str) -> str:
+    """The topic of a lidar robot's point clouds."""
+    return f"/{robot_id}/lidar/points"
 
 
 def _quaternion(rotation: npt.ArrayLike) -> Any:

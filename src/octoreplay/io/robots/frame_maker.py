@@ -1,0 +1,177 @@
+"""From a sensor message with its labels and pose to a frame: images of a camera, point clouds and laser scans."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from abc import ABC, abstractmethod
+from typing import Any
+
+from octoreplay.config import RobotConfig
+from octoreplay.errors import InputError
+from octoreplay.io.containers.log_reader import RawMessage
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.messages.sensor_messages import Calibration, Cloud, CompressedImage, Image, Scan
+from octoreplay.io.robots.frame_queue import Settled
+from octoreplay.io.sensors.cameras import camera_model, check_camera, image_size
+from octoreplay.io.sensors.clouds import decode_cloud, decode_scan
+from octoreplay.io.sensors.images import decode_confidences, decode_depth, decode_labels
+from octoreplay.io.sensors.labels import LabelLookup
+from octoreplay.records import (
+    BodyBox,
+    CameraModel,
+    CloudFrame,
+    DepthFrame,
+    Float64Array,
+    Frame,
+    UInt8Array,
+)
+
+
+class FrameMaker(ABC):
+    """Decodes the messages of one sensor; ``partner_topics`` are the topics of what goes with each of them."""
+
+    def __init__(self, robot: RobotConfig, labels: LabelLookup | None) -> None:
+        self._robot = robot
+        self._labels = labels
+
+    @property
+    @abstractmethod
+    def partner_topics(self) -> tuple[str, ...]:
+        """Topics of messages that belong to a sensor message of the same time; the first must be there."""
+
+    @abstractmethod
+    def make(
+        self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
+    ) -> Frame | None:
+        """The frame of a sensor message, ``stamp_ns`` on the team's clock; None where its labels are missing.
+
+        Raises InputError, and DamagedMessageError where only this message is bad.
+        """
+
+
+class DepthFrameMaker(FrameMaker):
+    """Depth images, raw or encoded, with label and confidence images of the same size."""
+
+    def __init__(self, robot: RobotConfig, labels: LabelLookup | None, calibration: RawMessage | None) -> None:
+        super().__init__(robot, labels)
+        self._camera: CameraModel | None = None
+        self._calibration: Calibration | None = None
+        self._where = "" if calibration is None else calibration.where
+        if calibration is not None:
+            found = calibration.sensor_message()
+            if not isinstance(found, Calibration):
+                raise InputError(f"{calibration.where}: is of type {calibration.type_name}, no CameraInfo")
+            check_camera(found, self._where, is_rectified=_is_rectified(robot))
+            self._calibration = found
+
+    @property
+    def partner_topics(self) -> tuple[str, ...]:
+        """The topics of labels and confidences."""
+        if self._labels is None or not self._robot.label_topic:
+            return ()
+        return tuple(topic for topic in (self._robot.label_topic, self._robot.confidence_topic) if topic)
+
+    def make(
+        self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
+    ) -> Frame:
+        """The frame of a depth image."""
+        message = settled.message
+        depth, unit = decode_depth(_image(message), message.where, self._robot.depth_unit)
+        camera = self._camera_of(depth, message.where)
+        label, confidence = (*settled.partners, None, None)[:2]
+        class_image, confidence_image = None, None
+        if label is not None and self._labels is not None:
+            image = decode_labels(_image(label), label.where)
+            self._check_size(image.pixels, depth, label, message)
+            class_image = self._labels.of_image(image, label.where)
+        if confidence is not None:
+            confidence_image = decode_confidences(_image(confidence), confidence.where)
+            self._check_size(confidence_image, depth, confidence, message)
+        return DepthFrame(
+            self._robot.robot_id, stamp_ns, depth, unit, class_image, camera, T_team_sensor, confidence_image, boxes
+        )
+
+    def _camera_of(self, depth: Any, where: str) -> CameraModel:
+        """The camera of an image, whose size must be what the calibration says, where that says any."""
+        height, width = depth.shape
+        announced = (0, 0) if self._calibration is None else image_size(self._calibration)
+        if self._camera is not None:
+            announced = self._camera.width, self._camera.height
+        if announced[0] and announced != (width, height):
+            whose = "the first one was" if self._calibration is None else "its CameraInfo is for"
+            raise InputError(
+                f"{where}: the image is {width}x{height}, but {whose} {announced[0]}x{announced[1]}; name the right "
+                f"depth_topic or camera_info_topic, or give intrinsics: [fx, fy, cx, cy]"
+            )
+        if self._camera is None:
+            self._camera = self._new_camera(width, height)
+        return self._camera
+
+    def _new_camera(self, width: int, height: int) -> CameraModel:
+        """The camera, made when there is an image of its size."""
+        if self._calibration is None:
+            fx, fy, cx, cy = self._robot.intrinsics or (0.0, 0.0, 0.0, 0.0)
+            return CameraModel(width, height, fx, fy, cx, cy)
+        camera = camera_model(self._calibration, self._where, is_rectified=_is_rectified(self._robot))
+        return dataclasses.replace(camera, width=width, height=height)
+
+    @staticmethod
+    def _check_size(image: Any, depth: Any, message: RawMessage, depth_message: RawMessage) -> None:
+        """Raise InputError where an image has another size than the depth image that it goes with."""
+        if image.shape[:2] != depth.shape:
+            raise InputError(
+                f"{message.where}: the image is {image.shape[1]}x{image.shape[0]}, but the depth image of "
+                f"'{depth_message.topic}' is {depth.shape[1]}x{depth.shape[0]}; name topics of one size"
+            )
+
+
+class CloudFrameMaker(FrameMaker):
+    """Point clouds and laser scans, whose labels and confidences are fields of their points."""
+
+    @property
+    def partner_topics(self) -> tuple[str, ...]:
+        """None: everything is in the cloud."""
+        return ()
+
+    def make(
+        self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
+    ) -> Frame | None:
+        """The frame of a cloud or a scan."""
+        message = settled.message
+        found = message.sensor_message()
+        if isinstance(found, Scan):
+            points, T_frame_points = decode_scan(found), found.T_frame_scan
+        elif isinstance(found, Cloud):
+            T_frame_points = found.T_frame_cloud
+            points = decode_cloud(
+                found, message.where, wanted_labels=self._robot.label_field,
+                wanted_confidences=self._robot.confidence_field,
+            )  # fmt: skip
+        else:
+            raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no point cloud")
+        class_ids: UInt8Array | None = None
+        if self._labels is not None and points.labels is not None:
+            class_ids = self._labels.of_points(points.labels, message.where)
+        elif self._labels is not None and self._labels.num_classes > 1:
+            return None
+        if T_frame_points is not None:
+            # Rays begin where the points' own frame does.
+            T_team_sensor = T_team_sensor @ T_frame_points
+        confidences = points.confidences if class_ids is not None else None
+        return CloudFrame(self._robot.robot_id, stamp_ns, points.points, class_ids, T_team_sensor, confidences, boxes)
+
+
+def _image(message: RawMessage) -> Image | CompressedImage:
+    """The image in a message of an image topic. Raises DamagedMessageError for the others that it may carry too."""
+    found = message.sensor_message()
+    if not isinstance(found, Image | CompressedImage):
+        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no image")
+    return found
+
+
+def _is_rectified(robot: RobotConfig) -> bool:
+    """True where the depth image is rectified: as the team file says, or else the topic's name."""
+    if robot.rectified is not None:
+        return robot.rectified
+    return re.search(r"(^|[/_])rect", str(robot.depth_topic).lower()) is not None

@@ -1,0 +1,78 @@
+"""Frames read and decoded in a thread of their own, a few ahead of whoever takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from queue import Empty, Full, Queue
+from threading import Event, Thread
+from types import TracebackType
+from typing import Self
+
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.records import Frame
+
+NUM_AHEAD = 4
+"""Frames that wait to be taken, at most; so memory does not grow with the length of the log."""
+
+# How often a waiting thread looks whether it is still wanted.
+_LOOK_EVERY_SECONDS = 0.1
+
+
+class ReadAhead:
+    """The frames of one robot's log from a thread; a context manager that ends the thread before the log is closed.
+
+    ``team_start_ns`` as for ``RobotLog.frames``. What that raises is raised by the iterator that ``frames`` gives.
+    """
+
+    def __init__(self, log: RobotLog, team_start_ns: int | None = None) -> None:
+        self._log = log
+        self._team_start_ns = team_start_ns
+        self._queue: Queue[Frame | Exception | None] = Queue(NUM_AHEAD)
+        self._is_closed = Event()
+        self._thread = Thread(target=self._read, name=f"read {log.robot_id}", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_closed.set()
+        self._thread.join()
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames from the beginning; to be called once."""
+        while (item := self._take()) is not None:
+            if isinstance(item, Exception):
+                raise item
+            yield item
+
+    def _take(self) -> Frame | Exception | None:
+        """What was read next; None at the end, and when the log is closed."""
+        while not self._is_closed.is_set():
+            try:
+                return self._queue.get(timeout=_LOOK_EVERY_SECONDS)
+            except Empty:
+                continue
+        return None
+
+    def _read(self) -> None:
+        """Read frames until there are none, one fails, or nobody wants them."""
+        try:
+            for frame in self._log.frames(self._team_start_ns, is_wanted=lambda: not self._is_closed.is_set()):
+                if not self._put(frame):
+                    return
+            self._put(None)
+        except Exception as error:
+            self._put(error)
+
+    def _put(self, item: Frame | Exception | None) -> bool:
+        """Wait until there is room; False when nobody wants it any more."""
+        while not self._is_closed.is_set():
+            try:
+                self._queue.put(item, timeout=_LOOK_EVERY_SECONDS)
+            except Full:
+                continue
+            return True
+        return False

@@ -1,0 +1,209 @@
+"""What is in a log: its topics, what the first message of each sensor's topic shows, and which robots share it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from octoreplay.errors import InputError
+from octoreplay.io.containers.log_reader import LogReader, TopicInfo, first_whole_message
+from octoreplay.io.messages.decoders import ENCODINGS
+from octoreplay.io.messages.sensor_messages import (
+    Cloud,
+    CompressedImage,
+    Image,
+    Kind,
+    Scan,
+    Transforms,
+    kind_of,
+)
+from octoreplay.io.robots.pose_source import POSE_KINDS
+from octoreplay.io.robots.poses import frame_name
+from octoreplay.io.sensors.clouds import label_field
+from octoreplay.io.sensors.images import COLOR_ENCODINGS, DEPTH_ENCODINGS, LABEL_ENCODINGS, encoding_and_size
+
+IMAGES = (Kind.IMAGE, Kind.COMPRESSED_IMAGE)
+CLOUDS = (Kind.CLOUD, Kind.SCAN)
+SENSORS = (*IMAGES, *CLOUDS)
+
+_DEPTH_HINTS = ("depth", "range", "disparity_z")
+_LABEL_HINTS = ("label", "semantic", "segment", "class")
+_CONFIDENCE_HINTS = ("confidence", "probability", "uncertainty")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the first message of an image, cloud or scan topic shows.
+
+    ``encoding`` is '' but for images, ``fields`` are empty but for clouds.
+    """
+
+    topic: str
+    kind: Kind
+    encoding: str
+    size: tuple[int, int]
+    frame_id: str
+    fields: tuple[str, ...]
+    detail: str
+
+    @property
+    def has_labels(self) -> bool:
+        """True for a cloud with a field of labels."""
+        return label_field(self.fields) is not None
+
+    @property
+    def is_depth(self) -> bool:
+        """True for a depth image, by its encoding and, where labels and thermal images share that, by its name."""
+        subject = self._subject
+        if self.encoding not in DEPTH_ENCODINGS or subject in (_LABEL_HINTS, _CONFIDENCE_HINTS):
+            return False
+        return self.encoding in ("32FC1", "16UC1") or subject is _DEPTH_HINTS
+
+    @property
+    def is_label(self) -> bool:
+        """True for a label image: an encoding that only labels have, or one that they share and a name that says so."""
+        subject = self._subject
+        if self.encoding not in (*LABEL_ENCODINGS, "palette", "jpeg rgb8") or subject is _CONFIDENCE_HINTS:
+            return False
+        return self.encoding in ("16SC1", "32SC1") or subject is _LABEL_HINTS
+
+    @property
+    def is_color(self) -> bool:
+        """True where an image's pixels are colours."""
+        return self.encoding in COLOR_ENCODINGS or self.encoding == "jpeg rgb8"
+
+    @property
+    def is_confidence(self) -> bool:
+        """True for an image that says how sure labels are: its name speaks of both."""
+        says_both = self._subject is _CONFIDENCE_HINTS and self._place_of(_LABEL_HINTS) >= 0
+        return says_both and self.encoding in ("mono8", "8UC1", "mono16", "16UC1", "32FC1")
+
+    @property
+    def is_sensor(self) -> bool:
+        """True where a map can be made from it."""
+        return self.is_depth or self.kind in CLOUDS
+
+    @property
+    def _subject(self) -> tuple[str, ...] | None:
+        """What the topic's name speaks of last: a namespace before it may speak of anything."""
+        last = max((_DEPTH_HINTS, _LABEL_HINTS, _CONFIDENCE_HINTS), key=self._place_of)
+        return last if self._place_of(last) >= 0 else None
+
+    def _place_of(self, hints: tuple[str, ...]) -> int:
+        """Where the last of some hints ends in the topic's name; -1 without any."""
+        name = self.topic.lower()
+        return max(name.rfind(hint) + len(hint) if hint in name else -1 for hint in hints)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """One open log's topics, and what its sensor topics look like by name.
+
+    ``owners`` says which robot a topic belongs to where the log holds several; it is empty where it holds one.
+    """
+
+    log: LogReader
+    start_ns: int | None
+    end_ns: int | None
+    num_messages: int
+    topics: tuple[TopicInfo, ...]
+    looks: Mapping[str, Look]
+    owners: Mapping[str, str]
+    damage: str | None
+
+    @property
+    def path(self) -> Path:
+        """Where the log is."""
+        return self.log.path
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots that share the log, in the order of their sensors' topics; empty where it holds one."""
+        sensors = (topic for topic, look in self.looks.items() if look.is_sensor)
+        return tuple(dict.fromkeys(self.owners[topic] for topic in sensors if topic in self.owners))
+
+
+def survey_log(log: LogReader) -> Survey:
+    """An open log's topics; the first message of each image, cloud and scan topic is looked at."""
+    looks = {}
+    for topic in log.topics:
+        if kind_of(topic.type_name) in SENSORS and topic.encoding in ENCODINGS and topic.num_messages:
+            look = _look(log, topic)
+            if look is not None:
+                looks[topic.name] = look
+    owners = _owners_by_name(log.topics, looks) or _owners_by_frame(log, looks)
+    return Survey(log, log.start_ns, log.end_ns, log.message_count, log.topics, looks, owners, log.damage)
+
+
+def first_part(topic: str) -> str:
+    """The first part of a topic's name."""
+    return topic.strip("/").split("/", 1)[0]
+
+
+def _look(log: LogReader, topic: TopicInfo) -> Look | None:
+    """What a topic's first message shows; None where it cannot be decoded."""
+    message = first_whole_message(log, topic.name, SENSORS)
+    kind = None if message is None else kind_of(message.type_name)
+    if message is None or kind not in SENSORS:
+        return None
+    try:
+        found = message.sensor_message()
+        if isinstance(found, Image | CompressedImage):
+            encoding, size = encoding_and_size(found, message.where)
+            detail = f"{encoding} {size[0]}x{size[1]}"
+            return Look(topic.name, kind, encoding, size, frame_name(found.frame_id), (), detail)
+    except InputError:
+        return None
+    if isinstance(found, Cloud):
+        names = [field.name for field in found.fields]
+        size, detail = (found.width, found.height), f"{found.width}x{found.height}: {', '.join(names)}"
+        return Look(topic.name, kind, "", size, frame_name(found.frame_id), tuple(names), detail)
+    if isinstance(found, Scan):
+        size = (found.ranges.size, 1)
+        return Look(topic.name, kind, "", size, frame_name(found.frame_id), (), f"{size[0]} ranges")
+    return None
+
+
+def _owners_by_name(topics: tuple[TopicInfo, ...], looks: Mapping[str, Look]) -> dict[str, str]:
+    """Topics to robots by the first part of their names, where at least two such parts have a sensor and a pose each.
+
+    A sensor whose frame has the same first part counts as one with a pose, which TF then gives.
+    """
+    found = []
+    for name in dict.fromkeys(first_part(topic) for topic, look in looks.items() if look.is_sensor):
+        own = [topic for topic in topics if first_part(topic.name) == name and topic.name.count("/") > 1]
+        has_pose = any(kind_of(topic.type_name) in POSE_KINDS for topic in own)
+        frames = [look.frame_id for topic, look in looks.items() if first_part(topic) == name]
+        if has_pose or any(frame.startswith(f"{name}/") for frame in frames):
+            found.append(name)
+    if len(found) < 2:
+        return {}
+    return {topic.name: first_part(topic.name) for topic in topics if first_part(topic.name) in found}
+
+
+def _owners_by_frame(log: LogReader, looks: Mapping[str, Look]) -> dict[str, str]:
+    """Topics to robots by the first part of their frames, where the sensors have at least two such parts."""
+    owners = {topic: first_part(look.frame_id) for topic, look in looks.items() if "/" in look.frame_id}
+    if len({owners[topic] for topic, look in looks.items() if look.is_sensor and topic in owners}) < 2:
+        return {}
+    for topic in log.topics:
+        if kind_of(topic.type_name) not in (None, Kind.TF) and topic.name not in looks and topic.num_messages:
+            frame = _frame(log, topic.name)
+            if "/" in frame:
+                owners[topic.name] = first_part(frame)
+    return owners
+
+
+def _frame(log: LogReader, topic: str) -> str:
+    """The frame of a topic's first message: of a pose the one that it is of, where it says that; '' without any."""
+    message = first_whole_message(log, topic, tuple(Kind))
+    if message is None:
+        return ""
+    try:
+        found = message.sensor_message() if kind_of(message.type_name) in POSE_KINDS else None
+        if isinstance(found, Transforms):
+            return next((frame_name(pose.child or pose.parent) for pose in found.transforms), "")
+        return frame_name(message.header_frame_id())
+    except InputError:
+        return ""

@@ -1,0 +1,93 @@
+"""Where the robots' bodies are, so that what one robot sees of another does not become part of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.records import BodyBox, Float64Array
+from octoreplay.transforms import inverse
+
+# Poses are looked for this much further in the log than the time they are wanted for.
+_LOOK_AHEAD_NS = 10_000_000_000
+
+
+class BodyTrack:
+    """The box of one robot over time, from its own reading of the poses in its log; a context manager."""
+
+    def __init__(self, robot: RobotConfig, time: TimeConfig) -> None:
+        self._log = RobotLog(robot, time, None)
+        self._poses = self._log.pose_source()
+        self._messages = self._log.pose_messages(self._poses)
+        self._offset_ns = round(robot.clock_offset * 1e9)
+        self._corners = np.array(robot.body_box, np.float64).reshape(2, 3)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._log.close()
+
+    def advance(self, start_ns: int, end_ns: int) -> None:
+        """Make the poses from a stamp to another known, as far as the log has them, and drop the ones before."""
+        start_ns, end_ns = start_ns - self._offset_ns, end_ns - self._offset_ns
+        self._poses.forget_before(start_ns)
+        while not self._poses.is_known(end_ns):
+            message = next(self._messages, None)
+            if message is None:
+                return
+            self._poses.forget_before(start_ns)
+            elapsed_ns = end_ns - (self._log.first_stamp_ns - self._offset_ns)
+            if message.log_time_ns - self._log.first_log_time_ns > max(elapsed_ns, 0) + _LOOK_AHEAD_NS:
+                return
+
+    def box_at(self, stamp_ns: int) -> BodyBox | None:
+        """The robot's box at a stamp; None where its pose is not known there."""
+        stamp_ns -= self._offset_ns
+        T_map_sensor, T_body_sensor = self._poses.at(stamp_ns), self._poses.T_body_sensor_at(stamp_ns)
+        if T_map_sensor is None or T_body_sensor is None:
+            return None
+        T_team_sensor: Float64Array = self._log.T_team_map @ T_map_sensor
+        return BodyBox(self._corners[0], self._corners[1], T_body_sensor @ inverse(T_team_sensor), is_own=False)
+
+
+class TeamBodies:
+    """The boxes of all robots that have one (``body_box``); a context manager.
+
+    ``advance`` is called for a span of time before the boxes in it are asked for, which threads may then do.
+    """
+
+    def __init__(self, robots: Sequence[RobotConfig], time: TimeConfig) -> None:
+        with ExitStack() as stack:
+            self._tracks = {
+                index: stack.enter_context(BodyTrack(robot, time))
+                for index, robot in enumerate(robots)
+                if robot.body_box is not None
+            }
+            self._closing = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.close()
+
+    def advance(self, start_ns: int, end_ns: int) -> None:
+        """Read the robots' poses between two stamps."""
+        for track in self._tracks.values():
+            track.advance(start_ns, end_ns)
+
+    def seen_by(self, index: int, stamp_ns: int) -> tuple[BodyBox, ...]:
+        """The boxes at a stamp of all robots but one."""
+        boxes = (track.box_at(stamp_ns) for other, track in self._tracks.items() if other != index)
+        return tuple(box for box in boxes if box is not None)

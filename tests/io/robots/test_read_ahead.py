@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from log_factory import NAMES, robot_entries, write_mcap
+from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.errors import InputError
+from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.sensors.labels import class_table_from_names
+
+TABLE = class_table_from_names({"r": NAMES})
+
+
+@pytest.fixture
+def robot(tmp_path):
+    path = write_mcap(tmp_path / "r.mcap", robot_entries(num_frames=20))
+    return RobotConfig(
+        "r", (path,), depth_topic="/camera/depth/image_raw", label_topic="/camera/labels/image_raw",
+        camera_info_topic="/camera/depth/camera_info", pose_topic="/odom",
+    )  # fmt: skip
+
+
+class CountedLog(RobotLog):
+    """Counts the frames that were read, and can fail after some."""
+
+    num_read = 0
+    fails_after = 1000
+
+    def frames(self, team_start_ns=None, *, is_wanted):
+        for frame in super().frames(team_start_ns, is_wanted=is_wanted):
+            if self.num_read == self.fails_after:
+                raise InputError("r.mcap: broken here")
+            self.num_read += 1
+            yield frame
+
+
+def test_the_frames_are_the_logs_own(robot):
+    with RobotLog(robot, TimeConfig(), TABLE) as log:
+        expected = list(log.frames())
+    with RobotLog(robot, TimeConfig(), TABLE) as log, ReadAhead(log) as source:
+        frames = list(source.frames())
+        assert log.counts.used == len(expected) == 20
+    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in expected]
+    for frame, other in zip(frames, expected, strict=True):
+        np.testing.assert_array_equal(frame.depth_image, other.depth_image)
+        np.testing.assert_array_equal(frame.T_team_sensor, other.T_team_sensor)
+
+
+def test_only_a_few_frames_are_read_ahead_and_leaving_ends_the_thread(robot):
+    with CountedLog(robot, TimeConfig(), TABLE) as log:
+        with ReadAhead(log) as source:
+            frames = source.frames()
+            next(frames)
+            time.sleep(0.3)
+            # One is taken, some wait, and one waits to be put.
+            assert log.num_read == 1 + NUM_AHEAD + 1
+        assert not any(thread.name == "read r" for thread in threading.enumerate())
+        assert log.num_read == NUM_AHEAD + 2
+
+
+def test_what_fails_in_the_thread_is_raised_where_frames_are_taken(robot):
+    with CountedLog(robot, TimeConfig(), TABLE) as log, ReadAhead(log) as source:
+        log.fails_after = 7
+        taken = []
+        with pytest.raises(InputError, match=r"r\.mcap: broken here"):
+            taken.extend(iter(source.frames()))
+    assert log.num_read == 7
+
+
+def test_a_source_that_was_never_asked_can_be_left(robot):
+    with RobotLog(robot, TimeConfig(), TABLE) as log, ReadAhead(log):
+        pass
+
+
+def test_leaving_ends_a_reading_that_finds_no_frames(robot, monkeypatch):
+    """A log of which nothing is wanted is left at the next message, not at its end."""
+    seen = []
+
+    def messages(self, topics):
+        for number in range(10**9):
+            seen.append(number)
+            yield from original(self, topics)
+
+    original = RobotLog._messages
+    time_config = TimeConfig(start=1e6)
+    with RobotLog(robot, time_config, TABLE) as log:
+        monkeypatch.setattr(RobotLog, "_messages", messages)
+        started = time.monotonic()
+        with ReadAhead(log):
+            time.sleep(0.2)
+        assert time.monotonic() - started < 5
+    assert len(seen) > 1

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from log_factory import SECOND, robot_entries, write_mcap
+from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.io.robots.team_bodies import TeamBodies
+
+START = 100 * SECOND
+BOX = (-0.5, -0.4, 0.0, 0.5, 0.4, 0.6)
+
+
+def robot_of(tmp_path, name, *, poses="odometry", num_frames=40, **fields):
+    entries = robot_entries(num_frames=num_frames, poses=poses, labels=False)
+    known = {"depth_topic": "/camera/depth/image_raw", "camera_info_topic": "/camera/depth/camera_info"}
+    known |= {"pose_topic": "/tf", "map_frame": "map"} if poses == "tf" else {"pose_topic": "/odom"}
+    return RobotConfig(name, (write_mcap(tmp_path / f"{name}.mcap", entries),), **{**known, **fields})
+
+
+def inside(box, points):
+    local = (box.T_box_team @ np.append(np.array(points), np.ones((len(points), 1)), axis=1).T).T[:, :3]
+    return ((local >= box.low) & (local <= box.high)).all(axis=1).tolist()
+
+
+@pytest.mark.parametrize("poses", ["odometry", "tf"])
+def test_boxes_are_where_the_robots_are(tmp_path, poses):
+    """The base of robot b is at x = t, 10 m to the left and half a second later than its stamps say."""
+    robots = (
+        robot_of(tmp_path, "a", body_box=BOX),
+        robot_of(
+            tmp_path, "b", poses=poses, body_box=BOX, body_frame="base_link" if poses == "tf" else None,
+            T_team_map=(0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 1.0), clock_offset=0.5,
+        ),
+        robot_of(tmp_path, "c"),
+    )  # fmt: skip
+    with TeamBodies(robots, TimeConfig()) as bodies:
+        for second in range(1, 9):
+            bodies.advance(START + (second - 1) * SECOND, START + second * SECOND)
+            stamp = START + second * SECOND - SECOND // 8
+            [box] = bodies.seen_by(0, stamp)
+            assert not box.is_own
+            x = second - 0.125 - 0.5
+            assert inside(box, [(x, 10, 0.3), (x + 0.49, 10.39, 0.59), (x + 0.51, 10, 0.3), (x, 10, -0.01)]) == [
+                True, True, False, False,
+            ]  # fmt: skip
+            assert len(bodies.seen_by(2, stamp)) == 2
+            [other] = bodies.seen_by(1, stamp)
+            assert inside(other, [(second - 0.125, 0, 0.1), (second + 0.5, 0, 0.1)]) == [True, False]
+
+
+def test_a_robot_whose_poses_have_ended_has_no_box(tmp_path):
+    robots = (robot_of(tmp_path, "a"), robot_of(tmp_path, "b", num_frames=4, body_box=BOX))
+    with TeamBodies(robots, TimeConfig()) as bodies:
+        bodies.advance(START, START + SECOND // 2)
+        assert len(bodies.seen_by(0, START + SECOND // 4)) == 1
+        bodies.advance(START + 5 * SECOND, START + 6 * SECOND)
+        assert bodies.seen_by(0, START + 5 * SECOND + 1) == ()
+
+
+def test_poses_are_read_only_as_far_as_they_are_wanted(tmp_path):
+    robots = (robot_of(tmp_path, "a"), robot_of(tmp_path, "b", num_frames=400, body_box=BOX))
+    with TeamBodies(robots, TimeConfig()) as bodies:
+        bodies.advance(START, START + SECOND)
+        track = bodies._tracks[1]
+        assert len(track._poses._track) < 20
+        for second in range(1, 60):
+            bodies.advance(START + (second - 1) * SECOND, START + second * SECOND)
+        assert len(track._poses._track) < 20

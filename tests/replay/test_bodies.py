@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from log_factory import robot_entries, write_mcap
+from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.io.robots.read_ahead import ReadAhead
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_bodies import TeamBodies
+from octoreplay.records import ClassTable, SemanticClass
+from octoreplay.replay.session import Session, replay_team
+
+CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
+
+
+def robot_of(tmp_path, name, **fields):
+    """A robot that drives along x and sees a wall 1 m ahead of its camera, all the time."""
+    path = write_mcap(tmp_path / f"{name}.mcap", robot_entries(num_frames=10, labels=False))
+    return RobotConfig(
+        name, (path,), depth_topic="/camera/depth/image_raw", camera_info_topic="/camera/depth/camera_info",
+        pose_topic="/odom", label_topic="", **fields,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def config(tmp_path):
+    """Robot b drives 1 m ahead of robot a, and is what a sees; b sees a wall."""
+    robots = (
+        robot_of(tmp_path, "a"),
+        robot_of(
+            tmp_path, "b", T_team_map=(1.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), body_box=(-0.4, -0.6, 0.0, 0.4, 0.6, 1.0)
+        ),
+    )
+    return RunConfig(robots, classes=CLASSES).with_parameters({"rule": "local", "resolution": 0.1})
+
+
+def num_occupied(config, *, hides):
+    """Occupied leaves of each robot's map at the end."""
+    with ExitStack() as stack:
+        logs = [stack.enter_context(RobotLog(robot, config.time, CLASSES)) for robot in config.robots]
+        sources = [stack.enter_context(ReadAhead(log)) for log in logs]
+        bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
+        *_, last = Session(config, sources, bodies=bodies).ticks()
+        return [int(np.count_nonzero(octree.leaves(0.0).log_odds[:, 0] > 0)) for octree in last.maps]
+
+
+def test_what_a_robot_sees_of_another_is_not_mapped(config):
+    seen, hidden = num_occupied(config, hides=False), num_occupied(config, hides=True)
+    assert seen[0] > 10
+    # The robot in front frees the cells that it drives through, and its own box is no one else's.
+    assert hidden[0] == 0
+    assert hidden[1] == seen[1] > 10
+
+
+def test_a_run_hides_robots_where_it_is_told_to(config):
+    volumes = {}
+    for hides in (False, True):
+        summary = replay_team(config.with_parameters({"hide_robots": hides}), None)
+        volumes[hides] = [robot.entropy_bits for robot in summary.last.robots]
+    assert volumes[True][0] != volumes[False][0]
+    assert volumes[True][1] == volumes[False][1]
