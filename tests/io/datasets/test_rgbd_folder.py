@@ -293,7 +293,7 @@ def test_label_pictures_of_another_size_or_name_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "text", "message"),
-    [("groundtruth.txt", "1.0 2 3\n", "line 1: expects a stamp, a position and a quaternion"),
+    [("groundtruth.txt", "1.0 2 3\n", "line 1: expects 8 numbers in every row"),
      ("groundtruth.txt", "soon 1 2 3 0 0 0 1\n", "'soon' is not a time"),
      ("depth.txt", "1.0\n", "line 1: expects a stamp and a file name"),
      ("depth.txt", "# nothing\n", "lists no depth pictures"),

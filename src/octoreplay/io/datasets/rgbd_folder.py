@@ -13,24 +13,32 @@ Three layouts are told apart by what is in the folder:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.errors import ConfigError, InputError, OutputError
-from octoreplay.io.robots.poses import PoseTrack, inverse, pose_matrix
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.datasets.frames_folder import (
+    check_choice,
+    chosen_frames,
+    frame_stamps,
+    natural_order,
+    read_times,
+    robot_name,
+    unfinished,
+)
+from octoreplay.io.datasets.pose_files import PoseReader, matrix_reader, read_tum_track, track_reader
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
-from octoreplay.records import CameraModel, ClassTable, Float64Array
+from octoreplay.io.text_tables import read_matrix, rows, seconds_to_ns
+from octoreplay.records import CameraModel, ClassTable
+from octoreplay.transforms import inverse
 
 MILLIMETRE = 0.001
 
-_POSE_GAP_NS = 200_000_000
 _INVALID = 65535
 
 
@@ -56,7 +64,7 @@ class _Frame:
     depth_file: Path
     label_file: Path | None
     stamp_ns: int | None
-    read_pose: Callable[[], Float64Array | None]
+    read_pose: PoseReader
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,17 +110,14 @@ def import_rgbd(
     Raises InputError for what is missing or damaged, ConfigError for options that do not fit, OutputError where the log
     cannot be written; then nothing is left behind.
     """
-    _check_options(rate, times, first, every, intrinsics, depth_unit)
-    robot_id = _robot_id(output) if robot_id is None else robot_id
-    if not robot_id or "/" in robot_id:
-        raise ConfigError(f"robot id '{robot_id}': must not be empty or contain '/'")
+    check_choice(rate, times, first, every)
+    _check_options(intrinsics, depth_unit)
+    robot_id = robot_name(robot_id, output)
     layout = _find_layout(folder)
     frames = layout.frames if labels is None else _with_labels(layout.frames, labels)
-    chosen = range(first, len(frames) if last is None else min(last + 1, len(frames)), every)
-    if not chosen:
-        raise ConfigError(f"{folder}: no frame between first {first} and last {last}; the folder has {len(frames)}")
-    stamps = _stamps(folder, [frames[k] for k in chosen], chosen, len(frames), rate, times)
-    partial = output.with_name(f"{output.stem}.partial.mcap")
+    chosen = chosen_frames(folder, len(frames), first, last, every)
+    own = _own_times([frames[k] for k in chosen]) if times is None else read_times(times, chosen, len(frames))
+    stamps = frame_stamps(times or folder, own, rate, len(chosen))
     job = _Import(
         frames=[frames[k] for k in chosen],
         stamps=stamps,
@@ -121,16 +126,10 @@ def import_rgbd(
         ),
         depth_unit=layout.depth_unit if depth_unit is None else depth_unit,
     )
-    try:
+    with unfinished(output) as partial:
         job.write(partial, robot_id, class_table, progress)
         if job.num_frames == 0:
             raise InputError(f"{folder}: none of the {len(chosen)} frames has a usable pose")
-        partial.replace(output)
-    except BaseException as error:
-        partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
-        raise
     return ImportSummary(
         output, robot_id, layout.name, job.camera, job.depth_unit, job.num_frames, job.num_labelled,
         job.num_without_pose, (stamps[-1] - stamps[0]) / 1e9,
@@ -201,35 +200,14 @@ class _Import:
             )
 
 
-def _check_options(
-    rate: float | None,
-    times: Path | None,
-    first: int,
-    every: int,
-    intrinsics: Sequence[float] | None,
-    depth_unit: float | None,
-) -> None:
-    """Refuse options that make no sense whatever the folder holds."""
-    if rate is not None and times is not None:
-        raise ConfigError("rate and times: give one of them, not both")
-    if rate is not None and not 0 < rate <= 1e6:
-        raise ConfigError(f"rate: {rate:g} must be greater than 0 and at most 1000000")
-    if first < 0:
-        raise ConfigError(f"first: {first} is below the least value 0")
-    if every < 1:
-        raise ConfigError(f"every: {every} is below the least value 1")
+def _check_options(intrinsics: Sequence[float] | None, depth_unit: float | None) -> None:
+    """Refuse a camera that makes no sense whatever the folder holds."""
     if intrinsics is not None and (
         len(intrinsics) != 4 or not np.isfinite(intrinsics).all() or min(intrinsics[:2]) <= 0
     ):
         raise ConfigError("intrinsics: expects 4 numbers fx, fy, cx, cy in pixels, fx and fy greater than 0")
     if depth_unit is not None and not 0 < depth_unit < 1000:
         raise ConfigError(f"depth_unit: {depth_unit:g} must be greater than 0 and below 1000 metres")
-
-
-def _robot_id(output: Path) -> str:
-    """A robot id that is good in topic names, from the log's file name."""
-    name = re.sub(r"[^A-Za-z0-9_]+", "_", output.stem).strip("_") or "robot"
-    return f"robot_{name}" if name[0].isdigit() else name
 
 
 # --- layouts ---------------------------------------------------------------------------------------------------------
@@ -239,24 +217,18 @@ def _find_layout(folder: Path) -> _Layout:
     """Tell the layout by what is in the folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder")
-    pictures = sorted(folder.glob("frame-*.depth.png"), key=_number)
+    pictures = sorted(folder.glob("frame-*.depth.png"), key=natural_order)
     if pictures:
         return _seven_scenes(folder, pictures)
     if (folder / "depth.txt").is_file() and (folder / "groundtruth.txt").is_file():
         return _tum(folder)
-    pictures = sorted((folder / "depth").glob("*.png"), key=_number)
+    pictures = sorted((folder / "depth").glob("*.png"), key=natural_order)
     if pictures and (folder / "pose").is_dir():
         return _scannet(folder, pictures)
     raise InputError(
         f"{folder}: no RGB-D sequence found; looked for frame-*.depth.png with frame-*.pose.txt (7-Scenes), depth.txt "
         "with groundtruth.txt (TUM RGB-D), depth/*.png with pose/*.txt (ScanNet)"
     )
-
-
-def _number(path: Path) -> tuple[int, str]:
-    """Sorts frames by the number in their name, so that 10 comes after 9."""
-    digits = re.search(r"\d+", path.name)
-    return (int(digits.group()) if digits else -1, path.name)
 
 
 def _seven_scenes(folder: Path, pictures: list[Path]) -> _Layout:
@@ -266,7 +238,7 @@ def _seven_scenes(folder: Path, pictures: list[Path]) -> _Layout:
             intrinsics, assumed = _read_camera_matrix(place / "camera-intrinsics.txt"), False
             break
     frames = [
-        _Frame(picture, None, None, _matrix_reader(picture.with_name(f"{_stem(picture)}.pose.txt")))
+        _Frame(picture, None, None, matrix_reader(picture.with_name(f"{_stem(picture)}.pose.txt")))
         for picture in pictures
     ]
     return _Layout("7-Scenes", frames, intrinsics, assumed, MILLIMETRE)
@@ -276,7 +248,7 @@ def _scannet(folder: Path, pictures: list[Path]) -> _Layout:
     path = folder / "intrinsic" / "intrinsic_depth.txt"
     if not path.is_file():
         raise InputError(f"{path}: not found; a ScanNet folder holds the depth camera's matrix there")
-    frames = [_Frame(p, None, None, _matrix_reader(folder / "pose" / f"{p.stem}.txt")) for p in pictures]
+    frames = [_Frame(p, None, None, matrix_reader(folder / "pose" / f"{p.stem}.txt")) for p in pictures]
     for name in ("label", "label-filt"):
         if (folder / name).is_dir():
             frames = _with_labels(frames, folder / name)
@@ -285,22 +257,23 @@ def _scannet(folder: Path, pictures: list[Path]) -> _Layout:
 
 
 def _tum(folder: Path) -> _Layout:
-    track = PoseTrack(_POSE_GAP_NS)
-    for where, fields in _rows(folder / "groundtruth.txt"):
-        if len(fields) != 8:
-            raise InputError(f"{where}: expects a stamp, a position and a quaternion, 8 numbers, got {len(fields)}")
-        values = _floats(where, fields[1:])
-        track.add(_seconds_to_ns(where, fields[0]), values[:3], values[3:])
+    track = read_tum_track(folder / "groundtruth.txt")
     frames = []
-    for where, fields in _rows(folder / "depth.txt"):
+    for where, fields in rows(folder / "depth.txt"):
         if len(fields) != 2:
             raise InputError(f"{where}: expects a stamp and a file name, got {len(fields)} words")
-        stamp_ns = _seconds_to_ns(where, fields[0])
-        frames.append(_Frame(folder / fields[1], None, stamp_ns, _track_reader(track, stamp_ns)))
+        stamp_ns = seconds_to_ns(where, fields[0])
+        frames.append(_Frame(folder / fields[1], None, stamp_ns, track_reader(track, stamp_ns)))
     if not frames:
         raise InputError(f"{folder / 'depth.txt'}: lists no depth pictures")
     frames.sort(key=lambda frame: frame.stamp_ns or 0)
     return _Layout("TUM RGB-D", frames, (525.0, 525.0, 319.5, 239.5), True, 1 / 5000)
+
+
+def _own_times(frames: list[_Frame]) -> list[int] | None:
+    """The frames' own stamps; None where one has none."""
+    stamps = [frame.stamp_ns for frame in frames if frame.stamp_ns is not None]
+    return stamps if len(stamps) == len(frames) else None
 
 
 def _with_labels(frames: list[_Frame], folder: Path) -> list[_Frame]:
@@ -324,119 +297,15 @@ def _stem(path: Path) -> str:
     return re.sub(r"(\.(depth|label|labels))?\.png$", "", path.name)
 
 
-# --- times -----------------------------------------------------------------------------------------------------------
-
-
-def _stamps(
-    folder: Path, frames: list[_Frame], chosen: range, total: int, rate: float | None, times: Path | None
-) -> list[int]:
-    """Stamps of the chosen frames, strictly ascending."""
-    if rate is not None:
-        return [round(k * 1e9 / rate) for k in range(len(frames))]
-    if times is not None:
-        stamps = _read_times(times, chosen, total)
-    else:
-        stamps = [frame.stamp_ns for frame in frames if frame.stamp_ns is not None]
-        if len(stamps) < len(frames):
-            raise ConfigError(f"{folder}: the frames have no times; give a rate or a file of times")
-    if any(later <= earlier for earlier, later in pairwise(stamps)):
-        raise InputError(f"{times or folder}: the frames' times do not ascend")
-    if stamps[0] < 0:
-        raise InputError(f"{times or folder}: times must not be negative")
-    return stamps
-
-
-def _read_times(path: Path, chosen: range, total: int) -> list[int]:
-    """Stamps from a text file that holds one for every frame of the folder, or for every chosen one."""
-    stamps = [_seconds_to_ns(where, fields[0]) for where, fields in _rows(path)]
-    if len(stamps) == total:
-        return [stamps[k] for k in chosen]
-    if len(stamps) == len(chosen):
-        return stamps
-    raise InputError(
-        f"{path}: has {len(stamps)} times; the folder has {total} frames, of which {len(chosen)} are taken"
-    )
-
-
-def _seconds_to_ns(where: str, text: str) -> int:
-    """Integer nanoseconds of a decimal number of seconds, without going through a float."""
-    try:
-        return int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError):
-        raise InputError(f"{where}: '{text}' is not a time in seconds") from None
-
-
 # --- files -----------------------------------------------------------------------------------------------------------
-
-
-def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """The rows of a text table as words, with 'file line N' for messages; comments and empty lines are left out."""
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
-        fields = line.split("#", 1)[0].replace(",", " ").split()
-        if fields:
-            yield f"{path} line {number}", fields
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file") from error
-
-
-def _floats(where: str, fields: list[str]) -> list[float]:
-    """Numbers from words."""
-    try:
-        return [float(field) for field in fields]
-    except ValueError:
-        raise InputError(f"{where}: expects numbers, got '{' '.join(fields)}'") from None
-
-
-def _read_matrix(path: Path, shapes: tuple[int, ...]) -> Float64Array:
-    """A square matrix of one of these sizes from a text file."""
-    values = [value for where, fields in _rows(path) for value in _floats(where, fields)]
-    for n in shapes:
-        if len(values) == n * n:
-            return np.array(values).reshape(n, n)
-    expected = " or ".join(f"{n}x{n}" for n in shapes)
-    raise InputError(f"{path}: expects a {expected} matrix, got {len(values)} numbers")
 
 
 def _read_camera_matrix(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy from a camera matrix."""
-    K = _read_matrix(path, (3, 4))
+    K = read_matrix(path, (3, 4))
     if not np.isfinite(K[:3, :3]).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise InputError(f"{path}: is not a camera matrix; its focal lengths must be greater than 0")
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-
-
-def _matrix_reader(path: Path) -> Callable[[], Float64Array | None]:
-    """Reads a pose file when asked; None where it is missing or, as for lost tracking in ScanNet, not finite."""
-
-    def read() -> Float64Array | None:
-        if not path.is_file():
-            return None
-        T = _read_matrix(path, (4,))
-        if not np.isfinite(T).all():
-            return None
-        rotation = T[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=0.02) or np.linalg.det(rotation) < 0:
-            raise InputError(f"{path}: its upper left 3x3 part is not a rotation")
-        return T
-
-    return read
-
-
-def _track_reader(track: PoseTrack, stamp_ns: int) -> Callable[[], Float64Array | None]:
-    """Interpolates a pose when asked; None where the track has none at that time."""
-
-    def read() -> Float64Array | None:
-        pose = track.at(stamp_ns)
-        return None if pose is None else pose_matrix(*pose)
-
-    return read
 
 
 def _camera(picture: Path, intrinsics: Sequence[float], *, assumed: bool) -> CameraModel:

@@ -1,0 +1,386 @@
+"""Folders of point clouds with poses, turned into ordinary logs.
+
+Clouds are PCD, PLY or KITTI's ``.bin``, of one kind in a folder. Labels are a field of the cloud or KITTI's ``.label``
+files. Poses are a table (TUM, KITTI), a 4x4 matrix beside every cloud, or the VIEWPOINT of PCD files. Times are a
+table, numbers in the files' names, or a rate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.errors import InputError
+from octoreplay.io.datasets.cloud_files import FORMATS, read_cloud, read_kitti_labels
+from octoreplay.io.datasets.frames_folder import (
+    check_choice,
+    chosen_frames,
+    frame_stamps,
+    natural_order,
+    read_times,
+    robot_name,
+    unfinished,
+)
+from octoreplay.io.datasets.pcd import read_viewpoint
+from octoreplay.io.datasets.pose_files import PoseReader, PoseTable, matrix_reader, read_poses
+from octoreplay.io.robots.robot_log_writer import RobotLogWriter
+from octoreplay.io.sensors.labels import UNLABELLED
+from octoreplay.io.text_tables import seconds_to_ns
+from octoreplay.records import ClassTable, Float64Array
+from octoreplay.transforms import pose_matrix, rotation_to_quaternion
+
+CloudFrameName: TypeAlias = Literal["sensor", "world"]
+"""What a cloud's points are given in: the sensor's frame, or the one that the poses are given in."""
+
+_T = TypeVar("_T")
+_VIEWPOINT = "VIEWPOINT"
+# Numbers in file names that are times: seconds_nanoseconds; seconds with a fraction; a whole number of seconds,
+# milliseconds, microseconds or nanoseconds since 1970, which any time after 2001 gives 10, 13, 16 or 19 digits.
+_SECONDS_AND_NANOSECONDS = re.compile(r"(?<!\d)([1-9]\d{8,9})_(\d{9})(?!\d)")
+_SECONDS = re.compile(r"(?<![\d.])\d+\.\d+(?![\d.])")
+_EPOCH = re.compile(r"(?<!\d)[1-9](?:\d{9}|\d{12}|\d{15}|\d{18})(?!\d)")
+
+
+@dataclass(frozen=True)
+class CloudImportSummary:
+    """What was imported.
+
+    ``poses`` says where they come from, ``frame`` what the points were taken to be given in. ``num_without_pose``
+    clouds were left out because their pose is missing or not finite, ``num_empty`` because no point of theirs is
+    finite; ``num_points`` were written. ``warnings`` are sentences.
+    """
+
+    path: Path
+    robot_id: str
+    layout: str
+    poses: str
+    frame: CloudFrameName
+    num_frames: int
+    num_points: int
+    num_labelled: int
+    num_without_pose: int
+    num_empty: int
+    duration: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Poses:
+    """Where the poses come from: a table and its file, or else a reader for each chosen cloud."""
+
+    name: str
+    file: Path
+    table: PoseTable | None = None
+    readers: tuple[PoseReader, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Times:
+    """The chosen clouds' own stamps, where they have any; ``are_of_poses`` where they are those of their poses."""
+
+    source: Path
+    stamps: list[int] | None
+    are_of_poses: bool = False
+
+
+def import_clouds(
+    folder: Path,
+    output: Path,
+    *,
+    rate: float | None = None,
+    times: Path | None = None,
+    poses: Path | None = None,
+    frame: CloudFrameName | None = None,
+    labels: Path | None = None,
+    robot_id: str | None = None,
+    class_table: ClassTable | None = None,
+    first: int = 0,
+    last: int | None = None,
+    every: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> CloudImportSummary:
+    """Write the point clouds and poses of a folder as one robot's log (MCAP).
+
+    Clouds ``first`` to ``last`` (both included, counted from 0 in the folder's order) are taken, of them each
+    ``every``-th. They are stamped from 0 on at ``rate`` Hz; or with the seconds of the text file ``times``, one line
+    for each cloud of the folder or for each one taken; or, without either, with those of ``times.txt`` here or one
+    folder up, with the stamps in their names, or with those of a TUM file of poses that has a line for each.
+    ``poses`` is a TUM or KITTI file (``pose_files.read_poses``); without it they are found: matrices in
+    ``NAME.pose.txt`` beside the clouds, ``poses.txt`` here or one folder up, VIEWPOINT of PCD files.
+    ``frame`` says what the points are given in; None is the sensor's frame, but with VIEWPOINT the world's.
+    ``labels`` is a folder of KITTI ``.label`` files named like the clouds; ``labels/`` beside the clouds' folder is
+    found. ``class_table`` names the labels. The log's name gives ``robot_id`` where it is None. Points that are not
+    finite are left out. One cloud at a time is held; the same input gives the same bytes.
+
+    Raises InputError for what is missing or damaged, ConfigError for options that do not fit, OutputError where the log
+    cannot be written; then nothing is left behind.
+    """
+    check_choice(rate, times, first, every)
+    robot_id = robot_name(robot_id, output)
+    clouds = _find_clouds(folder)
+    chosen = chosen_frames(folder, len(clouds), first, last, every)
+    paths = [clouds[k] for k in chosen]
+    found = _find_poses(paths, poses)
+    own = _find_times(clouds, chosen, times, found, has_rate=rate is not None)
+    stamps = frame_stamps(own.source, own.stamps, rate, len(paths))
+    job = _Import(
+        paths=paths,
+        stamps=stamps,
+        readers=_readers(found, own, chosen, len(clouds)),
+        label_files=_find_labels(paths, labels),
+        is_in_world=(found.name == _VIEWPOINT) if frame is None else frame == "world",
+    )
+    with unfinished(output) as path:
+        job.write(path, robot_id, class_table, progress)
+        if job.num_frames == 0:
+            raise InputError(_nothing_usable(folder, job, found, own))
+    return CloudImportSummary(
+        output, robot_id, FORMATS[paths[0].suffix.lower()], found.name, "world" if job.is_in_world else "sensor",
+        job.num_frames, job.num_points, job.num_labelled, job.num_without_pose, job.num_empty,
+        (stamps[-1] - stamps[0]) / 1e9, job.warnings(),
+    )  # fmt: skip
+
+
+@dataclass
+class _Import:
+    """One import under way, and what it counts."""
+
+    paths: Sequence[Path]
+    stamps: Sequence[int]
+    readers: Sequence[PoseReader]
+    label_files: Sequence[Path | None]
+    is_in_world: bool
+    num_frames: int = 0
+    num_points: int = 0
+    num_labelled: int = 0
+    num_without_pose: int = 0
+    num_empty: int = 0
+    is_labelled: bool | None = None
+    with_extra_columns: list[Path] = field(default_factory=list)
+
+    def write(
+        self, path: Path, robot_id: str, class_table: ClassTable | None, progress: Callable[[float], None] | None
+    ) -> None:
+        """Write the log."""
+        with RobotLogWriter(path, robot_id, None, class_table, T_body_sensor=np.eye(4), start_ns=self.stamps[0]) as log:
+            for index, (stamp_ns, read_pose) in enumerate(zip(self.stamps, self.readers, strict=True)):
+                T_map_sensor = read_pose()
+                if T_map_sensor is None:
+                    self.num_without_pose += 1
+                else:
+                    self._write_cloud(log, index, stamp_ns, T_map_sensor)
+                if progress is not None:
+                    progress((index + 1) / len(self.paths))
+
+    def _write_cloud(self, log: RobotLogWriter, index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:
+        """Write one cloud with its pose."""
+        path = self.paths[index]
+        cloud = read_cloud(path)
+        if cloud.num_extra_columns:
+            self.with_extra_columns.append(path)
+        label_file = self.label_files[index]
+        labels = cloud.labels if label_file is None else read_kitti_labels(label_file, len(cloud.points))
+        points = cloud.points
+        # What is not finite stays so, and what float32 cannot hold becomes so; it is left out below.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.is_in_world:
+                # By the rotation that the log holds: a matrix in a text is one only as far as its digits go.
+                rotation = pose_matrix((0.0, 0.0, 0.0), rotation_to_quaternion(T_map_sensor[:3, :3]))[:3, :3]
+                points = (points - T_map_sensor[:3, 3]) @ rotation
+            points = points.astype(np.float32)
+        usable = np.isfinite(points).all(axis=1)
+        if not usable.any():
+            self.num_empty += 1
+            return
+        log.write_pose(stamp_ns, T_map_sensor)
+        log.write_cloud(
+            stamp_ns,
+            points[usable],
+            labels=self._labels(path, labels, usable),
+            rgb=None if cloud.rgb is None else cloud.rgb[usable],
+            intensity=None if cloud.intensity is None else cloud.intensity[usable],
+        )
+        self.num_frames += 1
+        self.num_points += int(np.count_nonzero(usable))
+        self.num_labelled += labels is not None
+
+    def _labels(
+        self, path: Path, labels: npt.NDArray[np.uint32] | None, usable: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.uint32] | None:
+        """The labels to write: for every cloud where the log has any, since readers look at the first cloud only."""
+        if self.is_labelled is None:
+            self.is_labelled = labels is not None or any(self.label_files)
+        if labels is not None and not self.is_labelled:
+            raise InputError(f"{path}: has labels, but the clouds before it have none; start with it by 'first'")
+        if labels is None:
+            return np.full(np.count_nonzero(usable), UNLABELLED[1], np.uint32) if self.is_labelled else None
+        return labels[usable]
+
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of clouds that were taken nevertheless."""
+        if not self.with_extra_columns:
+            return ()
+        others = len(self.with_extra_columns) - 1
+        files = f"{self.with_extra_columns[0]}{f' and {others:,} more' if others else ''}"
+        return (f"{files}: rows have more columns than the header names; those after the named ones were not read",)
+
+
+def _nothing_usable(folder: Path, job: _Import, found: _Poses, own: _Times) -> str:
+    """Why no cloud could be written."""
+    if job.num_empty:
+        return f"{folder}: none of the {job.num_empty} clouds with a pose has a point that is finite"
+    sentence = f"{folder}: none of the {len(job.paths)} clouds has a usable pose in {found.name}"
+    stamps = None if found.table is None else found.table.stamps
+    if not stamps or not own.stamps:
+        return sentence
+    return (
+        f"{sentence}: the clouds' times are {own.stamps[0] / 1e9:.3f} to {own.stamps[-1] / 1e9:.3f} s, the poses' "
+        f"{min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s; give the clouds' times on the poses' clock"
+    )
+
+
+# --- clouds and labels -----------------------------------------------------------------------------------------------
+
+
+def _find_clouds(folder: Path) -> list[Path]:
+    """The folder's clouds, or those of its ``velodyne/``, in the order of the numbers or times in their names."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder")
+    for place in (folder, folder / "velodyne"):
+        clouds = [p for p in _files(place) if p.suffix.lower() in FORMATS]
+        kinds = sorted({path.suffix.lower() for path in clouds})
+        if len(kinds) > 1:
+            raise InputError(f"{place}: holds {' and '.join(kinds)} files; leave the clouds of one kind in it")
+        if clouds:
+            clouds.sort(key=natural_order)
+            stamps = _name_stamps(clouds)
+            return clouds if stamps is None else [path for _, path in sorted(zip(stamps, clouds, strict=True))]
+    endings = sorted({path.suffix for path in _files(folder) if path.suffix})
+    there = f"; the folder holds {', '.join(endings[:6])} files" if endings else ""
+    raise InputError(f"{folder}: no clouds found; looked for {', '.join(FORMATS)}, also in velodyne/{there}")
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of a folder that are not hidden; none where it is not there."""
+    try:
+        return [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
+
+
+def _find_labels(paths: Sequence[Path], labels: Path | None) -> list[Path | None]:
+    """The label file of every cloud, where it has one."""
+    folder = paths[0].parent.parent / "labels" if labels is None else labels
+    by_name = {path.stem: path for path in _files(folder) if path.suffix.lower() == ".label"}
+    matched = [by_name.get(path.stem) for path in paths]
+    if labels is not None and not any(matched):
+        raise InputError(f"{labels}: holds no .label file that is named like a cloud such as '{paths[0].name}'")
+    return matched
+
+
+# --- poses -----------------------------------------------------------------------------------------------------------
+
+
+def _find_poses(paths: Sequence[Path], given: Path | None) -> _Poses:
+    """The poses: a given file, matrices beside the clouds, ``poses.txt``, or VIEWPOINT."""
+    folder = paths[0].parent
+    if given is not None:
+        return _tabled(given)
+    matrices = [path.with_name(f"{path.stem}.pose.txt") for path in paths]
+    if any(path.is_file() for path in matrices):
+        return _Poses("*.pose.txt", folder, readers=tuple(matrix_reader(path) for path in matrices))
+    for place in (folder, folder.parent):
+        if (place / "poses.txt").is_file():
+            return _tabled(place / "poses.txt")
+    if paths[0].suffix.lower() != ".pcd":
+        raise InputError(
+            f"{folder}: no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one folder "
+            "up; give a file of poses"
+        )
+    viewpoints = [read_viewpoint(path) for path in paths]
+    # What writers put there that know nothing of poses.
+    is_unset = [T is None or np.array_equal(T, np.eye(4)) for T in viewpoints]
+    if all(T is None for T in viewpoints) or (len(paths) > 1 and all(is_unset)):
+        raise InputError(f"{folder}: no poses found, and the VIEWPOINT of every cloud is unset; give a file of poses")
+    return _Poses(_VIEWPOINT, folder, readers=tuple(_constant(T) for T in viewpoints))
+
+
+def _tabled(path: Path) -> _Poses:
+    table = read_poses(path)
+    return _Poses(f"{path.name} ({table.name})", path, table)
+
+
+def _constant(T_map_sensor: Float64Array | None) -> PoseReader:
+    """Gives a pose that is known."""
+    return lambda: T_map_sensor
+
+
+def _readers(found: _Poses, own: _Times, chosen: range, total: int) -> Sequence[PoseReader]:
+    """Where the pose of each chosen cloud comes from."""
+    table = found.table
+    if table is None:
+        return found.readers
+    if table.stamps is None or own.are_of_poses or own.stamps is None:
+        return [_constant(T) for T in _of_chosen(table.poses, chosen, total, found.file)]
+    return [partial(table.at, stamp_ns) for stamp_ns in own.stamps]
+
+
+def _of_chosen(rows: Sequence[_T], chosen: range, total: int, path: Path) -> list[_T]:
+    """The rows of the chosen clouds, of a file that holds one for each cloud of the folder, or for each chosen one."""
+    if len(rows) == total:
+        return [rows[k] for k in chosen]
+    if len(rows) == len(chosen):
+        return list(rows)
+    raise InputError(
+        f"{path}: has {len(rows)} poses; the folder has {total} clouds, of which {len(chosen)} are taken; give a line "
+        "for each, choose clouds with first, last and every, or give times to find poses of a TUM file by"
+    )
+
+
+# --- times -----------------------------------------------------------------------------------------------------------
+
+
+def _find_times(clouds: Sequence[Path], chosen: range, given: Path | None, found: _Poses, *, has_rate: bool) -> _Times:
+    """The clouds' own times: a given file, ``times.txt``, their names, or those of a TUM row for each."""
+    folder = clouds[0].parent
+    pose_stamps = None if found.table is None else found.table.stamps
+    if has_rate and pose_stamps is None:
+        return _Times(folder, None)
+    for path in (given, folder / "times.txt", folder.parent / "times.txt"):
+        if path is not None and (path == given or path.is_file()):
+            return _Times(path, read_times(path, chosen, len(clouds)))
+    names = _name_stamps(clouds)
+    if names is not None:
+        return _Times(folder, [names[k] for k in chosen])
+    if pose_stamps is not None:
+        return _Times(found.file, _of_chosen(pose_stamps, chosen, len(clouds), found.file), are_of_poses=True)
+    return _Times(folder, None)
+
+
+def _name_stamps(clouds: Sequence[Path]) -> list[int] | None:
+    """Stamps from the clouds' names; None unless every name holds one, and no two the same."""
+    stamps = [_name_stamp(path.stem) for path in clouds]
+    found = [stamp for stamp in stamps if stamp is not None]
+    return found if len(set(found)) == len(clouds) else None
+
+
+def _name_stamp(name: str) -> int | None:
+    """The one time that a name holds, in nanoseconds."""
+    pairs = _SECONDS_AND_NANOSECONDS.findall(name)
+    if len(pairs) == 1:
+        return int(pairs[0][0]) * 1_000_000_000 + int(pairs[0][1])
+    fractions = _SECONDS.findall(name)
+    if len(fractions) == 1:
+        return seconds_to_ns(name, fractions[0])
+    numbers = _EPOCH.findall(name)
+    # 10 digits are seconds, 19 are nanoseconds.
+    return int(numbers[0]) * 10 ** (19 - len(numbers[0])) if len(numbers) == 1 else None

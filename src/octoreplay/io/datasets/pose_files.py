@@ -1,0 +1,112 @@
+"""Files of poses: a 4x4 matrix each, tables of TUM and of KITTI.
+
+``T_map_sensor`` is (4, 4) float64 and maps coordinates of the sensor to the map's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from octoreplay.errors import InputError
+from octoreplay.io.robots.trajectories import Trajectory, read_rows, rigid, trajectory
+from octoreplay.io.text_tables import floats, read_matrix, rows
+from octoreplay.records import Float64Array
+from octoreplay.transforms import inverse
+
+POSE_GAP_NS = 200_000_000
+"""Poses are interpolated between neighbours that are at most this far apart."""
+
+_SAME_TIME_NS = 1_000_000
+
+PoseReader: TypeAlias = Callable[[], Float64Array | None]
+"""Gives T_map_sensor of one frame when asked; None where there is no usable one."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """The rows of a file of poses: T_map_sensor, None where a row is not finite; stamps [ns] in a TUM file only.
+
+    ``name`` says what the file is.
+    """
+
+    name: str
+    poses: list[Float64Array | None]
+    track: Trajectory | None = None
+    stamps: list[int] | None = None
+
+    def at(self, stamp_ns: int) -> Float64Array | None:
+        """T_map_sensor at a time, of a TUM file: of a row at most 1 ms away, else interpolated; None without any.
+
+        Rows and file names are rounded, so that what was one time is not quite one.
+        """
+        if self.track is None:
+            return None
+        stamps = self.track.stamps_ns
+        index = int(np.searchsorted(stamps, stamp_ns))
+        near = min(stamps[max(index - 1, 0) : index + 1].tolist(), key=lambda s: abs(s - stamp_ns), default=stamp_ns)
+        return self.track.matrix_at(near if abs(near - stamp_ns) <= _SAME_TIME_NS else stamp_ns, POSE_GAP_NS)
+
+
+def matrix_reader(path: Path) -> PoseReader:
+    """Reads a file of one 4x4 matrix when asked; None where it is missing or, as for lost tracking, not finite.
+
+    The reader raises InputError for another number of numbers and for a matrix that is no rigid transform.
+    """
+
+    def read() -> Float64Array | None:
+        T = read_matrix(path, (4,)) if path.is_file() else None
+        return rigid(str(path), T) if T is not None and np.isfinite(T).all() else None
+
+    return read
+
+
+def read_poses(path: Path) -> PoseTable:
+    """The poses of a TUM file (stamp, position, quaternion x y z w) or a KITTI file (the upper 3x4 part of a matrix).
+
+    KITTI's are the left camera's poses; with its ``calib.txt`` beside the file they become the lidar's,
+    inv(Tr) T_map_camera Tr, in a map that starts at the lidar (https://github.com/PRBonn/semantic-kitti-api).
+    Raises InputError where the file is empty, has another number of columns or a matrix that is no rigid transform.
+    """
+    found = read_rows(path)
+    if found.stamps_ns is not None:
+        return PoseTable("TUM", found.matrices(), trajectory(found.stamps_ns, found), found.stamps_ns.tolist())
+    calibration = path.with_name("calib.txt")
+    if not calibration.is_file():
+        return PoseTable("KITTI", found.matrices())
+    T_camera_lidar = _read_calibration(calibration)
+    T_lidar_camera = inverse(T_camera_lidar)
+    return PoseTable(
+        "KITTI, camera to lidar by calib.txt",
+        [None if T is None else T_lidar_camera @ T @ T_camera_lidar for T in found.matrices()],
+    )
+
+
+def read_tum_track(path: Path) -> Trajectory:
+    """The poses of a TUM file, to be interpolated. Raises InputError where a row is none."""
+    found = read_rows(path)
+    if found.stamps_ns is None:
+        raise InputError(f"{path}: expects TUM's rows of a time, a position and a quaternion")
+    return trajectory(found.stamps_ns, found)
+
+
+def track_reader(track: Trajectory, stamp_ns: int) -> PoseReader:
+    """Interpolates a pose when asked; None where the track has none at that time."""
+    return lambda: track.matrix_at(stamp_ns, POSE_GAP_NS)
+
+
+def _read_calibration(path: Path) -> Float64Array:
+    """T_camera_lidar of a KITTI calib.txt: its row 'Tr:'."""
+    for where, fields in rows(path):
+        if fields[0] == "Tr:" and len(fields) == 13:
+            T = np.eye(4)
+            T[:3] = np.array(floats(where, fields[1:])).reshape(3, 4)
+            if np.isfinite(T).all():
+                return rigid(where, T)
+    raise InputError(
+        f"{path}: has no usable row 'Tr:', lidar to camera; mend it, or take it away where the poses are the lidar's"
+    )
