@@ -25,7 +25,7 @@ import scenes
 import zstandard
 from rounds import Report, Row, arguments, measured
 
-from octoreplay.config import MapConfig, RunConfig, ScheduleEntry, load_team_file
+from octoreplay.config import MapConfig, RunConfig, ScheduleEntry
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping import codec
@@ -40,6 +40,7 @@ from octoreplay.replay.robot import Robot
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
 from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.team_file import load_team_file
 
 NUM_ROBOTS = 6
 PACKET_RESOLUTION = 0.3

@@ -16,7 +16,7 @@ from rounds import Row
 HERE = Path(__file__).parent
 FULL: dict[str, list[str]] = {
     "insertion": [], "consensus": [], "replay": [], "memory": [], "cold_start": [], "roofline": [],
-    "packets": [],
+    "packets": [], "reading": [],
 }  # fmt: skip
 QUICK: dict[str, list[str]] = {
     "insertion": ["--frames", "10", "--rounds", "2"],
@@ -26,6 +26,7 @@ QUICK: dict[str, list[str]] = {
     "cold_start": ["--rounds", "2", "--compilations", "1"],
     "roofline": ["--frames", "20", "--rounds", "2"],
     "packets": ["--duration", "20", "--only", "delta", "--only", "ring"],
+    "reading": ["--seconds", "5", "--gigabytes", "0.5", "--rounds", "2"],
 }
 
 

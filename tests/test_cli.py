@@ -16,13 +16,14 @@ from mcap.reader import make_reader
 from plyfile import PlyData
 
 from octoreplay import __version__, cli
-from octoreplay.config import PARAMETERS, RobotConfig, RunConfig, load_team_file
+from octoreplay.config import PARAMETERS, RobotConfig, RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.result import open_result
+from octoreplay.team_file import load_team_file
 
 FIXTURES = Path(__file__).parent / "fixtures"
 PAIR = FIXTURES / "pair" / "team.yaml"
-COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "query", "import-rgbd")
+COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds")
 
 
 def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -219,6 +220,10 @@ HUSKIES = "husky_1:husky_2"
         (["--loss", "1.5"], "loss: 1.5 is above the largest value 1"),
         (["--corruption", "-0.1"], "corruption: -0.1 is below the least value 0"),
         (["--burst-start", "nan"], "burst_start: nan is not a finite number"),
+        (["--start", "1e300"], r"start: 1e\+300 is above the largest value 1e\+12"),
+        (["--pose-gap", "1e13"], r"pose_gap: 1e\+13 is above the largest value 1e\+12"),
+        (["--rate", "1e-300"], "rate: 1e-300 is below the least value 1e-12"),
+        (["--publish-period", "1e6"], r"publish_period: 1000000\.0 is above the largest value 86400"),
         (["--schedule", "none.yaml"], r"none\.yaml: cannot be read: No such file"),
         (["--schedule", FIXTURES], "fixtures: cannot be read: Is a directory"),
         (["--schedule", FIXTURES / "pair" / "husky_1.mcap"], r"husky_1\.mcap: not a schedule file \(no UTF-8 text\)"),
@@ -446,3 +451,112 @@ def test_demo_makes_everything_and_says_so(tmp_path: Path) -> None:
         assert (tmp_path / "show" / name).stat().st_size > 0
     assert "Foxglove" in done.stdout
     fails(1, "show.*logs: is not empty; give a new folder", "demo", tmp_path / "show")
+
+
+# --- folders of clouds ------------------------------------------------------------------------------------------------
+
+
+def save_wall(path: Path, viewpoint: str, *, extra: str = "") -> None:
+    """A PCD file of a wall of label 7 at x = 2, in the world's frame, seen from somewhere."""
+    rows = [f"2.05 {y / 20} {z / 20} 7{extra}" for y in range(-20, 20) for z in range(20)]
+    path.write_text(
+        f"FIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\n"
+        "DATA ascii\n" + "\n".join(rows)
+    )
+
+
+@pytest.fixture
+def walls(tmp_path: Path) -> Path:
+    """Three clouds of one wall, and a team file that names its label."""
+    (tmp_path / "in").mkdir()
+    for index, viewpoint in enumerate(("0 0 0.5 1 0 0 0", "0.5 0.25 0.5 0.8 0 0 0.6", "-0.5 0 0.5 0.6 0 0 -0.8")):
+        save_wall(tmp_path / "in" / f"{index}.pcd", viewpoint)
+    (tmp_path / "team.yaml").write_text(
+        "robots: [{id: a, log: a.mcap}]\nclasses: [{name: wall, raw_labels: [7]}, {name: floor, raw_labels: [8]}]\n"
+    )
+    return tmp_path / "in"
+
+
+def test_a_folder_of_clouds_becomes_a_log_that_maps(walls: Path, tmp_path: Path) -> None:
+    log, out = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    done = octoreplay("import-clouds", walls, "-o", log, "--rate", 10, "--classes-from", tmp_path / "team.yaml")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == (
+        f"wrote {log} (PCD: robot a, 3 clouds, 3 with labels, 0.2 s;"
+        " poses from VIEWPOINT, points in the world's frame)\n"
+    )
+    done = octoreplay("run", log, "-o", out, "--resolution", "0.1")
+    assert done.returncode == 0, done.stderr
+    # However the sensor stood and turned, the wall is where it is, and before it is nothing.
+    done = octoreplay("query", out, "--at", 2.05, 0.05, 0.55, "--at", 1.5, 0.05, 0.55)
+    assert re.search(r"2\.05, 0\.05, 0\.55 +wall", done.stdout), done.stdout
+    assert re.search(r"1\.5, 0\.05, 0\.55 +free", done.stdout), done.stdout
+
+
+def test_clouds_that_are_left_out_or_odd_are_said(walls: Path, tmp_path: Path) -> None:
+    save_wall(walls / "1.pcd", "0 0 0 0 0 0 0", extra=" -1")
+    save_wall(walls / "2.pcd", "0 0 1 1 0 0 0", extra=" -1")
+    done = octoreplay("import-clouds", walls, "-o", tmp_path / "a.mcap", "--rate", 10)
+    assert done.returncode == cli.EXIT_DATA_LOST
+    assert "2 clouds, 2 with labels" in done.stdout
+    odd, left_out = done.stderr.splitlines()
+    assert odd.startswith(f"warning: {walls / '2.pcd'}: rows have more columns than the header names; those after")
+    assert left_out == "warning: 1 clouds without a usable pose were left out"
+
+
+def test_clouds_that_cannot_become_a_log_are_one_sentence(walls: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    fails(2, r"in: the frames have no times; give a rate or a file of times", "import-clouds", walls, "-o", out)
+    fails(2, r"a\.bag: the output's name must end in \.mcap", "import-clouds", walls, "-o", tmp_path / "a.bag")
+    (walls / "1.pcd").write_bytes((walls / "1.pcd").read_bytes()[:-30])
+    sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or take it out"
+    fails(1, sentence, "import-clouds", walls, "-o", out, "--rate", 10)
+    assert not out.exists()
+
+
+def test_init_writes_a_team_file_that_runs(tmp_path: Path) -> None:
+    logs = sorted((FIXTURES / "pair").glob("*.mcap"))
+    team_file = tmp_path / "team.yaml"
+    done = octoreplay("init", *logs, "-o", team_file)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"wrote {team_file} (2 robots)\n", "")
+    assert load_team_file(team_file).robots[0].pose_topic == "/husky_1/odom"
+    fails(
+        1, f"error: {team_file}: is there already; name another file, or give --force", "init", *logs, "-o", team_file
+    )
+    assert octoreplay("init", *logs, "-o", team_file, "--force").returncode == 0
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    assert octoreplay("run", team_file, "-o", first, "--settle", "0").returncode == 0
+    assert octoreplay("run", *logs, "-o", second, "--settle", "0").returncode == 0
+    with open_result(first) as one, open_result(second) as other:
+        for robot in one.robots:
+            assert (one.map(robot).leaves().log_odds == other.map(robot).leaves().log_odds).all()
+
+
+def test_init_says_what_is_missing_and_writes_it_down(tmp_path: Path) -> None:
+    team_file = tmp_path / "team.yaml"
+    done = octoreplay("init", FIXTURES / "containers" / "foxglove_json.mcap", "-o", team_file)
+    assert done.returncode == 0
+    assert "missing for a run: labels on " in done.stderr
+    (tmp_path / "empty.bag").touch()
+    fails(1, "the file is empty", "init", tmp_path / "empty.bag", "-o", tmp_path / "x.yaml")
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_info_goes_on_after_a_log_that_cannot_be_opened(tmp_path: Path) -> None:
+    done = octoreplay("info", tmp_path / "none.mcap", FIXTURES / "containers" / "lz4.bag")
+    assert done.returncode == 1
+    assert f"error: {tmp_path / 'none.mcap'}: no such file" in done.stderr
+    assert "/camera/depth/image_raw" in done.stdout
+
+
+def test_a_part_of_the_logs_can_be_taken(tmp_path: Path) -> None:
+    done = octoreplay(
+        "run", PAIR, "-o", tmp_path / "a.mcap", "--settle", "0", "--start", "1", "--duration", "2", "--every", "2"
+    )
+    assert done.returncode == 0
+    with open_result(tmp_path / "a.mcap") as result:
+        # 4 Hz for 2 s, every other one, of both robots.
+        assert [counts.used for counts in result.summary.frame_counts.values()] == [4, 4]
+        assert len(result.metrics) == 3
+    fails(2, "hide_robots: no robot has a body_box", "run", PAIR, "-o", tmp_path / "b.mcap", "--hide-robots")
+    fails(1, "no robot has a frame that can be used", "run", PAIR, "-o", tmp_path / "b.mcap", "--start", "99")

@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from octoreplay import __version__
-from octoreplay.config import PARAMETERS, PRESETS, Parameter, RunConfig
-from octoreplay.errors import ConfigError, OctoreplayError, OutputError
+from octoreplay.class_file import with_classes
+from octoreplay.class_tables.label_rows import BUILT_IN
+from octoreplay.config import PARAMETERS, PRESETS, SECTIONS, Parameter, RunConfig
+from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,12 +31,6 @@ if TYPE_CHECKING:
     from octoreplay.replay.session import Progress
 
 EXIT_ERROR, EXIT_USAGE, EXIT_DATA_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
-
-_SECTIONS = {
-    "sensor": "Inverse sensor model", "map": "Map", "consensus": "Consensus", "network": "Communication graph",
-    "link": "Links", "packet": "Packets", "time": "Time and pairing", "output": "What the result holds",
-}  # fmt: skip
-"""Headings of the parameters' sections in ``run --help``."""
 
 _WORDS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
 """What ``--help`` calls the value of a parameter."""
@@ -55,7 +51,7 @@ class _RunCommand(click.Command):
             record = parameter.get_help_record(ctx)
             if record is not None and isinstance(parameter, click.Option):
                 section = getattr(parameter, "section", "")
-                groups.setdefault(_SECTIONS.get(section, "Options"), []).append(record)
+                groups.setdefault(SECTIONS.get(section, "Options"), []).append(record)
         for heading, records in groups.items():
             with formatter.section(heading):
                 formatter.write_dl(records)
@@ -85,7 +81,7 @@ def _with_parameters(command: click.Command) -> click.Command:
     return command
 
 
-_existing = click.Path(path_type=Path)
+_existing = click.Path(path_type=Path, readable=False)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -110,9 +106,11 @@ def cli() -> None:
 @click.option("--edges", metavar="A:B[:W],...", help="links of the communication graph, with weights if all have one")
 @click.option("--one-way", metavar="A:B,...", help="links that carry from A to B only")
 @click.option("--schedule", type=_existing, metavar="FILE.yaml", help="when which robots and links are up or down")
+@click.option("--classes", metavar="NAME|FILE", help=f"what labels mean: {', '.join(BUILT_IN)}, or a file")
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
-    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, **parameters: Any,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, classes: str | None,
+    **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into maps that the team agrees on.
 
@@ -130,6 +128,7 @@ def run(
         _check_output(save_team, ".yaml", inputs)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     base = _base_config(inputs, config_from, err)
+    base = base if classes is None else with_classes(base, classes)
     given = {name: value for name, value in parameters.items() if value is not None}
     config = discover.resolve(_with_network(_with_options(base, preset, edges, given), one_way, schedule))
     if config_from is None and not _is_team_file(inputs):
@@ -183,10 +182,10 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
 
     Takes under two minutes. Says what it made and how to look at it.
     """
-    from octoreplay.config import load_team_file
     from octoreplay.io.robots import discover
     from octoreplay.report import export, plots, tables
     from octoreplay.result import open_result
+    from octoreplay.team_file import load_team_file
 
     out, err = tables.terminal(), tables.terminal(stderr=True)
     result_path, ply, csv, figures = (folder / n for n in ("result.mcap", "map.ply", "metrics.csv", "figures"))
@@ -274,7 +273,42 @@ def info(logs: tuple[Path, ...]) -> int:
     from octoreplay.report import tables
 
     description = discover.describe(logs)
-    tables.show(tables.terminal(), tables.description(description))
+    if any(log.error is None for log in description.logs):
+        tables.show(tables.terminal(), tables.description(description))
+    errors = [log.error for log in description.logs if log.error is not None]
+    for error in errors:
+        click.echo(f"error: {error}", err=True)
+    return EXIT_ERROR if errors else 0
+
+
+@cli.command(short_help="Write a team file for some logs, to be changed by hand.")
+@click.argument("logs", nargs=-1, required=True, type=_existing, metavar="LOG...")
+@click.option("-o", "--output", type=_existing, required=True, metavar="TEAM.yaml", help="the team file")
+@click.option("--force", is_flag=True, help="write over a file that is there")
+def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
+    """Write a team file with all that is found in logs, and all that can be set as comments.
+
+    What a run would still miss stands in it too, and is said.
+    """
+    from octoreplay.io.robots import discover
+    from octoreplay.team_file import team_template
+
+    _check_output(output, ".yaml", logs)
+    if output.exists() and not force:
+        raise OutputError(f"{output}: is there already; name another file, or give --force to write over it")
+    description = discover.describe(logs)
+    for log in description.logs:
+        if log.error is not None:
+            raise InputError(log.error)
+    if not description.robots:
+        raise InputError(description.missing[0])
+    robots = tuple(summary.robot.with_absolute_paths() for summary in description.robots)
+    missing = {summary.robot.robot_id: summary.missing for summary in description.robots}
+    config = RunConfig(robots, classes=description.class_table)
+    _write_text(output, team_template(config, {"": description.missing, **missing}, output.parent.resolve()))
+    click.echo(f"wrote {output} ({len(robots)} robot{'s' if len(robots) > 1 else ''})")
+    for sentence in (*description.missing, *(sentence for found in missing.values() for sentence in found)):
+        click.echo(f"missing for a run: {sentence}", err=True)
     return 0
 
 
@@ -340,8 +374,8 @@ def query(
 @click.option("--every", type=int, default=1, show_default=True, help="take one image of so many")
 def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, **options: Any) -> int:
     """Write a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) as a robot's log."""
-    from octoreplay.config import load_team_file
     from octoreplay.io.datasets import rgbd_folder
+    from octoreplay.team_file import load_team_file
 
     _check_output(output, ".mcap")
     numbers = None if intrinsics is None else _numbers("intrinsics", intrinsics, 4)
@@ -359,6 +393,47 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
     if summary.num_without_pose:
         click.echo(f"warning: {summary.num_without_pose:,} images without a usable pose were left out", err=True)
     return EXIT_DATA_LOST if summary.num_without_pose else 0
+
+
+@cli.command("import-clouds", short_help="Write a folder of point clouds as a log.")
+@click.argument("folder", type=_existing, metavar="DIR")
+@click.option("-o", "--output", type=_existing, required=True, metavar="LOG.mcap", help="the log")
+@click.option("--rate", type=float, default=None, help="clouds per second, where the folder has no times [Hz]")
+@click.option("--times", type=_existing, default=None, metavar="FILE", help="one time per line [s], in place of --rate")
+@click.option("--poses", type=_existing, default=None, metavar="FILE",
+              help="poses as TUM or KITTI have them  [default: those beside the clouds, or VIEWPOINT]")  # fmt: skip
+@click.option("--frame", type=click.Choice(("sensor", "world")), default=None,
+              help="what the points are given in  [default: sensor, but world with VIEWPOINT]")  # fmt: skip
+@click.option("--robot", "robot_id", default=None, metavar="ID", help="the robot's name  [default: the log's]")
+@click.option("--labels", type=_existing, default=None, metavar="DIR", help="KITTI .label files, named like the clouds")
+@click.option(
+    "--classes-from", type=_existing, default=None, metavar="TEAM.yaml", help="a team file that names the labels"
+)
+@click.option("--first", type=int, default=0, show_default=True, help="first cloud to take, counted from 0")
+@click.option("--last", type=int, default=None, help="last cloud to take  [default: the last one]")
+@click.option("--every", type=int, default=1, show_default=True, help="take one cloud of so many")
+def import_clouds(folder: Path, output: Path, classes_from: Path | None, **options: Any) -> int:
+    """Write a folder of point clouds with poses (PCD, PLY, KITTI) as a robot's log."""
+    from octoreplay.io.datasets import cloud_folder
+    from octoreplay.team_file import load_team_file
+
+    _check_output(output, ".mcap")
+    table = None if classes_from is None else load_team_file(classes_from).classes
+    with _progress("import") as update:
+        summary = cloud_folder.import_clouds(
+            folder, output, class_table=table, progress=lambda share: update(share, None, ""), **options
+        )
+    labelled = f", {summary.num_labelled:,} with labels" if summary.num_labelled else ", no labels"
+    click.echo(
+        f"wrote {output} ({summary.layout}: robot {summary.robot_id}, {summary.num_frames:,} clouds{labelled},"
+        f" {summary.duration:.1f} s; poses from {summary.poses}, points in the {summary.frame}'s frame)"
+    )
+    for sentence in summary.warnings:
+        click.echo(f"warning: {sentence}", err=True)
+    for count, reason in ((summary.num_without_pose, "a usable pose"), (summary.num_empty, "a finite point")):
+        if count:
+            click.echo(f"warning: {count:,} clouds without {reason} were left out", err=True)
+    return EXIT_DATA_LOST if summary.num_without_pose or summary.num_empty else 0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -398,9 +473,9 @@ def _is_team_file(inputs: Sequence[Path]) -> bool:
 
 def _base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console) -> RunConfig:
     """The configuration before any option: of a stored result, of a team file, or found in logs."""
-    from octoreplay.config import load_team_file
     from octoreplay.io.results.result_reader import ResultReader
     from octoreplay.io.robots import discover
+    from octoreplay.team_file import load_team_file
 
     if config_from is not None:
         if inputs:
@@ -437,7 +512,7 @@ def _with_options(base: RunConfig, preset: str | None, edges: str | None, given:
 
 def _with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:
     """The configuration with one-way links and a schedule, where they are given."""
-    from octoreplay.config import load_schedule
+    from octoreplay.team_file import load_schedule
 
     changes: dict[str, Any] = {}
     if one_way is not None:
@@ -502,12 +577,14 @@ def _check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
 
 def _save_team(config: RunConfig, path: Path) -> None:
     """Write a team file whose log paths hold from its own folder."""
-    from octoreplay.config import dump_team
+    from octoreplay.team_file import dump_team
 
-    robots = tuple(
-        dataclasses.replace(robot, logs=tuple(log.resolve() for log in robot.logs)) for robot in config.robots
-    )
-    text = dump_team(dataclasses.replace(config, robots=robots), path.parent.resolve())
+    robots = tuple(robot.with_absolute_paths() for robot in config.robots)
+    _write_text(path, dump_team(dataclasses.replace(config, robots=robots), path.parent.resolve()))
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a whole text file."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -585,20 +662,36 @@ def _show_warnings(err: Console, summary: RunSummary) -> None:
     """The run's warnings, and what was lost of each robot's log."""
     for sentence in summary.warnings:
         _warn(err, sentence)
+    # Robots may share a log.
+    for sentence in dict.fromkeys(s for counts in summary.frame_counts.values() for s in counts.truncated_files):
+        _warn(err, sentence)
     for robot_id, counts in summary.frame_counts.items():
         for sentence in _losses(counts):
             _warn(err, f"{robot_id}: {sentence}")
 
 
 def _losses(counts: FrameCounts) -> Iterator[str]:
-    """What could not be used of one robot's log, a sentence each."""
-    for file in counts.truncated_files:
-        yield f"{file} is cut off or damaged; everything before that was used"
-    if counts.unknown_label_pixels:
-        ids = ", ".join(str(label) for label in sorted(counts.unknown_label_pixels)[:8])
-        more = ", ..." if len(counts.unknown_label_pixels) > 8 else ""
-        total = sum(counts.unknown_label_pixels.values())
-        yield f"{total:,} pixels with labels that no class has were ignored: {ids}{more}"
+    """What could not be used of what one robot's logs hold, a sentence each."""
+    for cause, what in (
+        ("no_pose", "had no pose: none within pose_gap on both sides, or one beyond the map's reach"),
+        ("no_label", "had no labels or confidences within pair_tolerance"),
+        ("late", "came more than reorder_window late"),
+        ("undecodable", "could not be read"),
+    ):
+        count, first = getattr(counts, cause), counts.first_missing.get(cause)
+        if count:
+            yield f"{count:,} of the images or clouds {what}" + (f"; the first: {first}" if first else "")
+    if counts.duplicate:
+        yield f"{counts.duplicate:,} images or clouds had the stamp of another one, and were left out"
+    for what, numbers, spelling in (
+        ("labels", counts.unknown_label_pixels, "{}"),
+        ("colours", counts.unknown_colors, "#{:06x}"),
+    ):
+        if numbers:
+            shown = ", ".join(spelling.format(number) for number in sorted(numbers)[:8])
+            more = ", ..." if len(numbers) > 8 else ""
+            total = sum(numbers.values())
+            yield f"{total:,} pixels or points with {what} that no class has were ignored: {shown}{more}"
 
 
 def _warn(err: Console, sentence: str) -> None:
