@@ -7,6 +7,7 @@ import heapq
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
+from itertools import islice
 from types import TracebackType
 from typing import Self
 
@@ -29,6 +30,8 @@ from octoreplay.transforms import inverse, transform_of
 
 # A message that a robot recorded may have been under way for this long, and its poses too.
 _LOG_DELAY_NS = 10_000_000_000
+# So many of a sensor's first messages may be out of order.
+_NUM_FIRST = 8
 # Messages between two looks at which poses are needed no more.
 _FORGET_EVERY = 64
 _STAMPED_KINDS = (Kind.IMAGE, Kind.COMPRESSED_IMAGE, Kind.CLOUD, Kind.SCAN)
@@ -223,13 +226,13 @@ class RobotLog:
         return min((m for m in found if m is not None), key=lambda message: message.log_time_ns, default=None)
 
     def _first_stamp(self, first: RawMessage) -> int:
-        """The least stamp of the sensor's messages in the first ``reorder_window`` that is not late from the start."""
+        """The least of the sensor's first stamps within ``reorder_window`` that is not late from the start."""
         # A log may begin at 0; a header that was never stamped is 0 at any time.
         if not self._use_log_time and first.header_stamp_ns() == 0 and first.log_time_ns != 0:
             raise InputError(f"{first.where}: the header's stamp is 0; give clock: log to go by the log's times")
         window_ns = round(self._time.reorder_window * 1e9)
         stamps, check = [], StampCheck(self._offset_ns)
-        for message in self._messages((self.sensor_topic,)):
+        for message in islice(self._messages((self.sensor_topic,)), _NUM_FIRST):
             if message.log_time_ns > first.log_time_ns + window_ns:
                 break
             with contextlib.suppress(DamagedMessageError):
