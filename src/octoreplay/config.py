@@ -30,7 +30,7 @@ PALETTE: tuple[tuple[int, int, int], ...] = (
 """Colours for classes that come without one (the first seven: Okabe and Ito's colour-blind safe set)."""
 
 
-_LARGEST = 1e12
+_LARGEST, _SMALLEST = 1e12, 1e-15
 """No number of a configuration is larger, nor smaller where it must be above 0: what times become still has room."""
 
 
@@ -73,8 +73,8 @@ def _check_ranges(config: Any) -> None:
             raise ConfigError(f"{item.name}: {value} is above the largest value {meta['maximum']:g}")
         if meta["above"] is not None and value <= meta["above"]:
             raise ConfigError(f"{item.name}: {value} must be greater than {meta['above']:g}")
-        if isinstance(value, float) and meta["above"] == 0.0 and value < 1.0 / _LARGEST:
-            raise ConfigError(f"{item.name}: {value:g} is below the least value {1.0 / _LARGEST:g}")
+        if isinstance(value, float) and meta["above"] == 0.0 and value < _SMALLEST:
+            raise ConfigError(f"{item.name}: {value:g} is below the least value {_SMALLEST:g}")
 
 
 @dataclass(frozen=True)
