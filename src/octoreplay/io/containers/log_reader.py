@@ -221,8 +221,3 @@ def first_whole_message(log: LogReader, topic: str, kinds: Collection[Kind]) -> 
             message.sensor_message()
             return message
     return found
-
-
-def first_message(log: LogReader, topic: str) -> RawMessage | None:
-    """The first message of a topic in log time, or None; reads no further than it."""
-    return next(log.messages((topic,)), None)
