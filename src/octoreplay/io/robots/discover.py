@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from octoreplay.class_tables.edits import edited
 from octoreplay.config import RobotConfig, RunConfig, TimeConfig
-from octoreplay.errors import ConfigError, InputError, OctoreplayError
+from octoreplay.errors import ConfigError, InputError, OctoreplayError, suggestion
 from octoreplay.io.containers.log_reader import TopicInfo, first_whole_message
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import ENCODINGS, DamagedMessageError
@@ -309,7 +309,7 @@ def _check_named_topics(robot: RobotConfig, group: _Group) -> None:
         alike = sorted({t.name for survey in group.surveys for t in survey.topics if kind_of(t.type_name) in kinds})
         offer = f"{what} topics: {', '.join(repr(n) for n in alike)}" if alike else f"there are no {what} topics"
         if not infos:
-            raise InputError(f"{_paths(group)}: topic '{name}' not found; {offer}")
+            raise InputError(f"{_paths(group)}: topic '{name}' not found; {offer}{suggestion(name, alike)}")
         if not any(kind_of(info.type_name) in kinds for info in infos):
             raise InputError(f"{_paths(group)}: topic '{name}' is of type {infos[0].type_name}, no {role}; {offer}")
         bad = next((info for info in infos if info.encoding not in ENCODINGS), None)
