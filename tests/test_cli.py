@@ -222,7 +222,7 @@ HUSKIES = "husky_1:husky_2"
         (["--burst-start", "nan"], "burst_start: nan is not a finite number"),
         (["--start", "1e300"], r"start: 1e\+300 is above the largest value 1e\+12"),
         (["--pose-gap", "1e13"], r"pose_gap: 1e\+13 is above the largest value 1e\+12"),
-        (["--rate", "1e-300"], "rate: 1e-300 is below the least value 1e-12"),
+        (["--rate", "1e-300"], "rate: 1e-300 is below the least value 1e-15"),
         (["--publish-period", "1e6"], r"publish_period: 1000000\.0 is above the largest value 86400"),
         (["--schedule", "none.yaml"], r"none\.yaml: cannot be read: No such file"),
         (["--schedule", FIXTURES], "fixtures: cannot be read: Is a directory"),
