@@ -16,6 +16,8 @@ from mcap.reader import make_reader
 from plyfile import PlyData
 
 from octoreplay import __version__, cli
+from octoreplay.commands import running, team_options
+from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.config import PARAMETERS, RobotConfig, RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.result import open_result
@@ -87,7 +89,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_every_parameter_is_an_option_of_run_by_its_name() -> None:
-    names = {name: option for option in cli.run.params for name in option.opts}
+    names = {name: option for option in running.run.params for name in option.opts}
     for name, parameter in PARAMETERS.items():
         option = names[f"--{name.replace('_', '-')}"]
         assert option.name == name
@@ -96,7 +98,7 @@ def test_every_parameter_is_an_option_of_run_by_its_name() -> None:
 
 def parsed(*arguments: str) -> dict[str, object]:
     """What ``run`` would hand on from some arguments: only what was given."""
-    context = cli.run.make_context("run", list(arguments))
+    context = running.run.make_context("run", list(arguments))
     return {name: value for name, value in context.params.items() if value is not None and value != ()}
 
 
@@ -113,22 +115,22 @@ def base() -> RunConfig:
 
 def test_options_beat_the_preset_and_the_preset_beats_the_file() -> None:
     file = base().with_parameters({"evidence": "cell-average", "gamma": 0.125, "hit": 2.0})
-    config = cli._with_options(file, "paper", None, {"gamma": 0.75})
+    config = team_options.with_options(file, "paper", None, {"gamma": 0.75})
     assert config.consensus.evidence == "time-average"
     assert config.consensus.gamma == 0.75
     assert config.sensor.hit == 2.0
-    assert cli._with_options(file, None, None, {}) == file
+    assert team_options.with_options(file, None, None, {}) == file
 
 
 def test_edges_set_the_topology_and_the_weights() -> None:
-    config = cli._with_options(base(), None, "a:b, b:c", {})
+    config = team_options.with_options(base(), None, "a:b, b:c", {})
     assert (config.network.topology, config.network.weights) == ("edges", "metropolis")
     assert config.network.edges == (("a", "b", None), ("b", "c", None))
-    weighted = cli._with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
+    weighted = team_options.with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
     assert (weighted.network.weights, weighted.network.edges[1]) == ("given", ("b", "c", 0.5))
-    back = cli._with_options(weighted, None, None, {"topology": "ring"})
+    back = team_options.with_options(weighted, None, None, {"topology": "ring"})
     assert (back.network.topology, back.network.weights, back.network.edges) == ("ring", "metropolis", ())
-    kept = cli._with_options(weighted, None, None, {"hit": 2.0})
+    kept = team_options.with_options(weighted, None, None, {"hit": 2.0})
     assert kept.network == weighted.network
 
 
@@ -139,7 +141,7 @@ def test_edges_set_the_topology_and_the_weights() -> None:
 )  # fmt: skip
 def test_bad_edges_are_one_sentence(edges: str, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
-        cli._with_options(base(), None, edges, {})
+        team_options.with_options(base(), None, edges, {})
 
 
 def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +149,7 @@ def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "teams").mkdir()
     for name in ("a", "b", "c"):
         Path(f"{name}.mcap").write_text("")
-    cli._save_team(base(), Path("teams/team.yaml"))
+    team_options.save_team_file(base(), Path("teams/team.yaml"))
     robots = load_team_file(tmp_path / "teams" / "team.yaml").robots
     assert [log for robot in robots for log in robot.logs] == [tmp_path.resolve() / f"{n}.mcap" for n in "abc"]
 
@@ -497,7 +499,7 @@ def test_clouds_that_are_left_out_or_odd_are_said(walls: Path, tmp_path: Path) -
     save_wall(walls / "1.pcd", "0 0 0 0 0 0 0", extra=" -1")
     save_wall(walls / "2.pcd", "0 0 1 1 0 0 0", extra=" -1")
     done = octoreplay("import-clouds", walls, "-o", tmp_path / "a.mcap", "--rate", 10)
-    assert done.returncode == cli.EXIT_DATA_LOST
+    assert done.returncode == EXIT_DATA_LOST
     assert "2 clouds, 2 with labels" in done.stdout
     odd, left_out = done.stderr.splitlines()
     assert odd.startswith(f"warning: {walls / '2.pcd'}: rows have more columns than the header names; those after")

@@ -10,6 +10,7 @@ import pytest
 from octoreplay import cli
 from octoreplay.class_file import class_table, with_classes
 from octoreplay.class_tables.label_rows import BUILT_IN
+from octoreplay.commands import progress
 from octoreplay.config import PALETTE, RobotConfig, RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.io.robots.discover import resolve
@@ -248,7 +249,7 @@ def test_run_takes_classes_from_a_table_or_a_file(tmp_path, capsys):
 
 def test_unknown_colours_are_reported_as_colours():
     counts = FrameCounts(unknown_label_pixels={7: 1}, unknown_colors={0x0A0B0C: 1200, 255: 3})
-    sentences = list(cli._losses(counts))
+    sentences = list(progress.losses(counts))
     assert sentences == [
         "1 pixels or points with labels that no class has were ignored: 7",
         "1,203 pixels or points with colours that no class has were ignored: #0000ff, #0a0b0c",

@@ -45,6 +45,23 @@ def test_the_result_tells_what_was_run(result: Result, tmp_path: Path) -> None:
     assert result.stored_ticks("beta") == [4]
 
 
+def test_history_gives_the_maps_of_every_stored_tick(result: Result) -> None:
+    seen = []
+    for maps in result.history():
+        for robot_id, stored in maps.items():
+            if stored.tick == max(entry.tick for entry in maps.values()):
+                alone = result.map(robot_id, tick=stored.tick).leaves()
+                np.testing.assert_array_equal(stored.leaves().log_odds, alone.log_odds)
+                np.testing.assert_array_equal(stored.leaves().centers, alone.centers)
+                seen.append((robot_id, stored.tick))
+    assert seen == [("alpha", 1), ("alpha", 2), ("alpha", 4), ("beta", 4)]
+
+
+def test_a_result_without_the_centralised_map_says_so(result: Result) -> None:
+    with pytest.raises(InputError, match=r"holds no centralised map.*run the logs again"):
+        result.map("central")
+
+
 def test_time_counts_from_tick_zero(result: Result) -> None:
     assert result.start_ns == START
     assert result.seconds(START + 3 * SECOND // 2) == 1.5

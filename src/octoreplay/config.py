@@ -23,6 +23,9 @@ MODES = ("sync", "on-arrival")
 TOPOLOGIES = ("complete", "ring", "line", "star", "grid", "nearest", "range", "random", "edges")
 WEIGHTS = ("metropolis", "degree", "max-degree", "given")
 
+CENTRAL = "central"
+"""The name under which a result holds the centralised map, the sum of all robots' evidence."""
+
 PALETTE: tuple[tuple[int, int, int], ...] = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167),
     (120, 120, 120), (127, 60, 141), (17, 165, 121), (57, 105, 172), (242, 183, 1), (231, 63, 116), (128, 186, 90),
@@ -449,6 +452,8 @@ class RobotConfig:
     def __post_init__(self) -> None:
         if not self.robot_id or "/" in self.robot_id:
             raise ConfigError(f"robot id '{self.robot_id}': every robot needs an id, without '/' in it")
+        if self.robot_id == CENTRAL:
+            raise ConfigError(f"robot id '{CENTRAL}': is the name of the centralised map; give the robot another")
         for problem in (*self._wrong_sources(), *self._wrong_geometry(), *self._wrong_numbers()):
             raise ConfigError(f"robot '{self.robot_id}': {problem}")
 

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import RunConfig
+from octoreplay.config import CENTRAL, RunConfig
 from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results import posterior
 from octoreplay.io.results.result_reader import ResultReader
@@ -32,6 +33,7 @@ from octoreplay.records import (
     Float64Array,
     FloatArray,
     LeafTable,
+    MapState,
     RunSummary,
     TickMetrics,
     UInt8Array,
@@ -56,7 +58,7 @@ class PointQuery:
 
 
 class StoredMap:
-    """One robot's map after one tick.
+    """One robot's map after one tick, or the centralised one (``robot_id`` 'central').
 
     With ``team_posterior`` the methods give h_0 + N (h - h_0), the posterior of all N robots' evidence that an agreed
     map stands for, in place of the robot's own h.
@@ -70,16 +72,16 @@ class StoredMap:
         self.stamp_ns = stamp_ns
         self.prior = prior
         self.num_robots = num_robots
-        self._octree = octree
+        self.octree = octree
 
     @property
     def resolution(self) -> float:
         """Edge of the finest leaf in metres."""
-        return float(self._octree.resolution)
+        return float(self.octree.resolution)
 
     def leaves(self, *, team_posterior: bool = False) -> LeafTable:
         """All leaves, free ones included, in Morton order."""
-        table = self._octree.leaves(prior=self.prior)
+        table = self.octree.leaves(prior=self.prior)
         return LeafTable(table.centers, table.sizes, self._scaled(table.log_odds, team_posterior))
 
     def query(self, points: npt.ArrayLike, *, team_posterior: bool = False) -> PointQuery:
@@ -87,7 +89,7 @@ class StoredMap:
         coords = np.asarray(points, dtype=np.float64)
         if coords.ndim != 2 or coords.shape[1] != 3:
             raise ValueError(f"points: expects an array (P, 3), got {coords.shape}")
-        deviation, known, sizes = self._octree.lookup(coords)
+        deviation, known, sizes = self.octree.lookup(coords)
         log_odds = self._scaled((deviation + np.float32(self.prior)).astype(np.float32), team_posterior)
         probabilities = posterior.posterior(log_odds).astype(np.float32)
         return PointQuery(log_odds, probabilities, posterior.labels(log_odds), known, np.where(known, sizes, 0.0))
@@ -182,6 +184,8 @@ class Result:
     def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
         """A robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
+        ``robot_id`` 'central' gives the centralised map: the sum of all robots' evidence up to then.
+
         Raises InputError for an unknown robot, a tick at which no map is stored, or a time before the first stored map.
         Raises PacketError where a stored map is damaged, or of a version that is not read.
         """
@@ -195,8 +199,37 @@ class Result:
                 apply_delta(octree, state.data)
         except PacketError as error:
             raise PacketError(f"{self.path}: robot '{robot_id}': {error}; run the logs again") from error
-        last = states[-1]
-        return StoredMap(octree, robot_id, last.tick, last.stamp_ns, self._reader.prior, len(self.robots))
+        return self._stored_map(octree, states[-1])
+
+    def history(self) -> Iterator[dict[str, StoredMap]]:
+        """All maps at every stored tick in turn, by robot_id; with 'central' where the result holds it.
+
+        The octrees are changed in place by the next step. Raises as ``map`` does.
+        """
+        octrees: dict[str, SemanticOctree] = {}
+        maps: dict[str, StoredMap] = {}
+        tick: int | None = None
+        for state in self._reader.all_states():
+            if tick is not None and state.tick != tick:
+                yield maps
+            tick = state.tick
+            try:
+                if state.is_key_frame:
+                    octrees[state.robot_id] = decode_packet(state.data)
+                elif state.robot_id in octrees:
+                    apply_delta(octrees[state.robot_id], state.data)
+                else:
+                    raise PacketError("its first state is a delta")
+            except PacketError as error:
+                raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; run the logs again") from error
+            maps[state.robot_id] = self._stored_map(octrees[state.robot_id], state)
+        if maps:
+            yield maps
+
+    def _stored_map(self, octree: SemanticOctree, state: MapState) -> StoredMap:
+        """A map as it is after a state; the centralised one is the posterior of all evidence already."""
+        num_robots = 1 if state.robot_id == CENTRAL else len(self.robots)
+        return StoredMap(octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots)
 
     def _stamp_of(self, robot_id: str, tick: int) -> int:
         """The time of a robot's map stored at a tick."""

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, leaf_list, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, leaf_list, octree_from_streams
 from octoreplay.records import LeafTable
 from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
@@ -44,6 +44,19 @@ def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
     # As few leaves as a lossless octree can have: no eight sibling leaves are equal.
     assert len(leaves) == num_lossless_leaves(keys, values.astype(np.float32))
     assert _in_morton_order(leaves)
+
+
+@settings(max_examples=25, deadline=None)
+@given(cells=cell_maps(num_classes=2))
+def test_spans_are_the_leaves_as_runs_of_cells(cells):
+    octree = octree_of(cells)
+    spans = octree.spans()
+    codes = np.concatenate([np.arange(code, code + n) for code, n in zip(spans.codes, spans.num_cells, strict=True)])
+    assert (np.diff(codes) > 0).all()
+    values = np.repeat(spans.deviations, spans.num_cells, axis=0)
+    content = dict(zip(map(tuple, codes_to_keys(codes).tolist()), values.tolist(), strict=True))
+    assert content == {key: list(value) for key, value in cells.items()}
+    np.testing.assert_array_equal(keys_to_codes(codes_to_keys(codes)), codes)
 
 
 def _in_morton_order(leaves):

@@ -58,6 +58,18 @@ class TreeStreams(NamedTuple):
         return sum(array.nbytes for array in self)
 
 
+class LeafSpans(NamedTuple):
+    """The leaves of an octree as runs of finest cells along the Morton curve, in its order.
+
+    ``codes`` (L,) int64 are the Morton codes of their first cells, ``num_cells`` (L,) int64 the lengths of the runs,
+    ``deviations`` (L, C) float32 the values h - h_0.
+    """
+
+    codes: Int64Array
+    num_cells: Int64Array
+    deviations: Float32Array
+
+
 class SemanticOctree:
     """An octree over the key space [-2^18, 2^18)^3 with ``num_classes`` occupied classes.
 
@@ -220,10 +232,15 @@ class SemanticOctree:
             )  # fmt: skip
             codes, depths, is_vector = codes[chosen], depths[chosen], is_vector[chosen]
         sizes = np.exp2(storage.KEY_BITS - depths.astype(np.float64)) * self.resolution
-        keys = np.empty((codes.size, 3), np.int64)
-        storage.codes_to_keys(codes, keys)
-        centers = keys * self.resolution + sizes[:, None] / 2
+        centers = codes_to_keys(codes) * self.resolution + sizes[:, None] / 2
         return LeafTable(centers, sizes, leaf_values(streams, is_vector, self.num_classes) + np.float32(prior))
+
+    def spans(self) -> LeafSpans:
+        """All leaves as runs of finest cells."""
+        streams = self.streams()
+        codes, depths, is_vector = leaf_list(streams)
+        num_cells = np.int64(1) << (3 * (storage.KEY_BITS - depths.astype(np.int64)))
+        return LeafSpans(codes, num_cells, leaf_values(streams, is_vector, self.num_classes))
 
     def lookup(self, coords: Float64Array) -> tuple[Float32Array, BoolArray, Float64Array]:
         """What is at each coordinate (P, 3) [m]: deviations (P, C) float32, known (P,), size of the leaf (P,) [m].
@@ -236,8 +253,7 @@ class SemanticOctree:
             keys = np.floor(np.asarray(coords, np.float64) / self.resolution)
             inside = np.all((keys >= -storage.KEY_OFFSET) & (keys < storage.KEY_OFFSET), axis=1)
             keys = np.where(inside[:, None], keys, 0).astype(np.int64)
-        cell_codes = np.empty(len(keys), np.int64)
-        storage.keys_to_codes(keys, cell_codes)
+        cell_codes = keys_to_codes(keys)
         leaf = np.searchsorted(codes, cell_codes, side="right") - 1
         spans = np.int64(1) << (3 * (storage.KEY_BITS - depths.astype(np.int64)))
         known = inside & (leaf >= 0)
@@ -247,6 +263,20 @@ class SemanticOctree:
         sizes = np.zeros(len(keys))
         sizes[known] = np.exp2(storage.KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
         return log_odds, known, sizes
+
+
+def keys_to_codes(keys: Int64Array) -> Int64Array:
+    """Morton codes (n,) of the finest cells with keys (n, 3), each key from -2^18 to 2^18 - 1."""
+    codes = np.empty(len(keys), np.int64)
+    storage.keys_to_codes(np.ascontiguousarray(keys, np.int64), codes)
+    return codes
+
+
+def codes_to_keys(codes: Int64Array) -> Int64Array:
+    """Keys (n, 3) of the finest cells with Morton codes (n,)."""
+    keys = np.empty((codes.size, 3), np.int64)
+    storage.codes_to_keys(codes, keys)
+    return keys
 
 
 def mask_bytes(num_classes: int) -> int:

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from octoreplay.config import RunConfig
+from octoreplay.config import CENTRAL, RunConfig
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
@@ -27,7 +27,7 @@ class Recorder:
         self._config = config
         self._writer = writer
         self._threads = threads
-        self._num_states = {robot.robot_id: 0 for robot in config.robots}
+        self._num_states = {**{robot.robot_id: 0 for robot in config.robots}, CENTRAL: 0}
         self._stored: dict[str, SemanticOctree] = {}
         self._state_tick = -1
         self._view_tick = -1
@@ -110,9 +110,10 @@ class Recorder:
         return falls_due(tick.stamp_ns - self.start_ns, period_ns, every)
 
     def _write_states(self, tick: Tick) -> None:
-        """Store every robot's map: a key frame now and then, otherwise the bricks that changed since the last state."""
+        """Store all maps, the centralised one too: key frames now and then, in between the bricks that changed."""
         if self._writer is None:
             return
+        names, maps = (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle)
 
         def encode(robot_id: str, octree: SemanticOctree) -> MapState:
             sequence = self._num_states[robot_id]
@@ -125,10 +126,10 @@ class Recorder:
             base = sequence if is_key_frame else sequence - 1
             return MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
 
-        for state in self._threads.map(encode, tick.graph.robot_ids, tick.maps):
+        for state in self._threads.map(encode, names, maps):
             self._writer.write_state(state)
             self._num_states[state.robot_id] += 1
-        self._stored = dict(zip(tick.graph.robot_ids, tick.maps, strict=True))
+        self._stored = dict(zip(names, maps, strict=True))
         self._state_tick = tick.number
 
     def _write_views(self, tick: Tick) -> None:

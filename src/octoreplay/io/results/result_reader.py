@@ -17,7 +17,7 @@ from mcap.reader import SeekingReader
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
-from octoreplay.config import RunConfig
+from octoreplay.config import CENTRAL, RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
@@ -142,7 +142,14 @@ class ResultReader:
                 f"{self.path}: damaged: state {chain[-1].base_sequence} of robot '{robot_id}' is missing, on which"
                 f" state {chain[-1].sequence} builds"
             )
+        if robot_id == CENTRAL:
+            raise InputError(f"{self.path}: holds no centralised map up to the time asked for; run the logs again")
         raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for")
+
+    def all_states(self) -> Iterator[MapState]:
+        """Every stored state of all robots and of the centralised map, in the order of time."""
+        for _, value in self._messages(*map(map_state_topic, (*self.robots, CENTRAL))):
+            yield _map_state(value)
 
     def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
         """A robot's sensor poses: stamps [ns], and (P, 7) x, y, z, qx, qy, qz, qw in the team's frame."""
@@ -193,19 +200,19 @@ class ResultReader:
             )
 
     def _known(self, robot_id: str) -> str:
-        """The robot_id, if it is one of the team's."""
-        if robot_id not in self.robots:
+        """The robot_id, if it is one of the team's, or the centralised map's name."""
+        if robot_id not in (*self.robots, CENTRAL):
             raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
         return robot_id
 
-    def _messages(self, topic: str, *, end_ns: int | None = None, reverse: bool = False) -> Iterator[tuple[int, Any]]:
-        """(log time, message) on one topic, before ``end_ns``, in log-time order or the reverse of it."""
+    def _messages(self, *topics: str, end_ns: int | None = None, reverse: bool = False) -> Iterator[tuple[int, Any]]:
+        """(log time, message) on some topics, before ``end_ns``, in log-time order or the reverse of it."""
         try:
-            for schema, _, record in self._reader.iter_messages([topic], ending_before=end_ns, reverse=reverse):
+            for schema, _, record in self._reader.iter_messages(topics, ending_before=end_ns, reverse=reverse):
                 name = schema.name if schema is not None else ""
                 yield record.log_time, typestore().deserialize_cdr(record.data, name)
         except _DAMAGE as error:
-            raise InputError(f"{self.path}: damaged at topic '{topic}': {error}") from error
+            raise InputError(f"{self.path}: damaged at topic '{topics[0]}': {error}") from error
 
 
 _DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)

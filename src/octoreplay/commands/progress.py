@@ -1,0 +1,125 @@
+"""What is shown while a command works, and what is said about a run when it has ended."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from octoreplay.config import RunConfig
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from octoreplay.records import FrameCounts, RunSummary
+    from octoreplay.replay.session import Progress
+
+
+def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
+    """Run with a progress bar; says where the finished part is when interrupted."""
+    from octoreplay.io.results.result_writer import partial_path
+    from octoreplay.replay.session import replay_team
+
+    with progress_bar("replay") as update:
+
+        def show(progress: Progress) -> None:
+            elapsed = progress.log_ns / 1e9
+            done = None if not progress.total_ns else min(1.0, progress.log_ns / progress.total_ns)
+            stage = f"settling, tick {progress.tick}" if progress.settling else f"{elapsed:.1f} s"
+            update(done, None if progress.settling else elapsed, f"{stage}  \u03a6 {progress.total_distance:.3g}")
+
+        try:
+            return replay_team(config, output, progress=show)
+        except KeyboardInterrupt:
+            partial = partial_path(output)
+            kept = f"; what was finished is in {partial}" if partial.exists() else ""
+            raise KeyboardInterrupt(f"interrupted{kept}") from None
+
+
+def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
+    """Simulate with a progress bar and say what was written; the team file."""
+    from octoreplay.report.tables import size
+    from octoreplay.simulate.team import SimulationConfig, simulate_team
+
+    with progress_bar("simulate") as update:
+        summary = simulate_team(folder, SimulationConfig(**options), lambda share: update(share, None, ""))
+    click.echo(
+        f"simulated {len(summary.logs)} robots: {summary.num_frames:,} images, {size(summary.num_bytes)} in {folder}"
+    )
+    return summary.team_file
+
+
+def _ignore(*_: object) -> None:
+    """Progress that nobody watches."""
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, str], None]]:
+    """A progress bar on stderr when that is a terminal: update(share done, log seconds done, text)."""
+    from rich import progress as bars
+
+    from octoreplay.report.tables import terminal
+
+    console = terminal(stderr=True)
+    if not console.is_terminal:
+        yield _ignore
+        return
+    columns = (
+        bars.TextColumn("{task.description}"), bars.BarColumn(bar_width=24), bars.TaskProgressColumn(),
+        bars.TimeElapsedColumn(), bars.TextColumn("{task.fields[text]}"),
+    )  # fmt: skip
+    with bars.Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, text="")
+
+        def update(done: float | None, log_seconds: float | None, text: str) -> None:
+            wall = bar.tasks[0].elapsed or 0.0
+            speed = f"  {log_seconds / wall:.1f}x real time" if log_seconds is not None and wall > 0.5 else ""
+            bar.update(task, completed=done or 0.0, text=text + speed)
+
+        yield update
+
+
+def show_warnings(err: Console, summary: RunSummary) -> None:
+    """The run's warnings, and what was lost of each robot's log."""
+    for sentence in summary.warnings:
+        warn(err, sentence)
+    # Robots may share a log.
+    for sentence in dict.fromkeys(s for counts in summary.frame_counts.values() for s in counts.truncated_files):
+        warn(err, sentence)
+    for robot_id, counts in summary.frame_counts.items():
+        for sentence in losses(counts):
+            warn(err, f"{robot_id}: {sentence}")
+
+
+def losses(counts: FrameCounts) -> Iterator[str]:
+    """What could not be used of what one robot's logs hold, a sentence each."""
+    for cause, what in (
+        ("no_pose", "had no pose: none within pose_gap on both sides, or one beyond the map's reach"),
+        ("no_label", "had no labels or confidences within pair_tolerance"),
+        ("late", "came more than reorder_window late"),
+        ("undecodable", "could not be read"),
+    ):
+        count, first = getattr(counts, cause), counts.first_missing.get(cause)
+        if count:
+            yield f"{count:,} of the images or clouds {what}" + (f"; the first: {first}" if first else "")
+    if counts.duplicate:
+        yield f"{counts.duplicate:,} images or clouds had the stamp of another one, and were left out"
+    for what, numbers, spelling in (
+        ("labels", counts.unknown_label_pixels, "{}"),
+        ("colours", counts.unknown_colors, "#{:06x}"),
+    ):
+        if numbers:
+            shown = ", ".join(spelling.format(number) for number in sorted(numbers)[:8])
+            more = ", ..." if len(numbers) > 8 else ""
+            total = sum(numbers.values())
+            yield f"{total:,} pixels or points with {what} that no class has were ignored: {shown}{more}"
+
+
+def warn(err: Console, sentence: str) -> None:
+    """Say one warning."""
+    from rich.text import Text
+
+    err.print(Text.assemble(("warning: ", "yellow"), sentence), soft_wrap=True)

@@ -1,0 +1,108 @@
+"""Commands that look at a result: metrics, export, query."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from octoreplay.commands.options import check_output, existing_path
+from octoreplay.errors import ConfigError
+
+
+@click.command(short_help="Show a result's numbers, as table, CSV or figures.")
+@click.argument("result", type=existing_path, metavar="RESULT.mcap")
+@click.option("--csv", type=existing_path, metavar="FILE.csv", help="every tick's metrics as CSV")
+@click.option("--plot", type=existing_path, metavar="DIR", help="figures: disagreement over time, packet sizes")
+def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
+    """Show what a run came to, and write its metrics as CSV or pictures."""
+    from octoreplay.report import plots, tables
+    from octoreplay.result import open_result
+
+    if csv is not None:
+        check_output(csv, ".csv")
+    with open_result(result) as opened:
+        tables.show(tables.terminal(), tables.results(opened.summary))
+        written: list[Path] = []
+        if csv is not None:
+            plots.write_metrics_csv(opened.metrics, csv)
+            written.append(csv)
+        if plot is not None:
+            written += plots.write_figures(opened.metrics, plot)
+    for path in written:
+        click.echo(f"wrote {path}")
+    return 0
+
+
+@click.command(short_help="Write a map of a result as a PLY file.")
+@click.argument("result", type=existing_path, metavar="RESULT.mcap")
+@click.option("-o", "--output", type=existing_path, required=True, metavar="MAP.ply", help="the PLY file")
+@click.option(
+    "--robot", default=None, metavar="ID", help="whose map  [default: the first robot's; all with color robot]"
+)
+@click.option(
+    "--at", type=float, default=None, metavar="SECONDS", help="time since the run's start  [default: the end]"
+)
+@click.option("--what", type=click.Choice(("points", "voxels")), default="points", show_default=True,
+              help="leaf centres, or cubes of the leaves' sizes")  # fmt: skip
+@click.option("--color", type=click.Choice(("label", "robot", "disagreement", "probability")), default="label",
+              show_default=True, help="what the colours say")  # fmt: skip
+@click.option("--free", is_flag=True, help="free leaves too")
+@click.option("--team-posterior", is_flag=True, help="h_0 + N (h - h_0) in place of the robot's own h")
+def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
+    """Write a map of a result as a PLY file, which CloudCompare, MeshLab and Open3D open."""
+    from octoreplay.report.export import export_ply
+    from octoreplay.report.tables import size
+
+    check_output(output, ".ply")
+    count = export_ply(result, output, at=at, **options)
+    click.echo(f"wrote {output} ({count:,} {'cubes' if options['what'] == 'voxels' else 'points'}, "
+               f"{size(output.stat().st_size)})")  # fmt: skip
+    return 0
+
+
+@click.command(short_help="Ask a map what is at a point or in a box.")
+@click.argument("result", type=existing_path, metavar="RESULT.mcap")
+@click.option("--at", "points", type=(float, float, float), multiple=True, metavar="X Y Z",
+              help="what is at this point [m], in the team's frame; may be given several times")  # fmt: skip
+@click.option("--box", type=(float,) * 6, default=None, metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX",
+              help="what is in this box [m]")  # fmt: skip
+@click.option("--robot", default=None, metavar="ID", help="whose map is asked  [default: the first robot's]")
+@click.option("--time", "seconds", type=float, default=None, metavar="SECONDS",
+              help="time since the run's start  [default: the end]")  # fmt: skip
+@click.option("--team-posterior", is_flag=True, help="h_0 + N (h - h_0) in place of the robot's own h")
+def query(
+    result: Path, points: tuple[tuple[float, float, float], ...], box: tuple[float, ...] | None, robot: str | None,
+    seconds: float | None, team_posterior: bool,
+) -> int:  # fmt: skip
+    """Ask a robot's map what is at a point or in a box, and how sure it is."""
+    import numpy as np
+
+    from octoreplay.report import tables
+    from octoreplay.result import open_result
+
+    if not points and box is None:
+        raise click.UsageError("ask for a point, --at X Y Z, or a box, --box XMIN YMIN ZMIN XMAX YMAX ZMAX")
+    if not all(math.isfinite(number) for point in points for number in point):
+        raise ConfigError("at: expects finite numbers")
+    if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise ConfigError("box: every minimum must be below its maximum")
+    out = tables.terminal()
+    with open_result(result) as opened:
+        robot_id = opened.robots[0] if robot is None else robot
+        stored = opened.map(robot_id, at_ns=None if seconds is None else opened.time_ns(seconds))
+        names = ("free", *opened.class_table.names)
+        out.print(
+            f"map of {robot_id} {opened.seconds(stored.stamp_ns):.1f} s after the start"
+            f" ({'team posterior' if team_posterior else 'as the robot holds it'})",
+            soft_wrap=True,
+        )
+        if points:
+            answer = stored.query(np.array(points), team_posterior=team_posterior)
+            tables.show(out, tables.point_answers(names, points, answer))
+        if box is not None:
+            found = stored.query_box(box[:3], box[3:], team_posterior=team_posterior)
+            tables.show(out, tables.box_answer(names, found))
+    return 0

@@ -1,0 +1,147 @@
+"""Commands that make results: run, simulate, demo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from octoreplay.class_file import with_classes
+from octoreplay.class_tables.label_rows import BUILT_IN
+from octoreplay.commands.exit_codes import EXIT_DATA_LOST
+from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
+from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar
+from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network, with_options
+from octoreplay.config import PRESETS
+from octoreplay.errors import ConfigError
+
+
+@with_parameters
+@click.command(cls=SectionedCommand, short_help="Replay logs into maps that the team agrees on.")
+@click.argument("inputs", nargs=-1, type=existing_path, metavar="TEAM.yaml | LOG...")
+@click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="the result")
+@click.option(
+    "--config-from", type=existing_path, metavar="RESULT.mcap", help="repeat a run with the settings it stored"
+)
+@click.option(
+    "--save-team", type=existing_path, metavar="TEAM.yaml", help="save robots, topics and settings as a team file"
+)
+@click.option("--preset", type=click.Choice(tuple(PRESETS)), help="a named set of settings; options override it")
+@click.option("--edges", metavar="A:B[:W],...", help="links of the communication graph, with weights if all have one")
+@click.option("--one-way", metavar="A:B,...", help="links that carry from A to B only")
+@click.option("--schedule", type=existing_path, metavar="FILE.yaml", help="when which robots and links are up or down")
+@click.option("--classes", metavar="NAME|FILE", help=f"what labels mean: {', '.join(BUILT_IN)}, or a file")
+def run(
+    inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, classes: str | None,
+    **parameters: Any,
+) -> int:  # fmt: skip
+    """Replay a team's logs into maps that the team agrees on.
+
+    Give a team file, or logs (MCAP, ROS 1 bags, rosbag2 folders) in which robots and topics are found by themselves.
+    What was found is shown, and --save-team saves it.
+    """
+    from octoreplay.io.robots import discover
+    from octoreplay.report import tables
+
+    if output is None and save_team is None:
+        raise click.UsageError("give the result's name: -o OUT.mcap (or --save-team TEAM.yaml to stop before the run)")
+    if output is not None:
+        check_output(output, ".mcap")
+    if save_team is not None:
+        check_output(save_team, ".yaml", inputs)
+    out, err = tables.terminal(), tables.terminal(stderr=True)
+    base = base_config(inputs, config_from, err)
+    base = base if classes is None else with_classes(base, classes)
+    given = {name: value for name, value in parameters.items() if value is not None}
+    config = discover.resolve(with_network(with_options(base, preset, edges, given), one_way, schedule))
+    if config_from is None and not is_team_file(inputs):
+        tables.show(out, tables.chosen_inputs(config))
+        if config.classes is not None:
+            tables.show(out, tables.class_list(config.classes))
+    if save_team is not None:
+        save_team_file(config, save_team)
+        out.print(f"saved {save_team}", soft_wrap=True)
+    if output is None:
+        return 0
+    summary = replay_with_bar(config, output)
+    tables.show(out, tables.results(summary))
+    show_warnings(err, summary)
+    out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
+    return EXIT_DATA_LOST if summary.lost_data else 0
+
+
+@click.command(short_help="Write the logs of a simulated team.")
+@click.argument("folder", type=existing_path, metavar="DIR")
+@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
+@click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
+@click.option("--rate", type=float, default=4.0, show_default=True, help="images per second and robot [Hz]")
+@click.option("--image", default="160x120", show_default=True, metavar="WxH", help="image size [pixels]")
+@click.option("--seed", type=int, default=0, show_default=True, help="the village, the drives and the noise")
+@click.option("--resolution", type=float, default=0.3, show_default=True, help="edge of the finest cell [m]")
+@click.option("--label-noise", type=float, default=0.1, show_default=True, help="share of pixels with a wrong label")
+@click.option("--depth-noise/--no-depth-noise", default=True, show_default=True, help="noise that grows with range")
+@click.option("--world-size", type=float, default=None, help="edge of the square village [m]  [default: fits the team]")
+def simulate(folder: Path, robots: int, image: str, world_size: float | None, **options: Any) -> int:
+    """Write the logs of a simulated team that explores a village into DIR.
+
+    One ordinary MCAP log per robot, team.yaml, and the ground truth (world.npz, world.ply). The same options give the
+    same bytes.
+    """
+    values = {"num_robots": robots, "image": _image_size(image), **options}
+    if world_size is not None:
+        values["world_size"] = world_size
+    team_file = simulate_with_bar(folder, values)
+    click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
+    return 0
+
+
+@click.command(short_help="Simulate, replay and export, to see it all at once.")
+@click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-demo"), required=False)
+@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
+@click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
+@click.option("--seed", type=int, default=0, show_default=True, help="another seed, another village")
+def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
+    """Simulate a team, replay it, and export what it found, all into DIR (octoreplay-demo).
+
+    Takes under two minutes. Says what it made and how to look at it.
+    """
+    from octoreplay.io.robots import discover
+    from octoreplay.report import export, plots, tables
+    from octoreplay.result import open_result
+    from octoreplay.team_file import load_team_file
+
+    out, err = tables.terminal(), tables.terminal(stderr=True)
+    result_path, ply, csv, figures = (folder / n for n in ("result.mcap", "map.ply", "metrics.csv", "figures"))
+    team_file = simulate_with_bar(folder / "logs", {"num_robots": robots, "duration": duration, "seed": seed})
+    summary = replay_with_bar(discover.resolve(load_team_file(team_file)), result_path)
+    with open_result(result_path) as result:
+        plots.write_metrics_csv(result.metrics, csv)
+        plots.write_figures(result.metrics, figures)
+    export.export_ply(result_path, ply, what="voxels")
+    tables.show(out, tables.results(summary))
+    show_warnings(err, summary)
+    first = summary.last.robots[0].robot_id
+    tables.show(
+        out,
+        tables.made_files(
+            {
+                folder / "logs": f"what {robots} robots recorded, and the village they drove through (world.ply)",
+                result_path: f"the result; open it in Foxglove: 3D panel, frame 'team', topic /{first}/map",
+                ply: "the agreed map as cubes; open it in CloudCompare, MeshLab or Open3D",
+                figures: "disagreement over time and packet sizes, as pictures",
+                csv: "every number of every tick",
+            }
+        ),
+    )
+    out.print(f"more: octoreplay metrics {result_path}", soft_wrap=True)
+    return EXIT_DATA_LOST if summary.lost_data else 0
+
+
+def _image_size(text: str) -> tuple[int, int]:
+    """Width and height from WxH."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ConfigError(f"image: expects WIDTHxHEIGHT such as 160x120, got '{text}'")
+    return int(width), int(height)
