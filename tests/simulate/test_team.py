@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,15 @@ from scipy.spatial.transform import Rotation, Slerp
 from fixtures.make_fixtures import FIXTURES
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.simulate import team
-from octoreplay.simulate.team import START_NS, SimulationConfig, midway, simulate_team
-from octoreplay.simulate.world import VILLAGE_CLASSES, make_village
+from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
+from octoreplay.simulate.world import make_village, village_classes
 from octoreplay.team_file import load_team_file
 from stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
 SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)
 EXACT = SimulationConfig(
-    num_robots=2, duration=6.0, rate=2.0, image=(80, 60), seed=6, world_size=24.0, label_noise=0.0, depth_noise=False
+    num_robots=2, duration=6.0, rate=2.0, image=(80, 60), seed=6, world_size=24.0, label_noise=0.0, depth_noise=0.0
 )
 
 
@@ -90,7 +91,7 @@ def test_the_team_file_is_read_back_and_moves_with_its_folder(small):
     config = load_team_file(small / "team.yaml")
     assert [robot.robot_id for robot in config.robots] == ["husky_1", "husky_2"]
     assert [robot.logs for robot in config.robots] == [(small / f"husky_{k}.mcap",) for k in (1, 2)]
-    assert config.classes == VILLAGE_CLASSES
+    assert config.classes == village_classes()
     assert config.map.resolution == 0.3
     assert str(small) not in (small / "team.yaml").read_text()
     for robot in config.robots:
@@ -139,6 +140,41 @@ def test_odometry_and_tf_tell_the_same_poses_and_the_twist_is_their_change(small
     moved = np.linalg.norm(np.diff([T[:2, 3] for T in poses], axis=0), axis=1)
     np.testing.assert_allclose(speeds[:-1] * 0.05, moved, atol=1e-9)
     assert speeds.max() > 0.5
+
+
+def test_pose_errors_are_stationary_and_change_over_ten_seconds():
+    errors = pose_errors(0.5, 400_000, 0.05, np.random.default_rng(0))
+    np.testing.assert_allclose(errors.std(axis=0), [0.5, 0.5, 0.05], rtol=0.05)
+    starts = np.array([pose_errors(0.5, 1, 0.05, np.random.default_rng(seed))[0] for seed in range(1000)])
+    np.testing.assert_allclose(starts.std(axis=0), [0.5, 0.5, 0.05], rtol=0.1)
+    # Ten seconds are 200 steps: the correlation with what was then is 1 / e.
+    correlation = [np.corrcoef(errors[:-200, axis], errors[200:, axis])[0, 1] for axis in range(3)]
+    np.testing.assert_allclose(correlation, np.exp(-1.0), atol=0.05)
+    assert not pose_errors(0.0, 100, 0.05, np.random.default_rng(0)).any()
+
+
+def test_pose_noise_moves_the_recorded_poses_and_not_the_pictures(small, tmp_path):
+    simulate_team(tmp_path / "team", dataclasses.replace(SMALL, pose_noise=0.3))
+    exact, noisy = (read_messages(folder / "husky_1.mcap") for folder in (small, tmp_path / "team"))
+    for topic in ("/husky_1/camera/depth/image_raw", "/husky_1/camera/labels/image_raw"):
+        pairs = zip(exact[topic], noisy[topic], strict=True)
+        assert all(np.array_equal(one.data, other.data) for (_, one), (_, other) in pairs)
+    pairs = zip(exact["/husky_1/odom"], noisy["/husky_1/odom"], strict=True)
+    moved = [abs(one.pose.pose.position.x - other.pose.pose.position.x) for (_, one), (_, other) in pairs]
+    assert 0.01 < np.mean(moved) < 1.5
+
+
+def test_kinds_split_every_class_of_pictures_and_truth(small, tmp_path):
+    simulate_team(tmp_path / "team", dataclasses.replace(SMALL, kinds_per_class=4))
+    names = load_team_file(tmp_path / "team" / "team.yaml").classes.names
+    assert len(names) == 32
+    assert names[:5] == ("grass_1", "grass_2", "grass_3", "grass_4", "dirt_road_1")
+    (whole, _), (split, _) = truth_of(small), truth_of(tmp_path / "team")
+    assert whole.keys() == split.keys()
+    # On the border of two kinds the rest of a cell may outvote them.
+    same = [whole[key] == (split[key] - 1) // 4 + 1 for key in whole]
+    assert np.mean(same) > 0.98
+    assert len(set(split.values())) > 12
 
 
 def test_robots_stand_on_the_ground(small):

@@ -13,11 +13,11 @@ from octoreplay.simulate.world import (
     DIRT_ROAD,
     FENCE,
     GRASS,
-    VILLAGE_CLASSES,
     Terrain,
     World,
     labelled_cells,
     make_village,
+    village_classes,
     write_ground_truth,
     write_mesh,
 )
@@ -158,32 +158,32 @@ def test_the_square_is_clear_and_houses_are_in_the_way(village):
 
 
 def test_the_archive_says_what_it_holds(tmp_path, village):
-    count = write_ground_truth(tmp_path / "world.npz", village, 0.5, VILLAGE_CLASSES)
+    count = write_ground_truth(tmp_path / "world.npz", village, 0.5, village_classes())
     with np.load(tmp_path / "world.npz") as archive:
         assert sorted(archive.files) == ["class_colors", "class_ids", "class_names", "keys", "resolution"]
         assert archive["keys"].shape == (count, 3)
         assert archive["keys"].dtype == np.int32
         assert archive["class_ids"].dtype == np.uint8
         assert float(archive["resolution"]) == 0.5
-        assert archive["class_names"].tolist() == list(VILLAGE_CLASSES.names)
-        np.testing.assert_array_equal(archive["class_colors"], VILLAGE_CLASSES.colors)
+        assert archive["class_names"].tolist() == list(village_classes().names)
+        np.testing.assert_array_equal(archive["class_colors"], village_classes().colors)
         order = np.lexsort(archive["keys"].T[::-1])
         np.testing.assert_array_equal(order, np.arange(count))
 
 
 def test_the_mesh_file_is_the_mesh(tmp_path, village):
-    write_mesh(tmp_path / "world.ply", village, VILLAGE_CLASSES)
+    write_mesh(tmp_path / "world.ply", village, village_classes())
     ply = PlyData.read(str(tmp_path / "world.ply"))
     np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), village.triangles)
     np.testing.assert_array_equal(ply["face"]["label"], village.triangle_classes)
     np.testing.assert_array_equal(np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1), village.vertices)
-    first = VILLAGE_CLASSES.classes[village.triangle_classes[0] - 1].color
+    first = village_classes().classes[village.triangle_classes[0] - 1].color
     assert (ply["face"]["red"][0], ply["face"]["green"][0], ply["face"]["blue"][0]) == first
 
 
 def test_files_that_cannot_be_written(tmp_path, village):
     world = small_world((rectangle(0.0, (0, 1), (0, 1)), GRASS))
     with pytest.raises(OutputError, match=r"world\.npz: cannot be written"):
-        write_ground_truth(tmp_path / "none" / "world.npz", world, 0.3, VILLAGE_CLASSES)
+        write_ground_truth(tmp_path / "none" / "world.npz", world, 0.3, village_classes())
     with pytest.raises(OutputError, match=r"world\.ply: cannot be written"):
-        write_mesh(tmp_path / "none" / "world.ply", world, VILLAGE_CLASSES)
+        write_mesh(tmp_path / "none" / "world.ply", world, village_classes())

@@ -81,7 +81,11 @@ def run(
 @click.option("--seed", type=int, default=0, show_default=True, help="the village, the drives and the noise")
 @click.option("--resolution", type=float, default=0.3, show_default=True, help="edge of the finest cell [m]")
 @click.option("--label-noise", type=float, default=0.1, show_default=True, help="share of pixels with a wrong label")
-@click.option("--depth-noise/--no-depth-noise", default=True, show_default=True, help="noise that grows with range")
+@click.option("--depth-noise", type=float, default=1.0, show_default=True, metavar="FACTOR",
+              help="times a depth camera's noise, which grows with range")  # fmt: skip
+@click.option("--pose-noise", type=float, default=0.0, show_default=True,
+              help="error of the recorded poses, which changes over some ten seconds [m]")  # fmt: skip
+@click.option("--kinds-per-class", type=int, default=1, show_default=True, help="split the eight classes into kinds")
 @click.option("--world-size", type=float, default=None, help="edge of the square village [m]  [default: fits the team]")
 def simulate(folder: Path, robots: int, image: str, world_size: float | None, **options: Any) -> int:
     """Write the logs of a simulated team that explores a village into DIR.

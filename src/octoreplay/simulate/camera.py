@@ -64,9 +64,9 @@ def depth_noise_sigma(depth: npt.ArrayLike) -> Float64Array:
     return sigma
 
 
-def add_depth_noise(depth: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """The depth image with Gaussian noise that grows with range; pixels without a measurement stay 0."""
-    noise = rng.standard_normal(depth.shape, dtype=np.float32)
+def add_depth_noise(depth: Float32Array, rng: np.random.Generator, factor: float = 1.0) -> Float32Array:
+    """The depth image with Gaussian noise of ``factor`` sigma(z); pixels without a measurement stay 0."""
+    noise = np.float32(factor) * rng.standard_normal(depth.shape, dtype=np.float32)
     noisy = depth + noise * depth_noise_sigma(depth).astype(np.float32)
     return np.where(depth > 0, np.maximum(noisy, np.float32(0.001)), np.float32(0.0))
 

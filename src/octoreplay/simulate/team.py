@@ -12,13 +12,14 @@ import numpy as np
 from octoreplay.config import MapConfig, RobotConfig, RunConfig
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
-from octoreplay.records import CameraModel, Float64Array
+from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore
 from octoreplay.simulate.world import (
-    VILLAGE_CLASSES,
+    MAX_KINDS,
     Terrain,
     make_village,
+    village_classes,
     write_ground_truth,
     write_mesh,
 )
@@ -28,6 +29,7 @@ START_NS = 1_700_000_000_000_000_000
 """Stamp of a simulation's first message: fixed, so that the same options give the same bytes."""
 
 _ODOMETRY_RATE = 20.0
+_POSE_CORRELATION_TIME = 10.0
 _BASE_HEIGHT = 0.13
 _CAMERA_POSITION = (0.35, 0.0, 0.75)
 _CAMERA_PITCH = 0.08
@@ -39,8 +41,10 @@ class SimulationConfig:
 
     ``duration`` in seconds; ``rate`` images per second; ``image`` (width, height) in pixels; ``resolution`` in metres,
     of the ground truth's cells and of the team file; ``label_noise`` is the share of pixels that get another class;
-    ``world_size`` is the edge in metres of the square that robots may drive in; ``max_depth`` the camera's range in
-    metres. Raises ConfigError for a value out of range.
+    ``depth_noise`` multiplies the standard deviation of a depth camera's noise; ``pose_noise`` is the standard
+    deviation in metres of the recorded poses' x and y, a tenth of it in radians that of their heading;
+    ``kinds_per_class`` splits each of the eight classes; ``world_size`` is the edge in metres of the square that robots
+    may drive in; ``max_depth`` the camera's range in metres. Raises ConfigError for a value out of range.
     """
 
     num_robots: int = 6
@@ -50,7 +54,9 @@ class SimulationConfig:
     seed: int = 0
     resolution: float = 0.3
     label_noise: float = 0.1
-    depth_noise: bool = True
+    depth_noise: float = 1.0
+    pose_noise: float = 0.0
+    kinds_per_class: int = 1
     world_size: float = 70.0
     max_depth: float = 20.0
 
@@ -64,6 +70,9 @@ class SimulationConfig:
             ("seed", self.seed, 0, 2**32 - 1),
             ("resolution", self.resolution, 0.02, 5.0),
             ("label_noise", self.label_noise, 0.0, 1.0),
+            ("depth_noise", self.depth_noise, 0.0, 100.0),
+            ("pose_noise", self.pose_noise, 0.0, 10.0),
+            ("kinds_per_class", self.kinds_per_class, 1, MAX_KINDS),
             ("world_size", self.world_size, 20.0, 1000.0),
             ("max_depth", self.max_depth, 1.0, 65.0),
         ):
@@ -76,6 +85,11 @@ class SimulationConfig:
         width, height = self.image
         focal = 65.25 * width / 160
         return CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @property
+    def class_table(self) -> ClassTable:
+        """The classes that the cameras label."""
+        return village_classes(self.kinds_per_class)
 
     @property
     def robot_ids(self) -> tuple[str, ...]:
@@ -152,10 +166,10 @@ def _prepare(folder: Path) -> bool:
 
 def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float], None]) -> tuple[int, int]:
     """Write every file; the numbers of frames and of labelled cells."""
-    world = make_village(config.world_size, config.seed)
+    world = make_village(config.world_size, config.seed).with_kinds(config.kinds_per_class)
     eye = MeshCamera(world, config.camera)
-    num_cells = write_ground_truth(work / "world.npz", world, config.resolution, VILLAGE_CLASSES)
-    write_mesh(work / "world.ply", world, VILLAGE_CLASSES)
+    num_cells = write_ground_truth(work / "world.npz", world, config.resolution, config.class_table)
+    write_mesh(work / "world.ply", world, config.class_table)
     progress(0.1)
     schedule = _Schedule.of(config)
     drive = explore(
@@ -173,7 +187,7 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
             work / f"{robot_id}.mcap",
             robot_id,
             config.camera,
-            VILLAGE_CLASSES,
+            config.class_table,
             T_body_sensor=T_BODY_CAMERA,
             start_ns=START_NS,
         ) as log:
@@ -200,7 +214,7 @@ def _team(folder: Path, config: SimulationConfig) -> RunConfig:
                 label_info_topic=label_info,
             )
         )
-    return RunConfig(tuple(robots), classes=VILLAGE_CLASSES, map=MapConfig(resolution=config.resolution))
+    return RunConfig(tuple(robots), classes=config.class_table, map=MapConfig(resolution=config.resolution))
 
 
 @dataclass(frozen=True)
@@ -240,6 +254,9 @@ class _Recorder:
         self._schedule = schedule
         self._states = drive.states[index]
         self._poses = body_poses(terrain, self._states)
+        period, rng = schedule.pose_period_ns / 1e9, np.random.default_rng([config.seed, 3, index])
+        errors = pose_errors(config.pose_noise, len(self._states), period, rng)
+        self._recorded = body_poses(terrain, self._states + errors)
         self._exposures = schedule.exposures(index, config.num_robots)
         self._rng = np.random.default_rng([config.seed, 2, index])
 
@@ -247,10 +264,11 @@ class _Recorder:
         """Write all poses and images in time order; gives each image's stamp."""
         period_ns = self._schedule.pose_period_ns
         for step, (state, T_map_body) in enumerate(zip(self._states, self._poses, strict=True)):
+            recorded = self._recorded[step]
             stamp_ns = START_NS + step * period_ns
             following = self._states[min(step + 1, len(self._states) - 1)]
             speed = float(np.hypot(*(following[:2] - state[:2]))) * 1e9 / period_ns
-            log.write_pose(stamp_ns, T_map_body, speed, float(following[2] - state[2]) * 1e9 / period_ns)
+            log.write_pose(stamp_ns, recorded, speed, float(following[2] - state[2]) * 1e9 / period_ns)
             if step in self._exposures:
                 # Exposed midway between two poses: whoever reads the log has to interpolate.
                 T_map_camera = midway(T_map_body, self._poses[step + 1]) @ T_BODY_CAMERA
@@ -261,10 +279,10 @@ class _Recorder:
         """Take one picture and spoil it as a real camera and a real network would."""
         config = self._config
         depth, labels = self._eye.take(T_map_camera, config.max_depth)
-        if config.depth_noise:
-            depth = add_depth_noise(depth, self._rng)
+        if config.depth_noise > 0:
+            depth = add_depth_noise(depth, self._rng, config.depth_noise)
         if config.label_noise > 0:
-            labels = add_label_noise(labels, config.label_noise, VILLAGE_CLASSES.num_classes, self._rng)
+            labels = add_label_noise(labels, config.label_noise, config.class_table.num_classes, self._rng)
         log.write_frame(stamp_ns, depth_to_millimetres(depth), labels)
 
 
@@ -282,6 +300,23 @@ def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
     poses[:, 2, 3] = terrain.height(states[:, :2]) + _BASE_HEIGHT
     poses[:, 3, 3] = 1.0
     return poses
+
+
+def pose_errors(sigma: float, num_poses: int, period: float, rng: np.random.Generator) -> Float64Array:
+    """Errors (T, 3) of x, y [m] and heading [rad] of a robot that localises itself, one pose every ``period`` seconds.
+
+    A first-order Gauss-Markov process with a correlation time of 10 s: stationary with standard deviation ``sigma`` in
+    x and y, and ``sigma`` / 10 m in heading, which moves what is seen 10 m away by as much again.
+    """
+    kept = np.exp(-period / _POSE_CORRELATION_TIME)
+    steps = rng.standard_normal((num_poses, 3)) * (sigma, sigma, sigma / 10.0)
+    steps[1:] *= np.sqrt(1.0 - kept**2)
+    errors: Float64Array = np.empty_like(steps)
+    error = np.zeros(3)
+    for row, step in zip(errors, steps, strict=True):
+        error = kept * error + step
+        row[:] = error
+    return errors
 
 
 def midway(T_a: Float64Array, T_b: Float64Array) -> Float64Array:

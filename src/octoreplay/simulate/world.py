@@ -2,43 +2,58 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import OutputError
-from octoreplay.records import ClassTable, Float64Array, Int32Array, SemanticClass, UInt8Array
+from octoreplay.records import BoolArray, ClassTable, Color, Float64Array, Int32Array, SemanticClass, UInt8Array
 
 GRASS, DIRT_ROAD, BUILDING, ROOF, TRUNK, FOLIAGE, FENCE, CAR = range(1, 9)
 
-VILLAGE_CLASSES = ClassTable(
-    tuple(
-        SemanticClass(class_id, name, color, (class_id,))
-        for class_id, name, color in (
-            (GRASS, "grass", (124, 179, 66)),
-            (DIRT_ROAD, "dirt_road", (161, 122, 82)),
-            (BUILDING, "building", (224, 209, 178)),
-            (ROOF, "roof", (183, 58, 46)),
-            (TRUNK, "trunk", (96, 62, 35)),
-            (FOLIAGE, "foliage", (27, 108, 48)),
-            (FENCE, "fence", (240, 196, 60)),
-            (CAR, "car", (41, 98, 201)),
-        )
-    ),
-    ignored_raw_labels=(255,),
+_CLASSES = (
+    ("grass", (124, 179, 66)),
+    ("dirt_road", (161, 122, 82)),
+    ("building", (224, 209, 178)),
+    ("roof", (183, 58, 46)),
+    ("trunk", (96, 62, 35)),
+    ("foliage", (27, 108, 48)),
+    ("fence", (240, 196, 60)),
+    ("car", (41, 98, 201)),
 )
-"""The village's classes; the raw label of a class is its class_id, and 255 marks pixels without a measurement."""
+"""Names and colours of the classes 1 to 8."""
+MAX_KINDS = 31
+"""Most kinds of each class: ids and raw labels are below 255."""
+
+
+def village_classes(kinds: int = 1) -> ClassTable:
+    """The village's classes; with several ``kinds`` of each, grass_1, grass_2 and so on, the later ones darker.
+
+    The raw label of a class is its class_id, and 255 marks pixels without a measurement.
+    """
+    rows = [
+        (name if kinds == 1 else f"{name}_{kind + 1}", tuple(round(c * (1.0 - 0.5 * kind / kinds)) for c in color))
+        for name, color in _CLASSES
+        for kind in range(kinds)
+    ]
+    return ClassTable(
+        tuple(SemanticClass(i, name, cast("Color", color), (i,)) for i, (name, color) in enumerate(rows, 1)),
+        ignored_raw_labels=(255,),
+    )
+
 
 _ROAD_HALF_WIDTH = 2.0
 _ROAD_SPACING = 28.0
 _GROUND_STEP = 0.5
 _GROUND_MARGIN = 8.0
 _SQUARE_RADIUS = 8.0
+_KIND_SQUARE = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +84,8 @@ class Terrain:
 class World:
     """The village: ``vertices`` (V, 3) float32 in metres, ``triangles`` (T, 3) int32, ``triangle_classes`` (T,) uint8.
 
-    Robots may drive where |x| and |y| are at most ``size`` / 2; the ground goes on a little further.
+    Robots may drive where |x| and |y| are at most ``size`` / 2; the ground goes on a little further. The classes are
+    those of ``village_classes(kinds)``.
     """
 
     size: float
@@ -77,6 +93,20 @@ class World:
     vertices: npt.NDArray[np.float32]
     triangles: Int32Array
     triangle_classes: UInt8Array
+    kinds: int = 1
+
+    def is_ground(self, class_ids: UInt8Array) -> BoolArray:
+        """Which classes (P,) are grass or road of any kind."""
+        is_ground: BoolArray = class_ids <= DIRT_ROAD * self.kinds
+        return is_ground
+
+    def with_kinds(self, kinds: int) -> World:
+        """The same village with so many kinds of each class: what lies in one square of 8 m is of one kind."""
+        middles = self.vertices[self.triangles].mean(axis=1)[:, :2]
+        squares = np.floor(middles / _KIND_SQUARE).astype(np.int64)
+        kind = (squares[:, 0] * 7 + squares[:, 1] * 3) % kinds
+        classes = (self.triangle_classes.astype(np.int64) - 1) * kinds + kind + 1
+        return dataclasses.replace(self, triangle_classes=classes.astype(np.uint8), kinds=kinds)
 
     def surface_points(self, spacing: float) -> Iterator[tuple[Float64Array, UInt8Array]]:
         """Batches of points (P, 3) that lie at most ``spacing`` apart on all surfaces, with their classes (P,).
@@ -103,7 +133,7 @@ class World:
         n = grid_length(self.size, cell)
         mask = np.zeros((n, n), dtype=np.bool_)
         for points, class_ids in self.surface_points(cell / 2):
-            solid = points[class_ids > DIRT_ROAD]
+            solid = points[~self.is_ground(class_ids)]
             above = solid[:, 2] - self.terrain.height(solid[:, :2])
             index = np.floor((solid[(above > 0.1) & (above < 1.5), :2] + self.size / 2) / cell).astype(np.int64)
             index = index[((index >= 0) & (index < n)).all(axis=1)]
@@ -140,7 +170,7 @@ def labelled_cells(world: World, resolution: float) -> tuple[Int32Array, UInt8Ar
     """
     packed: list[npt.NDArray[np.int64]] = []
     for points, class_ids in world.surface_points(resolution / 3):
-        buried = (class_ids > DIRT_ROAD) & (points[:, 2] < world.terrain.height(points[:, :2]) - 0.05)
+        buried = ~world.is_ground(class_ids) & (points[:, 2] < world.terrain.height(points[:, :2]) - 0.05)
         keys = np.floor(points[~buried] / resolution).astype(np.int64) + _KEY_OFFSET
         packed.append((((keys[:, 0] << 18) + keys[:, 1] << 18) + keys[:, 2] << 8) + class_ids[~buried])
     values, counts = np.unique(np.concatenate(packed), return_counts=True)
