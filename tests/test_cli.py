@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from plyfile import PlyData
 
-from octoreplay import __version__, cli
+from octoreplay import __version__, cli, settings
 from octoreplay.commands import running, team_options
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.config import PARAMETERS, RobotConfig, RunConfig
@@ -115,22 +115,22 @@ def base() -> RunConfig:
 
 def test_options_beat_the_preset_and_the_preset_beats_the_file() -> None:
     file = base().with_parameters({"evidence": "cell-average", "gamma": 0.125, "hit": 2.0})
-    config = team_options.with_options(file, "paper", None, {"gamma": 0.75})
+    config = settings.with_options(file, "paper", None, {"gamma": 0.75})
     assert config.consensus.evidence == "time-average"
     assert config.consensus.gamma == 0.75
     assert config.sensor.hit == 2.0
-    assert team_options.with_options(file, None, None, {}) == file
+    assert settings.with_options(file, None, None, {}) == file
 
 
 def test_edges_set_the_topology_and_the_weights() -> None:
-    config = team_options.with_options(base(), None, "a:b, b:c", {})
+    config = settings.with_options(base(), None, "a:b, b:c", {})
     assert (config.network.topology, config.network.weights) == ("edges", "metropolis")
     assert config.network.edges == (("a", "b", None), ("b", "c", None))
-    weighted = team_options.with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
+    weighted = settings.with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
     assert (weighted.network.weights, weighted.network.edges[1]) == ("given", ("b", "c", 0.5))
-    back = team_options.with_options(weighted, None, None, {"topology": "ring"})
+    back = settings.with_options(weighted, None, None, {"topology": "ring"})
     assert (back.network.topology, back.network.weights, back.network.edges) == ("ring", "metropolis", ())
-    kept = team_options.with_options(weighted, None, None, {"hit": 2.0})
+    kept = settings.with_options(weighted, None, None, {"hit": 2.0})
     assert kept.network == weighted.network
 
 
@@ -141,7 +141,7 @@ def test_edges_set_the_topology_and_the_weights() -> None:
 )  # fmt: skip
 def test_bad_edges_are_one_sentence(edges: str, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
-        team_options.with_options(base(), None, edges, {})
+        settings.with_options(base(), None, edges, {})
 
 
 def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

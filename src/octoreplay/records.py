@@ -25,6 +25,9 @@ Color: TypeAlias = tuple[int, int, int]
 NO_CLASS = 0
 """The class_id of a measured point that carries no usable label: it frees its ray and hits nothing."""
 
+CONVERGED = "converged"
+"""The ``stop_reason`` of a run whose maps came to rest."""
+
 
 @dataclass(frozen=True)
 class CameraModel:

@@ -151,6 +151,16 @@ class Result:
         """The configuration of the run."""
         return self._reader.config
 
+    @property
+    def is_complete(self) -> bool:
+        """False for what an interrupted run left."""
+        return self._reader.is_complete
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, str, str]]:
+        """Size in bytes, method and fingerprint of every input file by its path, in the order of the robots."""
+        return self._reader.inputs
+
     @cached_property
     def metrics(self) -> list[TickMetrics]:
         """The metrics of all ticks, in order."""

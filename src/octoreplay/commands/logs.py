@@ -8,10 +8,11 @@ from typing import Any
 import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
-from octoreplay.commands.options import check_output, existing_path, numbers, write_text
+from octoreplay.commands.options import check_output, existing_path, numbers
 from octoreplay.commands.progress import progress_bar
 from octoreplay.config import RunConfig
 from octoreplay.errors import InputError, OutputError
+from octoreplay.io.text_files import write_whole
 
 
 @click.command(short_help="Show what logs hold and what is missing for a run.")
@@ -54,7 +55,7 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
     robots = tuple(summary.robot.with_absolute_paths() for summary in description.robots)
     missing = {summary.robot.robot_id: summary.missing for summary in description.robots}
     config = RunConfig(robots, classes=description.class_table)
-    write_text(output, team_template(config, {"": description.missing, **missing}, output.parent.resolve()))
+    write_whole(output, team_template(config, {"": description.missing, **missing}, output.parent.resolve()))
     click.echo(f"wrote {output} ({len(robots)} robot{'s' if len(robots) > 1 else ''})")
     for sentence in (*description.missing, *(sentence for found in missing.values() for sentence in found)):
         click.echo(f"missing for a run: {sentence}", err=True)

@@ -84,11 +84,3 @@ def check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
         raise OutputError(f"{path}: cannot be written: the folder '{path.parent}' does not exist")
     if any(path.resolve() == entry.resolve() for entry in inputs):
         raise OutputError(f"{path}: is an input of this command; name another output")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a whole text file."""
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error

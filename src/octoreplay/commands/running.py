@@ -12,9 +12,10 @@ from octoreplay.class_tables.label_rows import BUILT_IN
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar
-from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network, with_options
+from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
 from octoreplay.config import PRESETS
 from octoreplay.errors import ConfigError
+from octoreplay.settings import with_options
 
 
 @with_parameters

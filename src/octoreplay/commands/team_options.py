@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from octoreplay.commands.options import write_text
 from octoreplay.commands.progress import warn
-from octoreplay.config import PRESETS, RunConfig
+from octoreplay.config import RunConfig
 from octoreplay.errors import ConfigError
+from octoreplay.io.text_files import write_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,23 +45,6 @@ def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console
     return RunConfig(robots=discover.discover(inputs))
 
 
-def with_options(base: RunConfig, preset: str | None, edges: str | None, given: dict[str, Any]) -> RunConfig:
-    """The configuration with preset and options: an option beats the preset, which beats the file."""
-    parameters = {**(PRESETS[preset] if preset is not None else {}), **given}
-    network: dict[str, Any] = {name: parameters.pop(name) for name in ("topology", "weights") if name in parameters}
-    config = base.with_parameters(parameters)
-    if edges is not None:
-        links = _links(edges)
-        weighted = any(weight is not None for *_, weight in links)
-        network = {"topology": "edges", "weights": "given" if weighted else "metropolis", **network, "edges": links}
-    elif network.get("topology", "edges") != "edges":
-        # A topology by name replaces the file's list of edges, and with it the weights given there.
-        network["edges"] = ()
-        if base.network.weights == "given":
-            network.setdefault("weights", "metropolis")
-    return dataclasses.replace(config, network=dataclasses.replace(config.network, **network))
-
-
 def with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:
     """The configuration with one-way links and a schedule, where they are given."""
     from octoreplay.team_file import load_schedule
@@ -82,23 +65,9 @@ def _pair(text: str) -> tuple[str, str]:
     return sender, receiver
 
 
-def _links(text: str) -> tuple[tuple[str, str, float | None], ...]:
-    """Edges from A:B[:W],C:D[:W],..."""
-    links = []
-    for entry in text.split(","):
-        ends = entry.strip().split(":")
-        if len(ends) not in (2, 3) or not all(ends):
-            raise ConfigError(f"edges: '{entry}' is not A:B or A:B:WEIGHT")
-        try:
-            links.append((ends[0], ends[1], float(ends[2]) if len(ends) == 3 else None))
-        except ValueError:
-            raise ConfigError(f"edges: the weight in '{entry}' is not a number") from None
-    return tuple(links)
-
-
 def save_team_file(config: RunConfig, path: Path) -> None:
     """Write a team file whose log paths hold from its own folder."""
     from octoreplay.team_file import dump_team
 
     robots = tuple(robot.with_absolute_paths() for robot in config.robots)
-    write_text(path, dump_team(dataclasses.replace(config, robots=robots), path.parent.resolve()))
+    write_whole(path, dump_team(dataclasses.replace(config, robots=robots), path.parent.resolve()))

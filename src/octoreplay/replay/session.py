@@ -27,6 +27,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import (
+    CONVERGED,
     Float64Array,
     Frame,
     FrameCounts,
@@ -50,7 +51,6 @@ from octoreplay.replay.settling import num_quiet_ticks, num_settle_ticks
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import Bodies, FrameSource, Timeline
 
-CONVERGED = "converged"
 SETTLE_MAX = "settle_max reached"
 NO_SETTLING = "settling is off"
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from octoreplay.errors import InputError, OutputError
+from octoreplay.io.text_files import write_whole
 from octoreplay.records import TickMetrics
 
 _TEAM_COLUMNS = (
@@ -56,14 +57,7 @@ def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
 
 def write_metrics_csv(metrics: Sequence[TickMetrics], path: Path) -> None:
     """Write ``metrics_csv`` to a file. Raises OutputError."""
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        partial.write_text(metrics_csv(metrics), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, metrics_csv(metrics))
 
 
 def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:

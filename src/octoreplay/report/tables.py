@@ -86,7 +86,7 @@ def results(summary: RunSummary) -> RenderableType:
 
 def chosen_inputs(config: RunConfig) -> Table:
     """The robots, logs and topics that a run will use."""
-    table = _table("Robots and topics")
+    table = styled_table("Robots and topics")
     table.add_column("robot", no_wrap=True)
     table.add_column("log", overflow="fold")
     table.add_column("topics and frames", overflow="fold")
@@ -106,7 +106,7 @@ def class_list(class_table: ClassTable) -> RenderableType:
 
 def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, float]], answer: PointQuery) -> Table:
     """What a map says about points: the three most probable of ``names`` (free, then the classes)."""
-    table = _table("")
+    table = styled_table("")
     table.add_column("x, y, z [m]", no_wrap=True)
     table.add_column("what", no_wrap=True)
     table.add_column("how sure", justify="right", no_wrap=True)
@@ -128,7 +128,7 @@ def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
     """How much of each of ``names`` (free, then the classes) a table of leaves holds."""
     labels, volumes = posterior.labels(leaves.log_odds), leaves.sizes**3
     sure = posterior.label_probabilities(leaves.log_odds)
-    table = _table("")
+    table = styled_table("")
     table.add_column("what", no_wrap=True)
     for heading in ("leaves", "volume", "how sure, mean"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -144,7 +144,7 @@ def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
 
 def made_files(files: Mapping[Path, str]) -> Table:
     """Files or folders and what they are for."""
-    table = _table("Made")
+    table = styled_table("Made")
     table.show_header = False
     table.add_column(overflow="fold")
     table.add_column()
@@ -177,7 +177,7 @@ def show(console: Console, *parts: RenderableType) -> None:
         console.print()
 
 
-def _table(title: str) -> Table:
+def styled_table(title: str) -> Table:
     """The one style of all tables."""
     return Table(
         title=title or None,
@@ -201,7 +201,7 @@ def _spaced(parts: Sequence[RenderableType]) -> Group:
 
 def _team_table(summary: RunSummary) -> Table:
     """Rows of description and value for the whole team."""
-    last, table = summary.last, _table("Team")
+    last, table = summary.last, styled_table("Team")
     table.show_header = False
     table.add_column(no_wrap=True)
     table.add_column()
@@ -244,7 +244,7 @@ _AGREEMENTS = ("agreement", "agreement_occupied")
 
 def _robots_table(last: TickMetrics) -> Table:
     """One row per robot after the last tick."""
-    table = _table("Robots, after the last tick")
+    table = styled_table("Robots, after the last tick")
     table.add_column("robot", no_wrap=True)
     for name in ("scans", "agreement\nall cells", "\noccupied", "leaves", "volume", "entropy", "packet"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -263,7 +263,7 @@ _FATES = ("lost", "dropped", "late", "stale", "gaps", "damaged")
 
 def _links_table(links: Sequence[LinkMetrics]) -> Table:
     """One row per directed link over the whole run."""
-    table = _table("Links, over the whole run")
+    table = styled_table("Links, over the whole run")
     table.add_column("link", no_wrap=True)
     for name in ("packets", "delivered", *_FATES, "bytes/s"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -282,7 +282,7 @@ def _log_table(log: LogSummary) -> RenderableType:
     if log.start_ns is not None and log.end_ns is not None:
         span = f"{instant(log.start_ns)}, {seconds((log.end_ns - log.start_ns) / 1e9)}"
     title = Text.assemble((str(log.path), "bold"), f"\n{span}, {log.num_messages:,} messages")
-    table = _table("")
+    table = styled_table("")
     longest = max((len(topic.name) for topic in log.topics), default=0)
     table.add_column("topic", overflow="fold", min_width=min(longest, 32))
     table.add_column("type", no_wrap=True)
@@ -300,7 +300,7 @@ def _log_table(log: LogSummary) -> RenderableType:
 
 def _robot_spans(logs: LogDescription) -> Table:
     """One row per robot that was found: its topics, and when it was there."""
-    table = _table("Robots")
+    table = styled_table("Robots")
     table.add_column("robot", no_wrap=True)
     table.add_column("topics and frames", overflow="fold")
     table.add_column("start", justify="right", no_wrap=True)
@@ -332,7 +332,7 @@ def _readiness(logs: LogDescription) -> RenderableType:
 
 def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
     """One row per robot: frames that were mapped, and those that were not, by cause."""
-    table = _table("Frames")
+    table = styled_table("Frames")
     table.add_column("robot", no_wrap=True)
     table.add_column("mapped", justify="right")
     causes = [cause for cause in _CAUSES if any(getattr(count, cause) for count in counts.values())]

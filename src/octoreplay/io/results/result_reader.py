@@ -87,6 +87,17 @@ class ResultReader:
         return self.config.classes
 
     @property
+    def is_complete(self) -> bool:
+        """False for what an interrupted run left."""
+        return self._metadata.get("summary", {}).get("complete") == "true"
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, str, str]]:
+        """Size in bytes, method and fingerprint of every input file by its path, in the order of the robots."""
+        stored = {name: json.loads(text) for name, text in self._metadata.get("inputs", {}).items()}
+        return {name: (entry["size"], entry["method"], entry["fingerprint"]) for name, entry in stored.items()}
+
+    @property
     def prior(self) -> float:
         """h_0, the log-odds of each occupied class in an unobserved cell."""
         return float(self.description["prior"])
@@ -104,7 +115,7 @@ class ResultReader:
         if not metrics:
             raise InputError(f"{self.path}: holds no tick; the run was interrupted before its first one")
         stored = self._metadata.get("summary", {})
-        if stored.get("complete") != "true":
+        if not self.is_complete:
             return _summary_from_metrics(metrics, stored.get("stop_reason", "cut off"))
         names = {item.name for item in dataclasses.fields(RunSummary)}
         values: dict[str, Any] = {
@@ -163,13 +174,13 @@ class ResultReader:
     def changed_inputs(self) -> list[str]:
         """A sentence for every input file that is missing or no longer what this result was made from."""
         sentences = []
-        for name, text in self._metadata.get("inputs", {}).items():
-            stored, path = json.loads(text), self.path.parent / name
+        for name, stored in self.inputs.items():
+            path = self.path.parent / name
             if not path.exists():
                 sentences.append(f"{path}: input of {self.path.name} is missing")
                 continue
-            now = fingerprint(path, whole=stored["method"] == "sha256")
-            if (now.size, now.method, now.value) != (stored["size"], stored["method"], stored["fingerprint"]):
+            now = fingerprint(path, whole=stored[1] == "sha256")
+            if (now.size, now.method, now.value) != stored:
                 sentences.append(f"{path}: has changed since {self.path.name} was made from it")
         return sentences
 
