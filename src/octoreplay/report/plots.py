@@ -6,13 +6,28 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from octoreplay.errors import InputError, OutputError
+from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
 from octoreplay.records import TickMetrics
+from octoreplay.report.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    label_in_bytes,
+    legend_below,
+    new_figure,
+    save_figures,
+    style,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _TEAM_COLUMNS = (
     "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
@@ -27,8 +42,6 @@ _LINK_COLUMNS = (
     "num_sent", "sent_bytes", "num_delivered", "delivered_bytes", "num_lost", "num_dropped", "num_late", "num_stale",
     "num_gaps", "num_damaged", "bytes_per_second",
 )  # fmt: skip
-
-_BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
 
 
 def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
@@ -67,17 +80,9 @@ def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:
     """
     if not metrics:
         raise InputError("there is no tick to draw; the run was interrupted before its first one")
-    figures = {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}
-    paths = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in figures.items():
-            # Software would name matplotlib's version: left out, so that equal results give equal files.
-            figure.savefig(folder / name, metadata={"Software": None})
-            paths.append(folder / name)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
-    return paths
+    return save_figures(
+        {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}, folder
+    )
 
 
 def _cells(record: Any, names: Sequence[str]) -> list[str]:
@@ -91,21 +96,10 @@ def _cell(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
 
 
-def _axes(title: str, y_label: str) -> tuple[Any, Any]:
-    """An empty figure and its axes, in the one style of all figures. Drawn without a display."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 3.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.set_xlabel("log time [s]")
-    axes.set_ylabel(y_label)
-    axes.grid(visible=True, color="#e5e5e5", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
+def _over_time(title: str, y_label: str) -> tuple[Figure, Axes]:
+    """An empty figure over log time, and its axes."""
+    figure = new_figure()
+    return figure, style(figure.add_subplot(), title, "log time [s]", y_label)
 
 
 def _times(metrics: Sequence[TickMetrics]) -> Any:
@@ -113,44 +107,44 @@ def _times(metrics: Sequence[TickMetrics]) -> Any:
     return np.array([tick.stamp_ns - metrics[0].stamp_ns for tick in metrics]) / 1e9
 
 
-def _mark_settling(axes: Any, metrics: Sequence[TickMetrics], times: Any) -> None:
+def _mark_settling(axes: Axes, metrics: Sequence[TickMetrics], times: Any) -> None:
     """A grey band over the ticks after the last log."""
     first = next((index for index, tick in enumerate(metrics) if tick.settling), None)
     if first is not None:
         start = times[first - 1] if first else times[0]
-        axes.axvspan(start, times[-1], color=_GREY, alpha=0.15, linewidth=0, label="settling, no new scans")
+        axes.axvspan(start, times[-1], color=GREY, alpha=0.15, linewidth=0, label="settling, no new scans")
 
 
-def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Any:
+def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
     """Phi over time, on a logarithmic axis."""
-    figure, axes = _axes("Disagreement of the team", "\u03a6")
+    figure, axes = _over_time("Disagreement of the team", "\u03a6")
     times = _times(metrics)
     links = np.array([tick.total_distance for tick in metrics])
     pairs = np.array([tick.total_distance_all for tick in metrics])
-    axes.plot(times, np.where(links > 0, links, np.nan), color=_BLUE, linewidth=1.6, label="\u03a6 over the links")
+    axes.plot(times, np.where(links > 0, links, np.nan), color=BLUE, linewidth=1.6, label="\u03a6 over the links")
     # On a complete graph the two are one line but for rounding.
     if not np.allclose(links, pairs, rtol=1e-3):
         axes.plot(
-            times, np.where(pairs > 0, pairs, np.nan), "--", color=_ORANGE, linewidth=1.4, label="\u03a6 over all pairs"
+            times, np.where(pairs > 0, pairs, np.nan), "--", color=ORANGE, linewidth=1.4, label="\u03a6 over all pairs"
         )
     if (pairs > 0).any():
         axes.set_yscale("log")
         # What is below this is agreement; the axis belongs to the rise and the fall.
         axes.set_ylim(bottom=pairs.max() * 1e-9)
     _mark_settling(axes, metrics, times)
-    figure.legend(frameon=False, fontsize=9, loc="outside lower center", ncols=4)
+    legend_below(figure)
     return figure
 
 
-def _packet_figure(metrics: Sequence[TickMetrics]) -> Any:
+def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
     """Bytes of a published map: as sent, as octree and as uniform grid; mean and standard deviation over robots."""
-    figure, axes = _axes("Size of a published map (mean and standard deviation over robots)", "bytes")
+    figure, axes = _over_time("Size of a published map (mean and standard deviation over robots)", "bytes")
     times = _times(metrics)
     least = np.inf
     for name, label, color in (
-        ("grid_bytes", "uniform grid", _ORANGE),
-        ("octree_bytes", "octree", _BLUE),
-        ("packet_bytes", "octree, as sent", _GREEN),
+        ("grid_bytes", "uniform grid", ORANGE),
+        ("octree_bytes", "octree", BLUE),
+        ("packet_bytes", "octree, as sent", GREEN),
     ):
         mean, deviation = _over_robots(metrics, name)
         axes.plot(times, mean, color=color, linewidth=1.6, label=label)
@@ -160,9 +154,9 @@ def _packet_figure(metrics: Sequence[TickMetrics]) -> Any:
         # Logarithmic: on a linear axis both octree curves lie on the floor.
         axes.set_yscale("log")
         axes.set_ylim(bottom=least / 2)
-        _label_in_bytes(axes)
+        label_in_bytes(axes)
     _mark_settling(axes, metrics, times)
-    figure.legend(frameon=False, fontsize=9, loc="outside lower center", ncols=4)
+    legend_below(figure)
     return figure
 
 
@@ -174,13 +168,3 @@ def _over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
         means.append(np.mean(values) if values else np.nan)
         deviations.append(np.std(values) if values else np.nan)
     return np.array(means), np.array(deviations)
-
-
-def _label_in_bytes(axes: Any) -> None:
-    """Ticks on a logarithmic axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
-    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
-
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(EngFormatter(unit="B"))

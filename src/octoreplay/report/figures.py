@@ -1,0 +1,67 @@
+"""The one style of all figures, drawn without a display."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from octoreplay.errors import OutputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
+COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#222222")
+"""Colours that colour-blind readers tell apart (Okabe and Ito)."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+
+def new_figure(width: float = 7.0, height: float = 3.6) -> Figure:
+    """An empty figure of so many inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def style(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> Axes:
+    """Axes with a title, labels and a grid."""
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(visible=True, color="#e5e5e5", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def legend_below(figure: Figure, axes: Axes | None = None, columns: int = 4) -> None:
+    """A legend under the figure, of these axes' entries or of all."""
+    handles: dict[str, Any] = {"handles": axes.get_legend_handles_labels()[0]} if axes is not None else {}
+    figure.legend(**handles, frameon=False, fontsize=9, loc="outside lower center", ncols=columns)
+
+
+def label_in_bytes(axes: Axes) -> None:
+    """Ticks on a logarithmic axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
+    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(EngFormatter(unit="B"))
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write figures by their file names into a folder, made if need be; the files written. Raises OutputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, figure in figures.items():
+            # Software would name matplotlib's version: left out, so that equal results give equal files.
+            figure.savefig(folder / name, metadata={"Software": None})
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return [folder / name for name in figures]
