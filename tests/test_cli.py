@@ -25,7 +25,8 @@ from octoreplay.team_file import load_team_file
 
 FIXTURES = Path(__file__).parent / "fixtures"
 PAIR = FIXTURES / "pair" / "team.yaml"
-COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds")
+COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
+            "check", "compare")  # fmt: skip
 
 
 def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -12,6 +12,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from octoreplay.config import RobotConfig, RunConfig
     from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
+    from octoreplay.evaluate.checks import CheckRow, check_result
+    from octoreplay.evaluate.comparison import ResultComparison, compare_results
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from octoreplay.team_file import load_team_file
 
 _HOMES = {
+    "CheckRow": "evaluate.checks",
     "ClassTable": "records",
     "ConfigError": "errors",
     "InputError": "errors",
@@ -32,6 +35,7 @@ _HOMES = {
     "PointQuery": "result",
     "Progress": "replay.session",
     "Result": "result",
+    "ResultComparison": "evaluate.comparison",
     "RobotConfig": "config",
     "RunConfig": "config",
     "RunSummary": "records",
@@ -39,6 +43,8 @@ _HOMES = {
     "SimulationConfig": "simulate.team",
     "StoredMap": "result",
     "TickMetrics": "records",
+    "check_result": "evaluate.checks",
+    "compare_results": "evaluate.comparison",
     "discover": "io.robots.discover",
     "export_ply": "report.export",
     "load_team_file": "team_file",
@@ -51,10 +57,11 @@ _HOMES = {
 """The module that each public name comes from."""
 
 __all__ = [
-    "ClassTable", "ConfigError", "InputError", "LeafTable", "OctoreplayError", "OutputError", "PacketError",
-    "PointQuery", "Progress", "Result", "RobotConfig", "RunConfig", "RunSummary", "SemanticClass", "SimulationConfig",
-    "StoredMap", "TickMetrics", "__version__", "discover", "export_ply", "load_team_file", "open_log", "open_result",
-    "replay_team", "resolve", "simulate_team",
+    "CheckRow", "ClassTable", "ConfigError", "InputError", "LeafTable", "OctoreplayError", "OutputError",
+    "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RunConfig", "RunSummary",
+    "SemanticClass", "SimulationConfig", "StoredMap", "TickMetrics", "__version__", "check_result",
+    "compare_results", "discover", "export_ply", "load_team_file", "open_log", "open_result", "replay_team",
+    "resolve", "simulate_team",
 ]  # fmt: skip
 
 

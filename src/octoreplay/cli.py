@@ -1,8 +1,8 @@
 """The command line: one group of the commands in ``commands/``, and the exit code of each end.
 
-Only this module and the commands print or exit. Exit codes: 0 good; 1 input or run error; 2 usage or configuration;
-3 finished, but data was lost; 130 interrupted. Whatever a command needs is imported when it runs, so that ``--help`` is
-quick.
+Only this module and the commands print or exit. Exit codes: 0 good; 1 input or run error, or a failed check; 2 usage or
+configuration; 3 finished, but data was lost; 130 interrupted. Whatever a command needs is imported when it runs, so
+that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import click
 
 from octoreplay import __version__
-from octoreplay.commands import logs, results, running
+from octoreplay.commands import logs, results, running, verdicts
 from octoreplay.commands.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.errors import ConfigError, OctoreplayError
 
@@ -25,14 +25,14 @@ from octoreplay.errors import ConfigError, OctoreplayError
 def cli() -> None:
     """Replay the logs of a robot team into semantic octree maps that the team agrees on.
 
-    Start with "octoreplay demo". Exit codes: 0 good; 1 input or run error; 2 usage or configuration; 3 finished, but
-    data was lost; 130 interrupted.
+    Start with "octoreplay demo". Exit codes: 0 good; 1 input or run error, or a failed check; 2 usage or configuration;
+    3 finished, but data was lost; 130 interrupted.
     """
 
 
 for _command in (
     running.run, running.simulate, running.demo, logs.info, logs.init, logs.import_rgbd, logs.import_clouds,
-    results.metrics, results.export, results.query,
+    results.metrics, results.export, results.query, verdicts.check, verdicts.compare,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -1,0 +1,182 @@
+"""``octoreplay check`` and ``octoreplay compare`` as processes, on runs of the small recorded teams."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from octoreplay.evaluate.checks import CheckRow
+from octoreplay.io.robots.discover import resolve
+from octoreplay.replay.session import replay_team
+from octoreplay.report import verdict_tables
+from octoreplay.team_file import load_team_file
+from result_factory import tick_metrics, write_until
+
+FIXTURES = Path(__file__).parent / "fixtures"
+
+
+def octoreplay(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a process, 100 columns wide."""
+    return subprocess.run(
+        [sys.executable, "-m", "octoreplay", *map(str, arguments)], text=True, capture_output=True,
+        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
+    )  # fmt: skip
+
+
+def ends(code: int, *arguments: object) -> str:
+    """What a command says that ends with this code and without a traceback."""
+    done = octoreplay(*arguments)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr if code == 2 or not done.stdout else done.stdout
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two robots, once more, with a smaller step, with other cells, and three robots."""
+    folder = tmp_path_factory.mktemp("runs")
+    chosen = {
+        "pair": ("pair", {}), "again": ("pair", {}), "slower": ("pair", {"epsilon": 0.1, "settle": 0}),
+        "near": ("pair", {"gamma": 0.49}), "finer": ("pair", {"resolution": 0.4}), "trio": ("trio", {}),
+    }  # fmt: skip
+    paths = {}
+    for name, (team, parameters) in chosen.items():
+        paths[name] = folder / f"{name}.mcap"
+        config = load_team_file(FIXTURES / team / "team.yaml").with_parameters(parameters)
+        replay_team(resolve(config), paths[name])
+    return paths
+
+
+# --- compare ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_is_the_same_as_itself_and_as_its_repetition(runs: dict[str, Path]) -> None:
+    for other in ("pair", "again"):
+        text = ends(0, "compare", runs["pair"], runs[other])
+        assert text.endswith("\nthe same: 3 maps, every cell\n")
+        assert "logs: the same" in text
+        assert "Settings that differ" not in text
+        assert "Where they differ" not in text
+
+
+def test_another_parameter_gives_other_maps_and_is_named(runs: dict[str, Path], tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    text = ends(1, "compare", runs["pair"], runs["slower"], "--json", report)
+    assert "\ndifferent: 2 of 3 maps, in up to " in text
+    content = json.loads(report.read_text(encoding="utf-8"))
+    assert {(one["name"], one["value_b"]) for one in content["settings"]} == {("epsilon", 0.1), ("settle", 0)}
+    assert [one["robot_id"] for one in content["maps"]] == ["husky_1", "husky_2", "central"]
+    assert content["maps"][0]["num_differing"] > 0
+    assert content["maps"][2]["num_differing"] == 0
+    assert "the same: 1 map," in ends(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
+
+
+def test_a_tolerance_makes_near_maps_the_same(runs: dict[str, Path]) -> None:
+    assert ends(1, "compare", runs["pair"], runs["near"]).splitlines()[-1].startswith("different: 2 of 3 maps")
+    text = ends(0, "compare", runs["pair"], runs["near"], "--tolerance", 0.5)
+    assert text.splitlines()[-1].startswith("the same within 0.5: 3 maps, every cell")
+
+
+def test_a_larger_team_has_a_map_that_the_smaller_lacks(runs: dict[str, Path]) -> None:
+    text = ends(1, "compare", runs["pair"], runs["trio"])
+    assert "logs: different" in text
+    assert text.endswith("; only B has a map of husky_3\n")
+
+
+def test_early_maps_can_be_compared(runs: dict[str, Path]) -> None:
+    assert "the same" in ends(0, "compare", runs["pair"], runs["again"], "--at", 1.5)
+
+
+def test_results_that_cannot_be_compared_are_one_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
+    text = ends(1, "compare", runs["pair"], runs["finer"])
+    assert text.count("\n") == 1
+    assert "finer.mcap: has the resolution 0.4 m" in text
+    text = ends(1, "compare", runs["pair"], FIXTURES / "pair" / "husky_1.mcap")
+    assert text.count("\n") == 1
+    assert "no result of octoreplay" in text
+    assert "cannot be read" in ends(1, "compare", runs["pair"], tmp_path / "none.mcap")
+    assert "no map of robot 'nobody'" in ends(1, "compare", runs["pair"], runs["again"], "--robot", "nobody")
+
+
+def test_wrong_usage_of_compare(runs: dict[str, Path], tmp_path: Path) -> None:
+    assert "Missing argument 'B.mcap'" in ends(2, "compare", runs["pair"])
+    assert "tolerance: -1 is not" in ends(2, "compare", runs["pair"], runs["again"], "--tolerance", -1)
+    assert "must end in .json" in ends(2, "compare", runs["pair"], runs["again"], "--json", tmp_path / "a.txt")
+
+
+# --- check ------------------------------------------------------------------------------------------------------------
+
+EASY = ("--max-label-disagreement", 0.001, "--min-agreement", 0.5, "--max-packet-bytes", 10**9, "--settled")
+
+
+def test_limits_that_hold(runs: dict[str, Path]) -> None:
+    text = ends(0, "check", runs["pair"], *EASY)
+    assert text.endswith("\npassed: all 4 checks\n")
+    assert "FAILED" not in text
+    assert ends(0, "check", runs["pair"], "--min-num-leaves", 1).endswith("\npassed: 1 check\n")
+
+
+def test_a_limit_that_fails_is_named_first(runs: dict[str, Path], tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    text = ends(1, "check", runs["pair"], *EASY, "--max-packet-bytes", 1000, "--json", report)
+    assert text.splitlines()[2].startswith("FAILED  max packet bytes")
+    assert text.endswith("\nfailed: 1 of 4 checks: max packet bytes\n")
+    content = json.loads(report.read_text(encoding="utf-8"))
+    assert content["result"] == str(runs["pair"])
+    assert content["passed"] is False
+    first = content["rows"][0]
+    assert (first["name"], first["limit"], first["passed"]) == ("max_packet_bytes", 1000.0, False)
+    assert first["measured"] > 1000
+    assert first["robot"] in ("husky_1", "husky_2")
+
+
+def test_a_run_that_did_not_settle(runs: dict[str, Path]) -> None:
+    text = ends(1, "check", runs["slower"], "--settled")
+    assert "stopped: " in text
+    assert text.endswith("\nfailed: 1 of 1 check: settled\n")
+
+
+def test_an_interrupted_run_fails(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        write_until(KeyboardInterrupt, tmp_path / "cut.mcap", [tick_metrics(1), tick_metrics(2)])
+    text = ends(1, "check", tmp_path / "cut.partial.mcap", "--min-agreement", 0.1)
+    assert "the run was interrupted" in text
+    assert text.endswith("\nfailed: 1 of 2 checks: complete\n")
+
+
+def test_wrong_usage_of_check(runs: dict[str, Path], tmp_path: Path) -> None:
+    assert "no limit is given; give at least one, such as --max-label-disagreement 0.001" in ends(
+        2, "check", runs["pair"]
+    )
+    assert "No such option '--max-fun'" in ends(2, "check", runs["pair"], "--max-fun", 1)
+    assert "is more than 1; it is a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
+    assert "needs the true world; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
+    assert "must end in .json" in ends(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
+
+
+def test_what_is_no_result_fails_with_one_sentence(tmp_path: Path) -> None:
+    text = ends(1, "check", FIXTURES / "pair" / "team.yaml", "--min-agreement", 0.5)
+    assert text.count("\n") == 1
+    assert "team.yaml: not a finished MCAP file" in text
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (1234567.0, "1,234,567"), (0.99899, "0.99899"), (float("nan"), "-"), (float("inf"), "inf"),
+     (1.5e-7, "1.5e-07"), (1e20, "1e+20")],
+)  # fmt: skip
+def test_numbers_are_for_comparing(value: float, text: str) -> None:
+    assert verdict_tables.number(value) == text
+
+
+def test_values_that_differ_a_little_look_different() -> None:
+    row = CheckRow("min_agreement", 0.999, 0.9989999999, "alpha", None, None, passed=False)
+    assert verdict_tables._values(row) == ("at least 0.999", "0.9989999999")
