@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import click
 import pytest
 
 from octoreplay import cli
@@ -40,7 +41,9 @@ def test_every_command_and_option_is_explained() -> None:
         section = text.split(f"## octoreplay {name}")[1].split("\n## ")[0]
         if name == "run":
             continue
-        for parameter in command.params:
+        parts = command.commands if isinstance(command, click.Group) else {}
+        assert all(f"octoreplay {name} {part}" in section for part in parts)
+        for parameter in (*command.params, *(option for part in parts.values() for option in part.params)):
             if parameter.name not in ("output", "result", "folder", "logs"):
                 assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
 

@@ -49,3 +49,9 @@ def test_records_become_json_without_numbers_that_json_lacks() -> None:
     }
     assert "é" in text
     assert text.endswith("}\n")
+
+
+def test_bytes_are_written_as_they_are(tmp_path: Path) -> None:
+    write_whole(tmp_path / "a.png", b"\x89PNG\r\n\xff")
+    assert (tmp_path / "a.png").read_bytes() == b"\x89PNG\r\n\xff"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]

@@ -68,7 +68,7 @@ def test_figures_show_the_numbers() -> None:
 def test_a_robot_that_publishes_nothing_does_not_count() -> None:
     silent = dataclasses.replace(METRICS[0].robots[0], packet_bytes=0, octree_bytes=0, grid_bytes=0)
     tick = dataclasses.replace(METRICS[0], robots=(silent, METRICS[0].robots[1]))
-    mean, deviation = plots._over_robots([tick], "grid_bytes")
+    mean, deviation = plots.over_robots([tick], "grid_bytes")
     assert mean.tolist() == [METRICS[0].robots[1].grid_bytes]
     assert deviation.tolist() == [0.0]
 

@@ -1,4 +1,4 @@
-"""Text files that appear when they are whole: any text, and records as JSON."""
+"""Files that appear when they are whole: any text or picture, and records as JSON."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 from octoreplay.errors import OutputError
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file beside its own name and rename it when it is complete. Raises OutputError."""
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file, text in UTF-8, beside its own name and rename it when it is complete. Raises OutputError."""
     partial = path.with_name(f"{path.name}.partial")
     try:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
         partial.replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from octoreplay.errors import OutputError
+from octoreplay.io.text_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +41,18 @@ def style(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> 
     return axes
 
 
+def over_log_time(title: str, y_labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """A figure and its axes over log time, one below the other, the first the highest."""
+    figure = new_figure(height=1.8 * (len(y_labels) + 1))
+    ratios = [2] + [1] * (len(y_labels) - 1)
+    stack = figure.subplots(len(y_labels), sharex=True, squeeze=False, height_ratios=ratios)[:, 0].tolist()
+    for axes, y_label in zip(stack, y_labels, strict=True):
+        style(axes, y_label=y_label)
+    stack[0].set_title(title, loc="left", fontsize=11)
+    stack[-1].set_xlabel("log time [s]")
+    return figure, stack
+
+
 def legend_below(figure: Figure, axes: Axes | None = None, columns: int = 4) -> None:
     """A legend under the figure, of these axes' entries or of all."""
     handles: dict[str, Any] = {"handles": axes.get_legend_handles_labels()[0]} if axes is not None else {}
@@ -59,9 +73,11 @@ def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     """Write figures by their file names into a folder, made if need be; the files written. Raises OutputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in figures.items():
-            # Software would name matplotlib's version: left out, so that equal results give equal files.
-            figure.savefig(folder / name, metadata={"Software": None})
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    for name, figure in figures.items():
+        picture = io.BytesIO()
+        # Software would name matplotlib's version: left out, so that equal results give equal files.
+        figure.savefig(picture, metadata={"Software": None})
+        write_whole(folder / name, picture.getvalue())
     return [folder / name for name in figures]

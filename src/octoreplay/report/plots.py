@@ -20,9 +20,8 @@ from octoreplay.report.figures import (
     ORANGE,
     label_in_bytes,
     legend_below,
-    new_figure,
+    over_log_time,
     save_figures,
-    style,
 )
 
 if TYPE_CHECKING:
@@ -96,14 +95,8 @@ def _cell(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
 
 
-def _over_time(title: str, y_label: str) -> tuple[Figure, Axes]:
-    """An empty figure over log time, and its axes."""
-    figure = new_figure()
-    return figure, style(figure.add_subplot(), title, "log time [s]", y_label)
-
-
-def _times(metrics: Sequence[TickMetrics]) -> Any:
-    """Seconds since the first tick."""
+def log_seconds(metrics: Sequence[TickMetrics]) -> Any:
+    """Seconds since the first tick, for each tick."""
     return np.array([tick.stamp_ns - metrics[0].stamp_ns for tick in metrics]) / 1e9
 
 
@@ -117,8 +110,8 @@ def _mark_settling(axes: Axes, metrics: Sequence[TickMetrics], times: Any) -> No
 
 def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
     """Phi over time, on a logarithmic axis."""
-    figure, axes = _over_time("Disagreement of the team", "\u03a6")
-    times = _times(metrics)
+    figure, [axes] = over_log_time("Disagreement of the team", ["\u03a6"])
+    times = log_seconds(metrics)
     links = np.array([tick.total_distance for tick in metrics])
     pairs = np.array([tick.total_distance_all for tick in metrics])
     axes.plot(times, np.where(links > 0, links, np.nan), color=BLUE, linewidth=1.6, label="\u03a6 over the links")
@@ -138,15 +131,15 @@ def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
 
 def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
     """Bytes of a published map: as sent, as octree and as uniform grid; mean and standard deviation over robots."""
-    figure, axes = _over_time("Size of a published map (mean and standard deviation over robots)", "bytes")
-    times = _times(metrics)
+    figure, [axes] = over_log_time("Size of a published map (mean and standard deviation over robots)", ["bytes"])
+    times = log_seconds(metrics)
     least = np.inf
     for name, label, color in (
         ("grid_bytes", "uniform grid", ORANGE),
         ("octree_bytes", "octree", BLUE),
         ("packet_bytes", "octree, as sent", GREEN),
     ):
-        mean, deviation = _over_robots(metrics, name)
+        mean, deviation = over_robots(metrics, name)
         axes.plot(times, mean, color=color, linewidth=1.6, label=label)
         axes.fill_between(times, np.maximum(mean - deviation, 1), mean + deviation, color=color, alpha=0.2, linewidth=0)
         least = min([least, *mean[mean > 0]])
@@ -160,7 +153,7 @@ def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
     return figure
 
 
-def _over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
+def over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
     """Mean and standard deviation over the robots that published in a tick; NaN where none did."""
     means, deviations = [], []
     for tick in metrics:

@@ -1,0 +1,126 @@
+"""Experiments that one command repeats: octoreplay experiment paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from octoreplay.commands.options import existing_path
+from octoreplay.commands.progress import progress_bar
+from octoreplay.config import RunConfig
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from octoreplay.replay.session import Progress
+    from octoreplay.simulate.team import SimulationConfig
+    from octoreplay.study.paper import PaperNumbers
+
+
+@click.group(short_help="Repeat the experiments of the documentation.")
+def experiment() -> None:
+    """Repeat an experiment: simulate, replay, and write its figures and numbers.
+
+    What a folder holds already is used again where it is complete and of the same settings.
+    """
+
+
+@experiment.command(short_help="The paper's experiment: six robots explore a village for 300 s.")
+@click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-paper"), required=False)
+@click.option("--duration", type=float, default=300.0, show_default=True, help="length of the logs, 6 s or more [s]")
+@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
+@click.option("--seed", type=int, default=0, show_default=True, help="another seed, another village")
+def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
+    """Do the paper's experiment into DIR (octoreplay-paper): figures of disagreement, packets and maps, and numbers.
+
+    Takes about three minutes. What DIR holds already is used again where it is complete and of the same settings.
+    """
+    from octoreplay.report import tables
+    from octoreplay.study import paper as study
+
+    simulation = study.paper_team(robots, duration, seed)
+    team_file = team_with_bar(folder / study.TEAM, simulation)
+    result_with_bar(study.paper_config(team_file, simulation), folder / study.RESULT)
+    click.echo("drawing", err=True)
+    numbers = study.write_paper(folder, simulation)
+    out = tables.terminal()
+    tables.show(out, _paper_table(numbers))
+    peak = tables.number(numbers.peak_total_distance)
+    out.print(
+        f"\u03a6 is largest at {numbers.peak_seconds:.0f} s, {peak}; uniform grid / octree is {numbers.mean_ratio:.2f}"
+        f" in the mean over time, {numbers.least_ratio:.2f} at least\n",
+        soft_wrap=True,
+    )
+    tables.show(
+        out,
+        tables.made_files(
+            {
+                folder
+                / study.FIGURES
+                / "maps.png": "the maps, cells as transparent as robots deviate, and the village",
+                folder / study.FIGURES / "total_distance.png": "\u03a6 over time",
+                folder / study.FIGURES / "agreement.png": "agreement and different labels over time",
+                folder
+                / study.FIGURES
+                / "packet_size.png": "bytes of a map as octree and as uniform grid, and the ratio",
+                folder / study.NUMBERS: "the numbers of this table and more",
+                folder / study.RESULT: "the result, for 'octoreplay metrics', 'export' and 'query'",
+                folder / study.TEAM: "what the robots recorded, and the village they drove through",
+            }
+        ),
+    )
+    return 0
+
+
+def team_with_bar(folder: Path, simulation: SimulationConfig) -> Path:
+    """A simulated team with a progress bar, and a sentence that says whether it was there; the team file."""
+    from octoreplay.study.teams import is_simulated, simulated_team
+
+    is_there = is_simulated(folder, simulation)
+    with progress_bar("simulate") as update:
+        team_file = simulated_team(folder, simulation, lambda share: update(share, None, ""))
+    click.echo(f"used the team in {folder} again" if is_there else f"simulated the team in {folder}", err=True)
+    return team_file
+
+
+def result_with_bar(config: RunConfig, output: Path) -> Path:
+    """A team's result with a progress bar, and a sentence that says whether it was there; the result."""
+    from octoreplay.study.teams import is_replayed, replayed_team
+
+    is_there = is_replayed(config, output)
+    with progress_bar("replay") as update:
+
+        def show(progress: Progress) -> None:
+            elapsed = progress.log_ns / 1e9
+            done = None if not progress.total_ns else min(1.0, progress.log_ns / progress.total_ns)
+            update(done, elapsed, f"{elapsed:.1f} s  \u03a6 {progress.total_distance:.3g}")
+
+        replayed_team(config, output, show)
+    click.echo(f"used {output} again" if is_there else f"wrote {output}", err=True)
+    return output
+
+
+def _paper_table(numbers: PaperNumbers) -> Table:
+    """The experiment's numbers at its two moments."""
+    from octoreplay.report.tables import number, share, size, styled_table
+
+    table = styled_table("The paper's experiment")
+    table.add_column("")
+    for moment in numbers.moments:
+        table.add_column(f"{moment.seconds:.0f} s", justify="right")
+    rows = {
+        "total distance \u03a6": [number(m.total_distance) for m in numbers.moments],
+        "\u03a6 per pair / squared norm of a map": [share(m.relative_distance) for m in numbers.moments],
+        "known cells": [f"{m.num_known_cells:,}" for m in numbers.moments],
+        "cells with different labels": [share(m.label_disagreement) for m in numbers.moments],
+        "agreement, worst robot, all cells": [share(m.agreement) for m in numbers.moments],
+        "agreement, worst robot, occupied cells": [share(m.agreement_occupied) for m in numbers.moments],
+        "map as uniform grid": [size(m.grid_bytes) for m in numbers.moments],
+        "map as octree": [size(m.octree_bytes) for m in numbers.moments],
+        "uniform grid / octree": [f"{m.ratio:.2f}" for m in numbers.moments],
+    }
+    for name, values in rows.items():
+        table.add_row(name, *values)
+    return table

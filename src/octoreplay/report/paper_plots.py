@@ -1,0 +1,158 @@
+"""The figures of the paper's experiment: disagreement, agreement, packet sizes, and maps beside the true village."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from octoreplay.records import ClassTable, Color, TickMetrics, UInt8Array
+from octoreplay.report.figures import BLUE, GREEN, GREY, ORANGE, over_log_time
+from octoreplay.report.map_view import BACKGROUND, opacities
+from octoreplay.report.plots import log_seconds, over_robots
+
+PAPER_RATIO = 4.0
+"""The paper's saving by octrees, 'more than four times'."""
+
+_INK = "#333333"
+_COLOR_STEP = 4
+_LEGEND_HEIGHT = 0.9
+"""Inches below the pictures."""
+
+
+def distance_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
+    """Phi over time, logarithmic, with the moments [s] at which maps are shown."""
+    figure, [axes] = over_log_time("Total distance in local map estimates", ["\u03a6"])
+    values = np.array([tick.total_distance for tick in metrics])
+    axes.plot(log_seconds(metrics), np.where(values > 0, values, np.nan), color=BLUE, linewidth=1.6)
+    if (values > 0).any():
+        axes.set_yscale("log")
+    _mark(axes, moments)
+    return figure
+
+
+def agreement_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
+    """Shares over time: agreement with the oracle of the worst robot, and cells that robots label differently."""
+    figure, [upper, lower] = over_log_time(
+        "How far the team agrees", ["agreement with the oracle,\nworst robot", "cells with\ndifferent labels"]
+    )
+    times = log_seconds(metrics)
+    for name, label, color in (
+        ("agreement", "all cells", BLUE),
+        ("agreement_occupied", "occupied cells", ORANGE),
+    ):
+        values = [min((getattr(robot, name) for robot in tick.robots if robot.active), default=np.nan)
+                  for tick in metrics]  # fmt: skip
+        upper.plot(times, values, color=color, linewidth=1.6, label=label)
+    upper.legend(frameon=False, fontsize=9, loc="lower right")
+    lower.plot(times, [tick.label_disagreement for tick in metrics], color=GREEN, linewidth=1.6)
+    for axes in (upper, lower):
+        axes.yaxis.set_major_formatter("{x:.0%}")
+        axes.set_ylim(0.0, 1.02)
+        _mark(axes, moments)
+    return figure
+
+
+def packet_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
+    """Bytes of a published map as uniform grid and as octree, mean and deviation over robots, and their ratio."""
+    from matplotlib.ticker import EngFormatter
+
+    figure, [upper, lower] = over_log_time(
+        "Size of a published map, mean and standard deviation over robots", ["bytes", "uniform grid /\noctree"]
+    )
+    times = log_seconds(metrics)
+    means = {}
+    for name, label, color in (("grid_bytes", "uniform grid", ORANGE), ("octree_bytes", "octree", BLUE)):
+        mean, deviation = over_robots(metrics, name)
+        upper.plot(times, mean, color=color, linewidth=1.6, label=label)
+        upper.fill_between(times, mean - deviation, mean + deviation, color=color, alpha=0.25, linewidth=0)
+        means[name] = mean
+    upper.set_ylim(bottom=0.0)
+    upper.yaxis.set_major_formatter(EngFormatter(unit="B"))
+    upper.legend(frameon=False, fontsize=9, loc="upper left")
+    lower.plot(times, means["grid_bytes"] / means["octree_bytes"], color=BLUE, linewidth=1.6)
+    lower.axhline(PAPER_RATIO, color=GREY, linewidth=1.2, linestyle="--")
+    lower.annotate(
+        "the paper: more than four", (1.0, PAPER_RATIO), (0, 3), xycoords=("axes fraction", "data"),
+        textcoords="offset points", ha="right", fontsize=9, color=_INK,
+    )  # fmt: skip
+    lower.set_ylim(bottom=0.0)
+    for axes in (upper, lower):
+        _mark(axes, moments)
+    return figure
+
+
+def maps_picture(pictures: Mapping[str, UInt8Array], classes: ClassTable, largest: float) -> bytes:
+    """Three pictures (height, width, 3) with their titles, as PNG: the first large, two beside it, a legend below.
+
+    ``largest`` is the deviation at which opacity would be 0.
+    """
+    from PIL import Image
+
+    drawn = np.asarray(_maps_figure(pictures, classes, largest).canvas.buffer_rgba())[..., :3]
+    # Steps that no eye sees take a third off the file.
+    coarse = np.minimum(np.rint(drawn / _COLOR_STEP) * _COLOR_STEP, 255).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(coarse).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def _maps_figure(pictures: Mapping[str, UInt8Array], classes: ClassTable, largest: float) -> Any:
+    """The figure of ``maps_picture``, drawn."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    height, width = next(iter(pictures.values())).shape[:2]
+    panel = 8.0 * height / width
+    figure: Any = Figure(figsize=(12.0, panel + _LEGEND_HEIGHT), dpi=100)
+    FigureCanvasAgg(figure)
+    figure.set_facecolor(_unit(BACKGROUND))
+    bottom, half = _LEGEND_HEIGHT / (panel + _LEGEND_HEIGHT), panel / 2 / (panel + _LEGEND_HEIGHT)
+    places = ((0.0, bottom, 2 / 3, 2 * half), (2 / 3, bottom + half, 1 / 3, half), (2 / 3, bottom, 1 / 3, half))
+    for place, (title, picture) in zip(places, pictures.items(), strict=True):
+        axes = figure.add_axes(place)
+        axes.imshow(picture, interpolation="antialiased")
+        axes.set_axis_off()
+        axes.text(0.02, 0.97, title, transform=axes.transAxes, va="top", fontsize=14, color=_INK)
+    _explain_classes(figure.add_axes((0.02, 0.0, 0.62, bottom)), classes)
+    _explain_opacity(figure.add_axes((0.68, 0.36 * bottom, 0.27, 0.24 * bottom)), classes, largest)
+    figure.canvas.draw()
+    return figure
+
+
+def _explain_classes(axes: Any, classes: ClassTable) -> None:
+    """The classes' colours."""
+    from matplotlib.patches import Patch
+
+    axes.set_axis_off()
+    patches = [Patch(facecolor=_unit(entry.color), label=entry.name.replace("_", " ")) for entry in classes.classes]
+    axes.legend(
+        handles=patches, frameon=False, fontsize=12, labelcolor=_INK, loc="center left", ncols=4, columnspacing=2.0,
+        handlelength=1.4,
+    )  # fmt: skip
+
+
+def _explain_opacity(axes: Any, classes: ClassTable, largest: float) -> None:
+    """The scale of transparency, on the first class."""
+    shares = opacities(np.linspace(0.0, largest, 200), largest)[None, :, None]
+    colors = shares * np.array(_unit(classes.classes[0].color)) + (1.0 - shares) * np.array(_unit(BACKGROUND))
+    axes.imshow(colors, aspect="auto", extent=(0.0, 1.0, 0.0, 1.0))
+    axes.set_xticks([0.0, 1.0], ["0", f"{largest:.2g}"], fontsize=11, color=_INK)
+    axes.set_yticks([])
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_title(r"deviation: the largest $\|h_i - h_j\|$ of two robots", fontsize=11, color=_INK)
+
+
+def _unit(color: Color) -> tuple[float, float, float]:
+    """A colour as matplotlib wants it."""
+    red, green, blue = (value / 255.0 for value in color)
+    return red, green, blue
+
+
+def _mark(axes: Any, moments: Sequence[float]) -> None:
+    """Thin lines at some moments."""
+    for moment in moments:
+        axes.axvline(moment, color=GREY, linewidth=0.8, linestyle=":")

@@ -1,0 +1,212 @@
+"""The paper's experiment: six robots explore a village, agree by Alg. 1 on every arriving map, and are looked at.
+
+::
+
+    numbers = run_paper(Path("octoreplay-paper"), paper_team())
+    print(numbers.mean_ratio)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from octoreplay import __version__
+from octoreplay.config import RunConfig
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.records import TickMetrics, UInt8Array
+from octoreplay.replay.session import Progress
+from octoreplay.report import map_view, paper_plots, plots
+from octoreplay.report.figures import save_figures
+from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.settings import with_options
+from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.world import World, make_village
+from octoreplay.study.teams import replayed_team, simulated_team
+from octoreplay.team_file import load_team_file
+
+TEAM, RESULT, FIGURES, NUMBERS = "team", "paper.mcap", "figures", "numbers.json"
+"""What the experiment's folder holds."""
+
+PRESET = "paper"
+LEAST_DURATION = 6.0
+"""Seconds: before, no map has been exchanged by a third of the run."""
+
+_AZIMUTH, _ELEVATION = math.radians(74.0), math.radians(42.0)
+_WIDTH, _HEIGHT = 1600, 1000
+_PERCENTILE = 99.0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The team at one time, ``seconds`` after the run's start.
+
+    ``total_distance`` is the paper's Phi. ``relative_distance`` is Phi per pair of robots over the mean of their maps'
+    squared norms, how far maps are apart in terms of what they say. Bytes are means and standard deviations over the
+    robots that published; ``ratio`` is the mean grid over the mean octree. Agreement is the worst active robot's. The
+    deviation of an occupied cell is the largest ||h_i - h_j|| of two robots; ``median_deviation`` is over
+    ``num_occupied_cells``, those of the maps laid over each other.
+    """
+
+    seconds: float
+    total_distance: float
+    relative_distance: float
+    num_known_cells: int
+    num_occupied_cells: int
+    median_deviation: float
+    label_disagreement: float
+    agreement: float
+    agreement_occupied: float
+    octree_bytes: float
+    octree_bytes_std: float
+    grid_bytes: float
+    grid_bytes_std: float
+    unpruned_bytes: float
+    packet_bytes: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class PaperNumbers:
+    """What the experiment came to.
+
+    ``peak_total_distance`` is the largest Phi of any tick, ``peak_seconds`` after the run's start. ``mean_ratio`` is
+    the mean over ticks of the size of a map as uniform grid over that as octree, each the mean over robots;
+    ``least_ratio`` the least of any tick. ``transparent_deviation`` is the one that would make a cell invisible.
+    """
+
+    version: str
+    simulation: SimulationConfig
+    preset: str
+    peak_total_distance: float
+    peak_seconds: float
+    mean_ratio: float
+    least_ratio: float
+    transparent_deviation: float
+    moments: tuple[Moment, ...]
+
+
+def paper_team(num_robots: int = 6, duration: float = 300.0, seed: int = 0) -> SimulationConfig:
+    """The team of the experiment. Raises ConfigError for a value out of range."""
+    if duration < LEAST_DURATION:
+        raise ConfigError(f"duration: {duration:g} s is too short for the experiment; give {LEAST_DURATION:g} or more")
+    return SimulationConfig(num_robots=num_robots, duration=duration, seed=seed)
+
+
+def paper_config(team_file: Path, simulation: SimulationConfig) -> RunConfig:
+    """How the team is replayed: preset 'paper', with maps stored after each third of the run, a whole second."""
+    third = float(simulation.duration // 3)
+    return with_options(load_team_file(team_file), PRESET, None, {"state_every": third, "view_every": third})
+
+
+def run_paper(
+    folder: Path, simulation: SimulationConfig, simulated: Callable[[float], None] | None = None,
+    replayed: Callable[[Progress], None] | None = None,
+) -> PaperNumbers:  # fmt: skip
+    """Do the experiment into a folder: the team, its result, figures and numbers; what is complete is used again.
+
+    ``simulated`` and ``replayed`` are told how far the two long steps are. Raises as ``simulated_team``,
+    ``replayed_team`` and ``write_paper``.
+    """
+    team_file = simulated_team(folder / TEAM, simulation, simulated)
+    replayed_team(paper_config(team_file, simulation), folder / RESULT, replayed)
+    return write_paper(folder, simulation)
+
+
+def write_paper(folder: Path, simulation: SimulationConfig) -> PaperNumbers:
+    """Write the figures and numbers of the result in a folder.
+
+    Raises OutputError where that cannot be, InputError for a damaged result or one in which nothing was mapped.
+    """
+    with open_result(folder / RESULT) as result:
+        ticks = _shown_ticks(result)
+        seconds = [result.seconds(tick.stamp_ns) for tick in ticks]
+        maps = [[result.map(robot_id, at_ns=tick.stamp_ns) for robot_id in result.robots] for tick in ticks]
+        overlays = [map_view.overlay(together) for together in maps]
+        largest = transparent_deviation(overlays)
+        moments = tuple(map(_moment, seconds, ticks, overlays, map(relative_distance, ticks, maps)))
+        numbers = _numbers(result, simulation, moments, largest)
+        village = make_village(simulation.world_size, simulation.seed)
+        pictures = _pictures(result, seconds, overlays, largest, village)
+        figures = {
+            "total_distance.png": paper_plots.distance_figure(result.metrics, seconds),
+            "agreement.png": paper_plots.agreement_figure(result.metrics, seconds),
+            "packet_size.png": paper_plots.packet_figure(result.metrics, seconds),
+        }
+        picture = paper_plots.maps_picture(pictures, result.class_table, largest)
+    save_figures(figures, folder / FIGURES)
+    write_whole(folder / FIGURES / "maps.png", picture)
+    write_whole(folder / NUMBERS, json_text(numbers))
+    return numbers
+
+
+def transparent_deviation(overlays: Sequence[map_view.Overlay]) -> float:
+    """The deviation at which opacity would be 0: that of 99 % of the first overlay is below it.
+
+    One scale for all overlays. Raises InputError where the first overlay has no cell.
+    """
+    if not len(overlays[0].labels):
+        raise InputError("the robots' maps hold no occupied cell; give a longer duration")
+    return float(np.percentile(overlays[0].deviations, _PERCENTILE))
+
+
+def relative_distance(tick: TickMetrics, maps: Sequence[StoredMap]) -> float:
+    """Phi of all pairs of robots, per pair, over the mean of the maps' sums over cells of ||h - h_0||^2."""
+    spans = [stored.octree.spans() for stored in maps]
+    norms = [float(span.num_cells @ np.square(span.deviations, dtype=np.float64).sum(axis=1)) for span in spans]
+    num_pairs = len(maps) * (len(maps) - 1) / 2
+    return tick.total_distance_all / num_pairs / float(np.mean(norms)) if num_pairs and any(norms) else 0.0
+
+
+def _shown_ticks(result: Result) -> list[TickMetrics]:
+    """The ticks whose maps are shown: a third of the run, as the paper's 100 s of 300 s, and its end."""
+    stored = result.stored_ticks(result.robots[0])
+    third = max(tick for tick in stored if 3 * tick <= stored[-1])
+    return [tick for tick in result.metrics if tick.tick in (third, stored[-1])]
+
+
+def _numbers(result: Result, simulation: SimulationConfig, moments: tuple[Moment, ...], largest: float) -> PaperNumbers:
+    """The numbers of a result."""
+    peak = max(result.metrics, key=lambda tick: tick.total_distance)
+    octree, grid = (plots.over_robots(result.metrics, name)[0] for name in ("octree_bytes", "grid_bytes"))
+    ratios = (grid / octree)[np.isfinite(grid)]
+    return PaperNumbers(
+        __version__, simulation, PRESET, peak.total_distance, result.seconds(peak.stamp_ns), float(ratios.mean()),
+        float(ratios.min()), largest, moments,
+    )  # fmt: skip
+
+
+def _moment(seconds: float, tick: TickMetrics, shown: map_view.Overlay, relative: float) -> Moment:
+    """The numbers of one tick and of the maps shown at it."""
+    names = ("octree_bytes", "grid_bytes", "unpruned_bytes", "packet_bytes")
+    (octree, octree_std), (grid, grid_std), (unpruned, _), (packet, _) = (
+        (float(mean[0]), float(std[0])) for mean, std in (plots.over_robots([tick], name) for name in names)
+    )
+    active = [robot for robot in tick.robots if robot.active]
+    return Moment(
+        seconds, tick.total_distance, relative, tick.num_known_cells, len(shown.labels),
+        float(np.median(shown.deviations)), tick.label_disagreement, min(robot.agreement for robot in active),
+        min(robot.agreement_occupied for robot in active), octree, octree_std, grid, grid_std, unpruned, packet,
+        grid / octree,
+    )  # fmt: skip
+
+
+def _pictures(
+    result: Result, seconds: Sequence[float], overlays: Sequence[map_view.Overlay], largest: float, village: World
+) -> dict[str, UInt8Array]:
+    """The last map, the earlier one and the true village by their titles, all from one side."""
+    colors = result.class_table.colors
+    view = map_view.view_of(village.vertices, _AZIMUTH, _ELEVATION, _WIDTH, _HEIGHT)
+    pictures = {}
+    for at, shown in sorted(zip(seconds, overlays, strict=True), key=lambda pair: -pair[0]):
+        solidity = map_view.opacities(shown.deviations, largest)
+        cubes = map_view.cube_faces(shown.centers, shown.resolution, colors[shown.labels - 1], solidity)
+        pictures[f"{at:.0f} s"] = map_view.draw(cubes, view)
+    corners = village.vertices[village.triangles].astype(np.float64)
+    pictures["The village"] = map_view.draw(map_view.mesh_faces(corners, colors[village.triangle_classes - 1]), view)
+    return pictures

@@ -1,0 +1,133 @@
+"""Simulated teams and results of them in folders: made once, and used again when they are complete and the same."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from octoreplay import __version__
+from octoreplay.config import RunConfig
+from octoreplay.errors import OutputError
+from octoreplay.io.results.result_reader import ResultReader
+from octoreplay.io.results.result_writer import partial_path
+from octoreplay.io.robots.discover import resolve
+from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.replay.session import Progress, replay_team
+from octoreplay.simulate.team import SimulationConfig, simulate_team
+
+SETTINGS_FILE = "simulation.json"
+"""Beside a team's logs: the version and the settings that made them, and how large every file is."""
+
+
+def simulated_team(folder: Path, config: SimulationConfig, progress: Callable[[float], None] | None = None) -> Path:
+    """Simulate a team into a folder, or use the team that is there; the team file.
+
+    A team is used again when it is complete and was made with the same settings by the same version. ``progress`` is
+    called with the share that is done, 0 to 1, and not at all for a team that is there. The folder appears when it is
+    complete. Raises OutputError where it holds something else or cannot be written, InputError where Open3D cannot be
+    loaded.
+    """
+    if not is_simulated(folder, config):
+        with _in_place_of(folder) as work:
+            simulate_team(work, config, progress)
+            write_whole(work / SETTINGS_FILE, json_text(_content(work, config)))
+    return folder / "team.yaml"
+
+
+def is_simulated(folder: Path, config: SimulationConfig) -> bool:
+    """Whether a folder holds the team of these settings; False where there is nothing yet.
+
+    Raises OutputError where the folder holds anything else.
+    """
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return False
+        stored = json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))
+        present = _content(folder, config)
+    except (OSError, ValueError):
+        stored = None
+    if not isinstance(stored, dict) or set(stored) != set(present):
+        raise OutputError(f"{folder}: is there and holds no simulated team; give another folder, or remove this one")
+    for reason in _differences(stored, present):
+        raise OutputError(f"{folder}: {reason}; give another folder, or remove this one")
+    return True
+
+
+def replayed_team(config: RunConfig, output: Path, progress: Callable[[Progress], None] | None = None) -> Path:
+    """Replay a team into a result, or use the result that is there; the result.
+
+    A result is used again when it is complete, of the same configuration and version, and its logs have not changed
+    since. An interrupted replay leaves nothing behind. Raises OutputError where another result is there, and whatever
+    ``replay_team`` raises.
+    """
+    config = resolve(config)
+    if not is_replayed(config, output):
+        try:
+            replay_team(config, output, progress=progress)
+        except BaseException:
+            partial_path(output).unlink(missing_ok=True)
+            raise
+    return output
+
+
+def is_replayed(config: RunConfig, output: Path) -> bool:
+    """Whether a file is the result of this configuration; False where there is nothing yet.
+
+    Raises OutputError where it is the result of something else, InputError where it is no result.
+    """
+    if not output.exists():
+        return False
+    with ResultReader(output) as reader:
+        is_same = reader.is_complete and reader.description["version"] == __version__ and not reader.changed_inputs()
+        is_same = is_same and _absolute(reader.config) == _absolute(resolve(config))
+    if not is_same:
+        raise OutputError(
+            f"{output}: is there and was made from other logs, with other settings or by another version; give another"
+            " folder, or remove it"
+        )
+    return True
+
+
+@contextlib.contextmanager
+def _in_place_of(folder: Path) -> Iterator[Path]:
+    """A new folder beside a folder, which takes its place when all went well and is removed when not."""
+    work = folder.with_name(f".{folder.name}.partial")
+    try:
+        # What a killed process left.
+        shutil.rmtree(work, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        yield work
+        work.replace(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _content(folder: Path, config: SimulationConfig) -> dict[str, Any]:
+    """What the settings file of a team says."""
+    files = {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != SETTINGS_FILE}
+    settings = json.loads(json_text(config))
+    return {"version": __version__, "settings": settings, "files": files}
+
+
+def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> Iterator[str]:
+    """What keeps a stored team from being the wanted one."""
+    if stored["version"] != wanted["version"]:
+        yield f"was simulated by octoreplay {stored['version']}, this is {wanted['version']}"
+    for name, value in wanted["settings"].items():
+        if stored["settings"].get(name) != value:
+            yield f"holds a team with {name} {stored['settings'].get(name)}, not {value}"
+    for name, num_bytes in stored["files"].items():
+        if wanted["files"].get(name) != num_bytes:
+            yield f"'{name}' is missing or has changed since it was simulated"
+
+
+def _absolute(config: RunConfig) -> RunConfig:
+    """A configuration with paths that hold from everywhere."""
+    return dataclasses.replace(config, robots=tuple(robot.with_absolute_paths() for robot in config.robots))
