@@ -25,8 +25,10 @@ from octoreplay.team_file import load_team_file
 
 FIXTURES = Path(__file__).parent / "fixtures"
 PAIR = FIXTURES / "pair" / "team.yaml"
-COMMANDS = ("run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
-            "check", "compare")  # fmt: skip
+COMMANDS = (
+    "run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
+    "check", "compare", "sweep", "experiment",
+)  # fmt: skip
 
 
 def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -8,9 +8,11 @@ import click
 import pytest
 
 from octoreplay import cli
+from octoreplay.config import PARAMETERS
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
 from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
+from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -34,6 +36,13 @@ def test_every_message_and_field_of_the_result_is_explained() -> None:
     assert set(VIEW_DTYPE.names or ()) <= words
 
 
+def test_every_column_of_a_sweep_is_explained() -> None:
+    words = named("sweeps.md")
+    for name in (*RUN_COLUMNS, *TRUTH_COLUMNS, *TIMING_COLUMNS):
+        base = re.sub("_(log_end|mean)$", "", name)
+        assert name in words or (base in words and "_log_end" in words and "_mean" in words), name
+
+
 def test_every_command_and_option_is_explained() -> None:
     text = (DOCS / "cli.md").read_text(encoding="utf-8")
     for name, command in cli.cli.commands.items():
@@ -44,7 +53,7 @@ def test_every_command_and_option_is_explained() -> None:
         parts = command.commands if isinstance(command, click.Group) else {}
         assert all(f"octoreplay {name} {part}" in section for part in parts)
         for parameter in (*command.params, *(option for part in parts.values() for option in part.params)):
-            if parameter.name not in ("output", "result", "folder", "logs"):
+            if parameter.name not in ("output", "result", "folder", "logs", "teams", *PARAMETERS):
                 assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.simulate.team import SimulationConfig, simulate_team
+    from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
     from octoreplay.team_file import load_team_file
 
 _HOMES = {
@@ -42,6 +43,8 @@ _HOMES = {
     "SemanticClass": "records",
     "SimulationConfig": "simulate.team",
     "StoredMap": "result",
+    "Sweep": "study.sweep",
+    "SweepProgress": "study.sweep",
     "TickMetrics": "records",
     "check_result": "evaluate.checks",
     "compare_results": "evaluate.comparison",
@@ -52,6 +55,7 @@ _HOMES = {
     "open_result": "result",
     "replay_team": "replay.session",
     "resolve": "io.robots.discover",
+    "run_sweep": "study.sweep",
     "simulate_team": "simulate.team",
 }
 """The module that each public name comes from."""
@@ -59,9 +63,9 @@ _HOMES = {
 __all__ = [
     "CheckRow", "ClassTable", "ConfigError", "InputError", "LeafTable", "OctoreplayError", "OutputError",
     "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RunConfig", "RunSummary",
-    "SemanticClass", "SimulationConfig", "StoredMap", "TickMetrics", "__version__", "check_result",
-    "compare_results", "discover", "export_ply", "load_team_file", "open_log", "open_result", "replay_team",
-    "resolve", "simulate_team",
+    "SemanticClass", "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "TickMetrics", "__version__",
+    "check_result", "compare_results", "discover", "export_ply", "load_team_file", "open_log", "open_result",
+    "replay_team", "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 

@@ -1,0 +1,80 @@
+"""Commands that do many runs: sweep."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
+from octoreplay.commands.options import SectionedCommand, existing_path, with_parameters
+from octoreplay.commands.progress import progress_bar
+from octoreplay.config import PRESETS
+
+if TYPE_CHECKING:
+    from octoreplay.study.sweep import Sweep, SweepProgress
+
+
+@with_parameters
+@click.command(cls=SectionedCommand, short_help="Run many combinations of settings into one table.")
+@click.argument("teams", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml...")
+@click.option("-o", "--output", type=existing_path, required=True, metavar="DIR", help="where the table goes")
+@click.option("--vary", multiple=True, metavar="NAME=V1,V2,...",
+              help="a parameter and its values, or NAME+NAME=V1+V1,V2+V2,... for several; may be repeated")  # fmt: skip
+@click.option("--seeds", type=int, metavar="N", help="every combination with network_seed 0 to N - 1")
+@click.option("--truth", type=existing_path, metavar="FILE",
+              help="evaluate against this truth, found as given or beside each team file")  # fmt: skip
+@click.option("--keep", is_flag=True, help="keep every run's result in DIR/runs")
+@click.option("--jobs", type=int, metavar="N", help="runs at once on this machine  [default: processors over threads]")
+@click.option("--threads", type=int, default=1, show_default=True, metavar="N", help="threads of each run")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster in place of this machine")
+@click.option("--preset", type=click.Choice(tuple(PRESETS)), help="a named set of settings; options override it")
+def sweep(
+    teams: tuple[Path, ...], output: Path, vary: tuple[str, ...], seeds: int | None, truth: Path | None, keep: bool,
+    jobs: int | None, threads: int, scheduler: str | None, preset: str | None, **parameters: Any,
+) -> int:  # fmt: skip
+    """Run every combination of teams and settings, and write one table and figures into DIR.
+
+    What is finished in DIR already is not run again, so that the same command goes on after an interruption. A run that
+    fails does not stop the others.
+    """
+    from octoreplay.report import tables
+    from octoreplay.study.sweep import run_sweep
+
+    if jobs is not None and scheduler is not None:
+        raise click.UsageError("--jobs is for this machine and --scheduler for another; leave one out")
+    with progress_bar("sweep") as update:
+
+        def show(progress: SweepProgress) -> None:
+            update(progress.num_finished / progress.num_runs, None, _stage(progress))
+
+        done = run_sweep(
+            teams, vary, output, settings={**parameters, "preset": preset}, num_seeds=seeds, truth=truth, keep=keep,
+            num_jobs=jobs, num_threads=threads, scheduler=scheduler, progress=show,
+        )  # fmt: skip
+    out = tables.terminal()
+    earlier = f", {done.num_earlier} of them before" if done.num_earlier else ""
+    out.print(f"wrote {done.table} ({len(done.rows)} runs{earlier})", soft_wrap=True)
+    return _end(done)
+
+
+def _stage(progress: SweepProgress) -> str:
+    """How far a sweep is, in words."""
+    from octoreplay.report.tables import seconds
+
+    left = progress.num_runs - progress.num_finished
+    failed = f", {progress.num_failed} failed" if progress.num_failed else ""
+    time = f", about {seconds(progress.seconds_left)}" if left and math.isfinite(progress.seconds_left) else ""
+    return f"{progress.num_finished} of {progress.num_runs} runs{failed}, {left} left{time}"
+
+
+def _end(done: Sweep) -> int:
+    """Say which runs failed; the exit code."""
+    names = ("team", *done.names, "seed")
+    for row in done.failed:
+        click.echo(f"failed: {', '.join(f'{name}={row[name]}' for name in names)}: {row['error']}", err=True)
+    if done.failed:
+        return EXIT_ERROR
+    return EXIT_DATA_LOST if done.lost_data else 0

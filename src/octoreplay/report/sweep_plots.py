@@ -1,0 +1,214 @@
+"""The main columns of a sweep's table as figures, over what was varied."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from octoreplay.errors import OutputError
+from octoreplay.report.figures import COLORS, new_figure, save_figures, style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Axis = tuple[str, ...]
+"""Columns that were varied together."""
+
+_TITLES = {
+    "total_distance_all_log_end": ("\u03a6 over all pairs when the logs end", "\u03a6"),
+    "total_distance_all": ("\u03a6 over all pairs at the end", "\u03a6"),
+    "contraction": ("Change of \u03a6 per settling tick", "factor"),
+    "label_disagreement_log_end": ("Cells that robots label differently when the logs end", "share of known cells"),
+    "label_disagreement": ("Cells that robots label differently at the end", "share of known cells"),
+    "ticks_to_consensus": ("Ticks after the last evidence until the labels agree", "ticks"),
+    "agreement": ("Agreement with all evidence, worst robot at the end", "share of known cells"),
+    "agreement_occupied": ("Agreement on occupied cells, worst robot at the end", "share of occupied cells"),
+    "packet_bytes": ("Size of a packet", "bytes"),
+    "sent_bytes_per_second": ("Sent by a robot while the logs last", "bytes per second"),
+    "mean_iou": ("Mean IoU, mean of the robots", "mean IoU"),
+    "coverage": ("Observed surface that is mapped, mean of the robots", "share"),
+    "calibration_error": ("Expected calibration error, mean of the robots", "error"),
+}
+"""The columns that are drawn, each with its title and what the vertical axis says."""
+
+_LOGARITHMIC = ("total_distance_all_log_end", "total_distance_all", "packet_bytes", "sent_bytes_per_second")
+_HATCHES = ("", "///", "...", "xxx")
+
+
+def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis], folder: Path) -> list[Path]:
+    """Write a figure ``<column>.png`` of every main column into a folder, made if need be; the files written.
+
+    ``rows`` are a sweep's, ``varied`` the columns that were varied. The first of them is along the figure, the second
+    gives the colours, and every combination of the others a panel. Values are means over the seeds, with their range.
+    What has no number is not drawn, and a figure of an earlier sweep is taken away. Raises OutputError.
+    """
+    good = [row for row in rows if row["status"] != "failed"]
+    axes = _axes_of(good, varied)
+    drawn = {
+        f"{column}.png": _figure(good, axes, column)
+        for column in _TITLES
+        if any(math.isfinite(row.get(column, math.nan)) for row in good)
+    }
+    try:
+        for column in _TITLES:
+            if f"{column}.png" not in drawn:
+                (folder / f"{column}.png").unlink(missing_ok=True)
+        if not drawn and folder.exists():
+            folder.rmdir()
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return save_figures(drawn, folder) if drawn else []
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """A mean over seeds with the least and the largest value."""
+
+    mean: float
+    least: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the figures of a sweep have along, as colours and as panels: the labels of each in the rows' order."""
+
+    along: Axis
+    series: Axis
+    panels: tuple[Axis, ...]
+
+
+def _axes_of(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis]) -> _Layout:
+    """Which columns go where; the seeds go along where nothing else was varied."""
+    has_teams = len({row["team"] for row in rows}) > 1
+    axes = [*varied, *([("team",)] if has_teams else [])] or [("seed",)]
+    return _Layout(axes[0], axes[1] if len(axes) > 1 else (), tuple(axes[2:]))
+
+
+def _label(row: Mapping[str, Any], axis: Axis) -> str:
+    """A row's values of what was varied together."""
+    return " ".join(str(row[name]) for name in axis)
+
+
+def _labels(rows: Sequence[Mapping[str, Any]], axis: Axis) -> list[str]:
+    """All values in the rows' order."""
+    return list(dict.fromkeys(_label(row, axis) for row in rows))
+
+
+def _figure(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> Figure:
+    """One column over what was varied."""
+    panels = list(itertools.product(*(_labels(rows, axis) for axis in layout.panels)))
+    along, series = _labels(rows, layout.along), _labels(rows, layout.series)
+    num_columns = 1 if len(panels) == 1 else 2
+    num_rows = math.ceil(len(panels) / num_columns)
+    numeric = _numbers(along) if len(layout.along) == 1 else None
+    width = 7.0 if numeric else max(7.0, 0.16 * len(along) * len(series) + 1.5)
+    figure = new_figure(width * num_columns, 3.6 * num_rows)
+    title, y_label = _TITLES[column]
+    figure.suptitle(title, x=0.02, ha="left", fontsize=11)
+    grid = figure.subplots(num_rows, num_columns, squeeze=False, sharey=True)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(y_label)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    scale = _scale(rows, column)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        of_panel = [row for row in rows if tuple(_label(row, axis) for axis in layout.panels) == panel]
+        names = ", ".join(f"{'+'.join(axis)} {label}" for axis, label in zip(layout.panels, panel, strict=True))
+        style(axes, names, "+".join(layout.along), axes.get_ylabel())
+        if not numeric:
+            axes.grid(visible=False, axis="x")
+        spreads = _spreads(of_panel, layout, column)
+        if numeric:
+            _draw_lines(axes, numeric, along, series, spreads)
+        else:
+            _draw_bars(axes, along, series, spreads)
+        axes.set_yscale(scale)
+    _leave_room(grid.flat[0], rows, column, scale)
+    if layout.series:
+        handles, names_of = grid.flat[0].get_legend_handles_labels()
+        figure.legend(
+            handles, names_of, title="+".join(layout.series), frameon=False, fontsize=9, title_fontsize=9,
+            loc="outside right upper", ncols=1 + len(series) // 16,
+        )  # fmt: skip
+    return figure
+
+
+def _numbers(labels: Sequence[str]) -> list[float] | None:
+    """The labels as numbers where all of them are finite ones."""
+    try:
+        numbers = [float(label) for label in labels]
+    except ValueError:
+        return None
+    return numbers if len(numbers) > 1 and all(map(math.isfinite, numbers)) else None
+
+
+def _spreads(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> dict[tuple[str, str], _Spread]:
+    """The values of a column by label along the figure and label of the series."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        if math.isfinite(row[column]):
+            found.setdefault((_label(row, layout.along), _label(row, layout.series)), []).append(row[column])
+    return {key: _Spread(math.fsum(values) / len(values), min(values), max(values)) for key, values in found.items()}
+
+
+def _scale(rows: Sequence[Mapping[str, Any]], column: str) -> str:
+    """Logarithmic where the values span much more than a decade."""
+    values = [row[column] for row in rows if row[column] > 0 and math.isfinite(row[column])]
+    return "log" if column in _LOGARITHMIC and values and max(values) > 20 * min(values) else "linear"
+
+
+def _leave_room(axes: Any, rows: Sequence[Mapping[str, Any]], column: str, scale: str) -> None:
+    """A logarithmic axis whose least bar is still seen, and one that starts at 0 where nothing is above."""
+    values = [row[column] for row in rows if math.isfinite(row[column])]
+    if scale == "log":
+        axes.set_ylim(bottom=min(value for value in values if value > 0) / 3, top=max(values) * 2)
+    elif not any(values):
+        axes.set_ylim(0.0, 1.0)
+
+
+def _draw_lines(
+    axes: Any, numbers: Sequence[float], along: Sequence[str], series: Sequence[str],
+    spreads: Mapping[tuple[str, str], _Spread],
+) -> None:  # fmt: skip
+    """One line for each series, over numbers."""
+    order = sorted(range(len(along)), key=lambda index: numbers[index])
+    for index, name in enumerate(series):
+        points = [(numbers[n], spreads[along[n], name]) for n in order if (along[n], name) in spreads]
+        axes.errorbar(
+            [x for x, _ in points], [spread.mean for _, spread in points], yerr=_ranges([s for _, s in points]),
+            label=name, color=COLORS[index % len(COLORS)], linewidth=1.6, marker="os^Dv"[index % 5], markersize=4,
+            linestyle=("-", "--", ":", "-.")[index // len(COLORS) % 4], elinewidth=1, capsize=2,
+        )  # fmt: skip
+    if len(numbers) <= 8:
+        axes.set_xticks(sorted(numbers))
+
+
+def _draw_bars(
+    axes: Any, along: Sequence[str], series: Sequence[str], spreads: Mapping[tuple[str, str], _Spread]
+) -> None:
+    """A group of bars for each label, one bar for each series."""
+    width = 0.8 / len(series)
+    for index, name in enumerate(series):
+        places = [(n, spreads[label, name]) for n, label in enumerate(along) if (label, name) in spreads]
+        axes.bar(
+            [n + (index - (len(series) - 1) / 2) * width for n, _ in places], [spread.mean for _, spread in places],
+            0.9 * width, label=name, color=COLORS[index % len(COLORS)],
+            hatch=_HATCHES[index // len(COLORS) % len(_HATCHES)], edgecolor="white", linewidth=0,
+            yerr=_ranges([spread for _, spread in places]),
+            error_kw={"elinewidth": 1, "capsize": 2, "ecolor": "#444444"},
+        )  # fmt: skip
+    is_long = sum(len(label) + 2 for label in along) > 90
+    axes.set_xticks(range(len(along)), along, **({"rotation": 30, "ha": "right"} if is_long else {}))
+    axes.set_xlim(-0.6, len(along) - 0.4)
+
+
+def _ranges(spreads: Sequence[_Spread]) -> list[list[float]] | None:
+    """How far each mean is above the least and below the largest value; None where there is no range to show."""
+    if all(spread.least == spread.largest for spread in spreads):
+        return None
+    return [[max(s.mean - s.least, 0.0) for s in spreads], [max(s.largest - s.mean, 0.0) for s in spreads]]

@@ -1,0 +1,122 @@
+"""What one run of a sweep comes to, as a flat row of numbers (docs/sweeps.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from octoreplay.evaluate.checks import ticks_to_consensus
+from octoreplay.records import RobotMetrics, RunSummary, TickMetrics
+
+if TYPE_CHECKING:
+    from octoreplay.evaluate.records import Evaluation
+
+RUN_COLUMNS = (
+    "stop_reason", "num_ticks", "num_settling_ticks", "ticks_to_consensus", "log_seconds", "num_known_cells",
+    "total_distance", "total_distance_log_end", "total_distance_mean", "total_distance_peak",
+    "total_distance_all", "total_distance_all_log_end", "total_distance_all_mean", "total_distance_all_peak",
+    "label_disagreement", "label_disagreement_log_end", "label_disagreement_mean",
+    "agreement", "agreement_log_end", "agreement_mean",
+    "agreement_occupied", "agreement_occupied_log_end", "agreement_occupied_mean",
+    "contraction", "entropy_bits", "packet_bytes", "octree_bytes", "grid_bytes", "sent_bytes_per_second",
+    "delivered_share", "num_leaves", "memory_bytes",
+)  # fmt: skip
+"""What every run has."""
+
+_SCORES = (
+    "mean_iou", "mean_iou_known", "coverage", "world_coverage", "occupied_accuracy", "free_accuracy",
+    "calibration_error", "calibration_error_occupied",
+)  # fmt: skip
+_TEAM_SCORES = ("team_calibration_error", "team_calibration_error_occupied")
+
+TRUTH_COLUMNS = (*_SCORES, *_TEAM_SCORES, "mean_iou_least", *(f"central_{name}" for name in _SCORES))
+"""What a run has besides where the truth is known."""
+
+TIMING_COLUMNS = ("wall_seconds", "realtime_factor", "peak_rss_bytes")
+"""What differs when the same run is repeated."""
+
+
+def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str, Any]:
+    """The values of ``RUN_COLUMNS``; ``metrics`` are those of all ticks."""
+    last = summary.last
+    log_ticks = [tick for tick in metrics if not tick.settling]
+    # Before the first scan everybody agrees on nothing.
+    seen = [tick for tick in log_ticks if tick.num_known_cells > 0]
+    sent_bytes = sum(robot.sent_bytes for tick in log_ticks for robot in tick.robots)
+    num_sent = sum(link.num_sent for link in summary.links)
+    distances: dict[str, float] = {}
+    for name in ("total_distance", "total_distance_all", "label_disagreement"):
+        distances |= {
+            name: getattr(last, name),
+            f"{name}_log_end": getattr(log_ticks[-1], name),
+            f"{name}_mean": _mean(getattr(tick, name) for tick in seen),
+        }
+    agreements: dict[str, float] = {}
+    for name in ("agreement", "agreement_occupied"):
+        agreements |= {
+            name: _worst(last, name),
+            f"{name}_log_end": _worst(log_ticks[-1], name),
+            f"{name}_mean": _mean(_worst(tick, name) for tick in seen),
+        }
+    values = {
+        "stop_reason": summary.stop_reason,
+        "num_ticks": summary.num_ticks,
+        "num_settling_ticks": summary.num_settling_ticks,
+        "ticks_to_consensus": ticks_to_consensus(metrics),
+        "log_seconds": summary.log_seconds,
+        "num_known_cells": last.num_known_cells,
+        **distances,
+        "total_distance_peak": summary.peak_total_distance,
+        "total_distance_all_peak": summary.peak_total_distance_all,
+        **agreements,
+        "contraction": contraction([tick.total_distance for tick in metrics if tick.settling]),
+        "entropy_bits": _mean(robot.entropy_bits for robot in last.robots),
+        "packet_bytes": summary.mean_packet_bytes,
+        "octree_bytes": summary.mean_octree_bytes,
+        "grid_bytes": summary.mean_grid_bytes,
+        "sent_bytes_per_second": _ratio(sent_bytes, len(last.robots) * summary.log_seconds),
+        "delivered_share": _ratio(sum(link.num_delivered for link in summary.links), num_sent),
+        "num_leaves": _mean(robot.num_leaves for robot in last.robots),
+        "memory_bytes": max(robot.memory_bytes for robot in last.robots),
+    }
+    return {name: values[name] for name in RUN_COLUMNS}
+
+
+def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
+    """The values of ``TRUTH_COLUMNS``: means over the robots, and those of the centralised map."""
+    final = evaluation.final
+    central = final.central
+    return {
+        **{name: final.mean(name) for name in (*_SCORES, *_TEAM_SCORES)},
+        "mean_iou_least": final.least("mean_iou"),
+        **{f"central_{name}": math.nan if central is None else getattr(central, name) for name in _SCORES},
+    }
+
+
+def contraction(distances: Sequence[float]) -> float:
+    """The factor by which the total distance shrank per tick: the geometric mean over the later half of the ticks.
+
+    ``distances`` are those of the settling ticks. NaN where there are fewer than four, and where one is 0.
+    """
+    later = distances[len(distances) // 2 - 1 :]
+    if len(distances) < 4 or not min(later) > 0.0:
+        return math.nan
+    return float((later[-1] / later[0]) ** (1.0 / (len(later) - 1)))
+
+
+def _worst(tick: TickMetrics, name: str) -> float:
+    """The least of one number over the robots that are active; over all where none is."""
+    robots: Sequence[RobotMetrics] = [robot for robot in tick.robots if robot.active] or tick.robots
+    return min((float(getattr(robot, name)) for robot in robots), key=lambda v: (not math.isnan(v), v))
+
+
+def _mean(values: Iterable[float]) -> float:
+    """The mean of the numbers that there are; NaN of none."""
+    found = [value for value in values if not math.isnan(value)]
+    return sum(found) / len(found) if found else math.nan
+
+
+def _ratio(part: float, whole: float) -> float:
+    """NaN where there is nothing to divide by."""
+    return part / whole if whole > 0 else math.nan

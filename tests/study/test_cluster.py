@@ -1,0 +1,160 @@
+"""Sweeps on a real dask scheduler with two workers, which are processes of this test."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import octoreplay
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.study import cluster
+from octoreplay.study.task import Task
+from study.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
+
+pytest.importorskip("distributed")
+
+GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
+ENDLESS = ("--settle", "100000", "--settle-max", "100000", *QUICK)
+
+
+@dataclasses.dataclass
+class Cluster:
+    address: str
+    scheduler: subprocess.Popen[bytes]
+    workers: list[subprocess.Popen[bytes]]
+
+    def runs(self) -> list[Path]:
+        """The processes of runs that the workers have started."""
+        lists = (path for worker in self.workers for path in Path(f"/proc/{worker.pid}/task").glob("*/children"))
+        return [Path("/proc") / pid for path in lists for pid in path.read_text().split()]
+
+
+@pytest.fixture
+def dask(tmp_path: Path) -> Iterator[Cluster]:
+    """A scheduler and two workers."""
+    file = tmp_path / "scheduler.json"
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*arguments: str) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dask", *arguments, "--no-dashboard"], cwd=tmp_path, stderr=subprocess.DEVNULL
+        )
+        started.append(process)
+        return process
+
+    try:
+        scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+        wait_for(file.exists)
+        address = json.loads(file.read_text())["address"]
+        workers = [start("worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2)]
+        yield Cluster(address, scheduler, workers)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
+    done = sweep(TEAM, *GRID, "-o", tmp_path / "d", "--scheduler", dask.address)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"wrote {tmp_path / 'd' / 'table.csv'} (4 runs)\n"
+    assert sweep(TEAM, *GRID, "-o", tmp_path / "s").returncode == 0
+    assert table(tmp_path / "d") == table(tmp_path / "s")
+    done = sweep(TEAM, *GRID, "-o", tmp_path / "s", "--scheduler", dask.address)
+    assert "(4 runs, 4 of them before)" in done.stdout
+
+
+def test_what_happens_on_a_cluster_happens_to_one_run(dask: Cluster, tmp_path: Path) -> None:
+    """A worker is lost, and a run fails: the other worker does what is left."""
+    arguments = command(TEAM, "--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address)
+    process = subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    wait_for(lambda: bool(dask.runs()))
+    dask.workers[0].kill()
+    out, said = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "(3 runs)" in out
+    assert "failed: team=team, start=99, seed=0: no robot has a frame" in said
+    assert "Traceback" not in said
+    assert [row["status"] for row in table(tmp_path / "d")] == ["failed", "ok", "ok"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_sweep_ends_its_runs_on_the_workers(
+    dask: Cluster, tmp_path: Path, number: signal.Signals
+) -> None:
+    arguments = ("-o", tmp_path / "d", "--scheduler", dask.address)
+    process = subprocess.Popen(command(TEAM, *ENDLESS, *arguments), text=True, stderr=subprocess.PIPE)
+    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+    runs = dask.runs()
+    assert len(runs) == 1
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    if number == signal.SIGKILL:
+        # Nothing could be said to the workers; the next sweep takes the folder away from the run.
+        done = sweep(TEAM, *QUICK, *arguments)
+        assert done.returncode == 0, done.stderr
+    else:
+        assert process.returncode == 130
+        assert "interrupted; 0 of 1 runs are finished" in said
+        assert "Traceback" not in said
+    wait_for(lambda: not is_running(runs[0]), 20)
+
+
+def test_a_lost_scheduler_is_one_sentence(dask: Cluster, tmp_path: Path) -> None:
+    arguments = command(TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address)
+    process = subprocess.Popen(arguments, text=True, stderr=subprocess.PIPE)
+    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+    dask.scheduler.kill()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert said.splitlines()[-1] == (
+        f"error: {dask.address}: the scheduler was lost; what is finished is kept, and the same command goes on with"
+        " the others"
+    )
+    assert "Traceback" not in said
+
+
+def test_a_scheduler_that_is_none_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = some_task(tmp_path)
+    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1.0)
+    with pytest.raises(
+        InputError, match=r"tcp://127\.0\.0\.1:9: no dask scheduler answers there within 1 s; start one"
+    ):
+        list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
+    for address in ("here", "http://127.0.0.1:80"):
+        with pytest.raises(ConfigError, match=f"scheduler: '{address}' is not an address such as tcp://host:8786: "):
+            list(cluster.run_on_cluster([task], address))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"not installed; pip install 'octoreplay\[cluster\]'"):
+        list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
+
+
+def test_jobs_are_for_this_machine_only(tmp_path: Path) -> None:
+    done = sweep(TEAM, "-o", tmp_path / "d", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 2
+    assert "--jobs is for this machine and --scheduler for another; leave one out" in done.stderr
+
+
+def some_task(folder: Path) -> Task:
+    unfinished = str(folder / "none" / "u.mcap")
+    return Task("x", "k", {}, "", unfinished, str(folder / "r"), False, None, octoreplay.__version__, 1)
+
+
+def test_a_worker_that_cannot_do_a_run_says_why(tmp_path: Path) -> None:
+    content = dataclasses.asdict(some_task(tmp_path))
+    assert cluster.run_here(content)["error"] == (
+        f"a worker does not see '{tmp_path / 'none'}'; workers need the sweep's folder and the logs at the same paths"
+    )
+    # Another version may know other tasks.
+    row = cluster.run_here({"version": "0.0.1", "wheels": 4})
+    assert row["status"] == "failed"
+    assert row["error"] == (
+        f"a worker has octoreplay {octoreplay.__version__} and the sweep 0.0.1; install the same version"
+    )

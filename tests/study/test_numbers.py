@@ -1,0 +1,109 @@
+"""What a run comes to, against the result's own ticks."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.records import RunSummary, TickMetrics
+from octoreplay.replay.session import replay_team
+from octoreplay.result import open_result
+from octoreplay.study import numbers
+from octoreplay.study.numbers import (
+    RUN_COLUMNS,
+    TRUTH_COLUMNS,
+    contraction,
+    run_numbers,
+    truth_numbers,
+)
+from octoreplay.team_file import load_team_file
+from result_factory import tick_metrics
+
+PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
+
+
+def ticks(*disagreements: float, num_log_ticks: int) -> list[TickMetrics]:
+    return [
+        dataclasses.replace(tick_metrics(tick, settling=tick >= num_log_ticks), label_disagreement=value)
+        for tick, value in enumerate(disagreements)
+    ]
+
+
+def test_contraction_is_the_factor_of_the_later_half() -> None:
+    assert contraction([0.25**n for n in range(9)]) == pytest.approx(0.25)
+    # The first half counts for nothing; of the other one only how far it went in all.
+    assert contraction([7.0, 900.0, 8.0, 3.0, 1.0, 1.0]) == pytest.approx((1 / 8) ** (1 / 3))
+    assert math.isnan(contraction([8.0, 4.0, 2.0]))
+    assert math.isnan(contraction([8.0, 4.0, 2.0, 0.0]))
+    assert math.isnan(contraction([]))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunSummary, tuple[TickMetrics, ...]]:
+    path = tmp_path_factory.mktemp("run") / "result.mcap"
+    changes = {"loss": 0.5, "network_seed": 3, "rule": "bayes", "resolution": 0.6}
+    summary = replay_team(load_team_file(PAIR).with_parameters(changes), path)
+    with open_result(path) as result:
+        return summary, tuple(result.metrics)
+
+
+def test_a_run_in_numbers(run: tuple[RunSummary, tuple[TickMetrics, ...]]) -> None:
+    summary, metrics = run
+    row = run_numbers(summary, metrics)
+    assert tuple(row) == RUN_COLUMNS
+    log_ticks = [tick for tick in metrics if not tick.settling]
+    assert 2 < len(log_ticks) < len(metrics) == row["num_ticks"]
+    for name in ("total_distance", "total_distance_all"):
+        values = [getattr(tick, name) for tick in metrics]
+        assert row[name] == values[-1]
+        assert row[f"{name}_log_end"] == values[len(log_ticks) - 1]
+        assert row[f"{name}_mean"] == pytest.approx(np.mean(values[1 : len(log_ticks)]))
+        assert row[f"{name}_peak"] == max(values)
+    for name in ("agreement", "agreement_occupied"):
+        # In the first tick no robot has seen anything.
+        worst = [np.nan, *(min(getattr(r, name) for r in tick.robots if r.active) for tick in metrics[1:])]
+        assert row[name] == worst[-1]
+        assert row[f"{name}_log_end"] == worst[len(log_ticks) - 1] < row[name]
+        assert row[f"{name}_mean"] == pytest.approx(np.mean(worst[1 : len(log_ticks)]))
+    sent = sum(robot.sent_bytes for tick in log_ticks for robot in tick.robots)
+    assert row["sent_bytes_per_second"] == pytest.approx(sent / 2 / summary.log_seconds)
+    links = [link for tick in metrics for link in tick.links]
+    share = sum(link.num_delivered for link in links) / sum(link.num_sent for link in links)
+    assert row["delivered_share"] == pytest.approx(share)
+    assert 0.2 < share < 0.8
+    assert row["memory_bytes"] == max(robot.memory_bytes for robot in metrics[-1].robots)
+    assert row["num_leaves"] == np.mean([robot.num_leaves for robot in metrics[-1].robots])
+
+
+def test_a_dormant_robot_is_not_the_worst() -> None:
+    tick = tick_metrics(1)
+    summary_tick = dataclasses.replace(
+        tick, robots=(tick.robots[0], dataclasses.replace(tick.robots[1], agreement=0.0, active=False))
+    )
+    assert numbers._worst(summary_tick, "agreement") == tick.robots[0].agreement
+
+
+def scores(robot_id: str, number: float) -> MapScores:
+    """Scores that differ by name and robot."""
+    names = [item.name for item in dataclasses.fields(MapScores)]
+    values = {name: number + index / 100 for index, name in enumerate(names)}
+    return MapScores(**{**values, "robot_id": robot_id, "is_active": True, "iou": (number,)})  # type: ignore[arg-type]
+
+
+def test_the_truth_in_numbers() -> None:
+    maps = (scores("a", 0.25), scores("b", 0.5), scores("central", 0.75))
+    tick = EvaluatedTick(3, 1.0, 0.0, maps)
+    row = truth_numbers(Evaluation("r", "t", "central", ("x",), (tick,)))
+    assert tuple(row) == TRUTH_COLUMNS
+    for name in ("mean_iou", "coverage", "free_accuracy", "calibration_error", "team_calibration_error_occupied"):
+        assert row[name] == pytest.approx((getattr(maps[0], name) + getattr(maps[1], name)) / 2)
+    assert row["mean_iou_least"] == maps[0].mean_iou
+    assert row["central_mean_iou"] == maps[2].mean_iou
+    assert row["central_calibration_error"] == maps[2].calibration_error
+    alone = truth_numbers(Evaluation("r", "t", "central", ("x",), (dataclasses.replace(tick, maps=maps[:2]),)))
+    assert math.isnan(alone["central_mean_iou"])
