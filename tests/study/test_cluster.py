@@ -128,8 +128,8 @@ def test_a_scheduler_that_is_none_is_one_sentence(tmp_path: Path, monkeypatch: p
         InputError, match=r"tcp://127\.0\.0\.1:9: no dask scheduler answers there within 1 s; start one"
     ):
         list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
-    for address in ("here", "http://127.0.0.1:80"):
-        with pytest.raises(ConfigError, match=f"scheduler: '{address}' is not an address such as tcp://host:8786: "):
+    for address in ("here", "http://127.0.0.1:80", "tcp://here", "tcp://:x"):
+        with pytest.raises(ConfigError, match=f"scheduler: '{address}' is not an address such as tcp://host:8786"):
             list(cluster.run_on_cluster([task], address))
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"not installed; pip install 'octoreplay\[cluster\]'"):
