@@ -27,7 +27,7 @@ FIXTURES = Path(__file__).parent / "fixtures"
 PAIR = FIXTURES / "pair" / "team.yaml"
 COMMANDS = (
     "run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
-    "check", "compare", "sweep", "experiment",
+    "evaluate", "check", "compare", "sweep", "experiment",
 )  # fmt: skip
 
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
     from octoreplay.evaluate.checks import CheckRow, check_result
     from octoreplay.evaluate.comparison import ResultComparison, compare_results
+    from octoreplay.evaluate.evaluation import evaluate_result
+    from octoreplay.evaluate.records import Evaluation
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
@@ -28,6 +30,7 @@ _HOMES = {
     "CheckRow": "evaluate.checks",
     "ClassTable": "records",
     "ConfigError": "errors",
+    "Evaluation": "evaluate.records",
     "InputError": "errors",
     "LeafTable": "records",
     "OctoreplayError": "errors",
@@ -49,6 +52,7 @@ _HOMES = {
     "check_result": "evaluate.checks",
     "compare_results": "evaluate.comparison",
     "discover": "io.robots.discover",
+    "evaluate_result": "evaluate.evaluation",
     "export_ply": "report.export",
     "load_team_file": "team_file",
     "open_log": "io.containers.logs",
@@ -61,11 +65,11 @@ _HOMES = {
 """The module that each public name comes from."""
 
 __all__ = [
-    "CheckRow", "ClassTable", "ConfigError", "InputError", "LeafTable", "OctoreplayError", "OutputError",
+    "CheckRow", "ClassTable", "ConfigError", "Evaluation", "InputError", "LeafTable", "OctoreplayError", "OutputError",
     "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RunConfig", "RunSummary",
     "SemanticClass", "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "TickMetrics", "__version__",
-    "check_result", "compare_results", "discover", "export_ply", "load_team_file", "open_log", "open_result",
-    "replay_team", "resolve", "run_sweep", "simulate_team",
+    "check_result", "compare_results", "discover", "evaluate_result", "export_ply", "load_team_file", "open_log",
+    "open_result", "replay_team", "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 

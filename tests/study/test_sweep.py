@@ -259,7 +259,6 @@ def test_runs_are_kept_to_processors_of_their_own() -> None:
 
 
 def test_a_sweep_with_truth_has_scores(tmp_path: Path) -> None:
-    pytest.importorskip("octoreplay.evaluate.evaluation")
     done = run_sweep(TEAM, ["rule=bayes"], tmp_path, settings={"resolution": 0.3}, truth="world.npz")
     (row,) = done.rows
     assert row["status"] == "ok", row["error"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -154,10 +153,9 @@ def _check_limits(limits: Mapping[str, float], settled: bool, has_truth: bool) -
 
 def _evaluation(path: Path, truth: Path) -> Evaluation:
     """The last maps of a result against the truth."""
-    evaluation: Evaluation = import_module("octoreplay.evaluate.evaluation").evaluate_result(
-        path, truth=truth, over_time=False
-    )
-    return evaluation
+    from octoreplay.evaluate.evaluation import evaluate_result
+
+    return evaluate_result(path, truth=truth, over_time=False)
 
 
 _COMPLETE, _SETTLED = "complete", "settled"

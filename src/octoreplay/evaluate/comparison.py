@@ -12,12 +12,13 @@ from collections.abc import Iterator, Set
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from octoreplay.config import CENTRAL, PARAMETERS, RunConfig
 from octoreplay.errors import ConfigError, InputError
+from octoreplay.evaluate.runs import CommonRuns, bounding_box, common_runs
 from octoreplay.io.results import posterior
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys
 from octoreplay.records import BoolArray, Float64Array, Int64Array
@@ -31,8 +32,6 @@ UNKNOWN = "unknown"
 _LATEST = 1e9
 """No run is longer [s]."""
 
-_CUBES = np.int64(1) << np.arange(0, 63, 3)
-"""Numbers of finest cells in cubes of the edges 1, 2, 4, ..."""
 
 _PATHS = ("logs", "pose_file", "pose_times")
 """What of a robot's settings says where its data are; whether these are the same, their fingerprints tell."""
@@ -144,55 +143,6 @@ def compare_results(
             same_inputs=_same_inputs(result_a, result_b),
             settings=tuple(_setting_differences(result_a.config, result_b.config)),
         )  # fmt: skip
-
-
-class CommonRuns(NamedTuple):
-    """Runs of finest cells along the Morton curve in which neither of two maps changes, in its order.
-
-    ``codes`` (S,) int64 are the Morton codes of their first cells, ``num_cells`` (S,) int64 their lengths, ``leaves_a``
-    and ``leaves_b`` (S,) int64 each map's leaf, -1 where it knows nothing; one of them always knows something.
-    """
-
-    codes: Int64Array
-    num_cells: Int64Array
-    leaves_a: Int64Array
-    leaves_b: Int64Array
-
-
-def common_runs(a: LeafSpans, b: LeafSpans) -> CommonRuns:
-    """The common refinement of two maps' leaves: at most twice as many runs as the two have leaves."""
-    # Four sorted lists, which a stable sort merges many times faster than any other way sorts them.
-    bounds = np.sort(np.concatenate([a.codes, b.codes, a.codes + a.num_cells, b.codes + b.num_cells]), kind="stable")
-    num_cells = np.diff(bounds)
-    starts, num_cells = bounds[:-1][num_cells > 0], num_cells[num_cells > 0]
-    leaves_a, leaves_b = _leaf_at(a, starts), _leaf_at(b, starts)
-    known = (leaves_a >= 0) | (leaves_b >= 0)
-    return CommonRuns(starts[known], num_cells[known], leaves_a[known], leaves_b[known])
-
-
-def _leaf_at(spans: LeafSpans, codes: Int64Array) -> Int64Array:
-    """The leaf (S,) that holds each cell, -1 where none does."""
-    leaves: Int64Array = np.searchsorted(spans.codes, codes, side="right") - 1
-    inside = leaves >= 0
-    held = leaves[inside]
-    leaves[inside] = np.where(codes[inside] < spans.codes[held] + spans.num_cells[held], held, -1)
-    return leaves
-
-
-def bounding_box(codes: Int64Array, num_cells: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """The least and the largest key (3,) of any cell in some runs (S,), S >= 1, along the Morton curve."""
-    lows, highs = [], []
-    while codes.size:
-        # The largest cube that starts at the run's first cell and ends in the run.
-        aligned = np.where(codes == 0, num_cells, codes & -codes)
-        levels = np.searchsorted(_CUBES, np.minimum(aligned, num_cells), side="right") - 1
-        keys = codes_to_keys(codes)
-        lows.append(keys.min(axis=0))
-        highs.append((keys + (np.int64(1) << levels)[:, None] - 1).max(axis=0))
-        taken = np.int64(1) << (3 * levels)
-        rest = num_cells > taken
-        codes, num_cells = (codes + taken)[rest], (num_cells - taken)[rest]
-    return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def _map_difference(

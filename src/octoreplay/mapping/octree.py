@@ -69,6 +69,14 @@ class LeafSpans(NamedTuple):
     num_cells: Int64Array
     deviations: Float32Array
 
+    def leaves_at(self, codes: Int64Array) -> Int64Array:
+        """The leaf (n,) that holds each cell of ``codes`` (n,), -1 where none does."""
+        leaves = np.searchsorted(self.codes, codes, side="right") - 1
+        inside = leaves >= 0
+        held = leaves[inside]
+        leaves[inside] = np.where(codes[inside] < self.codes[held] + self.num_cells[held], held, -1)
+        return leaves
+
 
 class SemanticOctree:
     """An octree over the key space [-2^18, 2^18)^3 with ``num_classes`` occupied classes.

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import OutputError
+from octoreplay.mapping.surface import CellVotes, points_on_triangles
 from octoreplay.records import BoolArray, ClassTable, Color, Float64Array, Int32Array, SemanticClass, UInt8Array
 
 GRASS, DIRT_ROAD, BUILDING, ROOF, TRUNK, FOLIAGE, FENCE, CAR = range(1, 9)
@@ -111,19 +112,11 @@ class World:
     def surface_points(self, spacing: float) -> Iterator[tuple[Float64Array, UInt8Array]]:
         """Batches of points (P, 3) that lie at most ``spacing`` apart on all surfaces, with their classes (P,).
 
-        Every triangle is cut into n x n equal ones, and their centroids are given; n follows from its longest edge.
+        They are those of ``points_on_triangles``.
         """
         corners = self.vertices[self.triangles].astype(np.float64)
-        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        cuts = np.maximum(1, np.ceil(edges.max(axis=1) / spacing)).astype(np.int64)
-        for n in np.unique(cuts):
-            weights = _centroid_weights(int(n))
-            members = np.flatnonzero(cuts == n)
-            step = max(1, 1_000_000 // len(weights))
-            for start in range(0, len(members), step):
-                part = members[start : start + step]
-                points = np.einsum("pk,tkd->tpd", weights, corners[part]).reshape(-1, 3)
-                yield points, np.repeat(self.triangle_classes[part], len(weights))
+        for points, triangles in points_on_triangles(corners, spacing):
+            yield points, self.triangle_classes[triangles]
 
     def obstacle_mask(self, cell: float) -> npt.NDArray[np.bool_]:
         """Where a robot cannot drive, (n, n) bool over x, y from -size/2 in steps of ``cell`` metres.
@@ -168,20 +161,15 @@ def labelled_cells(world: World, resolution: float) -> tuple[Int32Array, UInt8Ar
     key = floor(coordinate / resolution). Surfaces are sampled every third of a cell's edge; the class with the most
     points in a cell wins, ties go to the lower id. What lies under the ground is left out. Keys are in ascending order.
     """
-    packed: list[npt.NDArray[np.int64]] = []
+    votes = CellVotes()
     for points, class_ids in world.surface_points(resolution / 3):
         buried = ~world.is_ground(class_ids) & (points[:, 2] < world.terrain.height(points[:, :2]) - 0.05)
         keys = np.floor(points[~buried] / resolution).astype(np.int64) + _KEY_OFFSET
-        packed.append((((keys[:, 0] << 18) + keys[:, 1] << 18) + keys[:, 2] << 8) + class_ids[~buried])
-    values, counts = np.unique(np.concatenate(packed), return_counts=True)
-    # Stable order by cell, then falling count: the first of each cell is its class, ties to the lower id.
-    values = values[np.lexsort((-counts, values >> 8))]
-    cells = values >> 8
-    values = values[np.concatenate([[True], cells[1:] != cells[:-1]])]
-    cells = values >> 8
+        votes.add(((keys[:, 0] << 18) + keys[:, 1] << 18) + keys[:, 2], class_ids[~buried])
+    cells, winners = votes.winners()
     mask = (1 << 18) - 1
     keys = np.stack([cells >> 36, (cells >> 18) & mask, cells & mask], axis=1) - _KEY_OFFSET
-    return keys.astype(np.int32), (values & 0xFF).astype(np.uint8)
+    return keys.astype(np.int32), winners
 
 
 _KEY_OFFSET = 1 << 17
@@ -467,16 +455,6 @@ def _make_terrain(rng: np.random.Generator) -> Terrain:
     numbers = 2 * math.pi / rng.uniform(35.0, 70.0, 4)
     vectors = numbers[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return Terrain(vectors, rng.uniform(0.0, 2 * math.pi, 4), rng.uniform(0.1, 0.3, 4))
-
-
-def _centroid_weights(n: int) -> Float64Array:
-    """Barycentric weights (n * n, 3) of the centroids when a triangle is cut into n x n equal ones."""
-    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    upright = np.stack([i, j], axis=-1)[i + j < n] + 1 / 3
-    inverted = np.stack([i, j], axis=-1)[i + j < n - 1] + 2 / 3
-    uv = np.concatenate([upright, inverted]) / n
-    weights: Float64Array = np.column_stack([uv, 1.0 - uv.sum(axis=1)])
-    return weights
 
 
 def _icosphere() -> tuple[Float64Array, list[tuple[int, int, int]]]:

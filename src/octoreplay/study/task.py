@@ -86,7 +86,7 @@ def _run(task: Task) -> Row:
     with open_result(unfinished) as result:
         row = run_numbers(summary, result.metrics)
     if task.truth is not None:
-        from octoreplay.evaluate.evaluation import evaluate_result  # type: ignore[import-not-found, unused-ignore]
+        from octoreplay.evaluate.evaluation import evaluate_result
 
         row |= truth_numbers(evaluate_result(unfinished, truth=Path(task.truth), over_time=False))
     if task.keep:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ import numpy.typing as npt
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.pcd import read_pcd
+from octoreplay.io.datasets.ply_files import raw_labels, read_ply
 from octoreplay.io.sensors.clouds import LABEL_FIELDS
-from octoreplay.io.sensors.labels import UNLABELLED
 
 FORMATS = {".pcd": "PCD", ".ply": "PLY", ".bin": "KITTI"}
 """What files with these endings are."""
@@ -60,7 +59,7 @@ def read_cloud(path: Path) -> Cloud:
     with np.errstate(over="ignore", invalid="ignore"):
         return Cloud(
             np.stack([columns[name] for name in "xyz"], axis=1).astype(kind),
-            None if label_field is None else _labels(columns[label_field]),
+            None if label_field is None else raw_labels(columns[label_field]),
             _rgb(columns),
             columns["intensity"].astype(np.float32) if "intensity" in columns else None,
             num_extra_columns,
@@ -83,36 +82,13 @@ def read_kitti_labels(path: Path, num_points: int) -> npt.NDArray[np.uint32]:
 
 def _read_ply(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The properties of the element 'vertex', in the machine's byte order."""
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        with path.open("rb") as file:
-            is_text = b"format ascii" in file.read(4096)
-            file.seek(0)
-            # Binary points are read at once, but from a true file only; a text needs its lines counted.
-            text = file.read() if is_text else b""
-            ply = PlyData.read(io.BytesIO(text) if is_text else file)
-            num_left = _lines(text) - sum(len(element) for element in ply) if is_text else len(file.read().strip())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path}: is cut or damaged: {error}; {_REMEDY}") from error
-    if num_left > 0:
-        raise InputError(f"{path}: is damaged: more follows than its header announces; {_REMEDY}")
-    if "vertex" not in ply:
-        raise InputError(f"{path}: has no element 'vertex', which a point cloud needs")
+    ply = read_ply(path, _REMEDY)
     points = ply["vertex"].data
     return {
         name: np.array(points[name], points[name].dtype.newbyteorder("="))
         for name in points.dtype.names or ()
         if points[name].dtype.kind in "iuf"
     }
-
-
-def _lines(text: bytes) -> int:
-    """The lines with anything in them after a PLY file's header."""
-    body = text.partition(b"end_header")[2]
-    return sum(bool(line.strip()) for line in body.splitlines())
 
 
 def _read_kitti(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -132,13 +108,6 @@ def _read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _labels(column: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
-    """Raw labels of a field of any type; what is negative or not finite, or -1 in 32 bits, is none."""
-    values = column.astype(np.float64)
-    is_label = (values >= 0) & (values < 2**32 - 1)
-    return np.where(is_label, values, UNLABELLED[1]).astype(np.uint32)
 
 
 def _rgb(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.uint32] | None:

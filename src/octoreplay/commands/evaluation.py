@@ -1,0 +1,58 @@
+"""The command that judges a result: evaluate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from octoreplay.commands.options import check_output, existing_path
+from octoreplay.commands.progress import progress_bar
+from octoreplay.config import CENTRAL
+
+
+@click.command(short_help="Judge a result's maps: IoU, coverage, calibration, agreement.")
+@click.argument("result", type=existing_path, metavar="RESULT.mcap")
+@click.option("--truth", type=existing_path, metavar="WORLD",
+              help="the truth: world.npz, the folder of a simulated team, or a labelled PLY file")  # fmt: skip
+@click.option("--against", default=CENTRAL, show_default=True, metavar="central|OTHER.mcap",
+              help="whose centralised map the maps should agree with: this result's, or another's")  # fmt: skip
+@click.option("--csv", type=existing_path, metavar="FILE.csv", help="every map's scores at every stored tick as CSV")
+@click.option("--json", type=existing_path, metavar="FILE.json", help="the same as JSON")
+@click.option("--plot", type=existing_path, metavar="DIR", help="figures: IoU, coverage, calibration, agreement")
+@click.option("--last", is_flag=True, help="the last stored maps alone, which is quick")
+def evaluate(
+    result: Path, truth: Path | None, against: str, csv: Path | None, json: Path | None, plot: Path | None, last: bool
+) -> int:
+    """Judge the maps of a result, over time and at the end.
+
+    Against the truth, where it is known: IoU per class, occupied and free cells found, coverage of the surface,
+    calibration of the probabilities. Without it: entropy, agreement with the centralised map, labels in dispute.
+    """
+    from octoreplay.evaluate.evaluation import evaluate_result, truth_beside_logs
+    from octoreplay.report import tables
+    from octoreplay.report.evaluation_files import write_evaluation
+    from octoreplay.report.evaluation_plots import write_evaluation_figures
+    from octoreplay.report.evaluation_tables import evaluation_tables
+
+    inputs = [result, *([truth] if truth is not None else []), Path(against)]
+    for path, suffix in ((csv, ".csv"), (json, ".json")):
+        if path is not None:
+            check_output(path, suffix, inputs)
+    out, err = tables.terminal(), tables.terminal(stderr=True)
+    with progress_bar("evaluate") as update:
+        evaluation = evaluate_result(
+            result, truth=truth, against=against, over_time=not last, progress=lambda share: update(share, None, "")
+        )
+    tables.show(out, evaluation_tables(evaluation))
+    if truth is None:
+        beside = truth_beside_logs(result)
+        found = "" if beside is None else f"; beside the logs lies {beside}"
+        err.print(f"IoU, coverage and calibration need the truth: --truth WORLD{found}", soft_wrap=True)
+    write_evaluation(evaluation, csv_path=csv, json_path=json)
+    written = [path for path in (csv, json) if path is not None]
+    if plot is not None:
+        written += write_evaluation_figures(evaluation, plot)
+    for path in written:
+        click.echo(f"wrote {path}")
+    return 0

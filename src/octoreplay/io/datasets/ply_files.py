@@ -1,0 +1,136 @@
+"""PLY files as they are there: all elements, and labelled points or triangles."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from octoreplay.errors import InputError
+from octoreplay.io.sensors.clouds import LABEL_FIELDS
+from octoreplay.io.sensors.labels import UNLABELLED
+from octoreplay.records import Float64Array, Int64Array
+
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+"""What the list of a face's vertices is called."""
+
+
+def read_ply(path: Path, remedy: str) -> Any:
+    """The file as plyfile's PlyData.
+
+    Raises InputError where it cannot be read, is cut or damaged, or has no element 'vertex'; ``remedy`` ends the
+    sentence.
+    """
+    from plyfile import PlyParseError
+
+    try:
+        with path.open("rb") as file:
+            is_text = b"format ascii" in file.read(4096)
+            file.seek(0)
+            # Binary elements are read at once, but from a true file only; a text needs its lines counted.
+            text = file.read() if is_text else b""
+            ply = _read_text(text) if is_text else _read_binary(file)
+            num_left = _lines(text) - sum(len(element) for element in ply) if is_text else len(file.read().strip())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: is cut or damaged: {error}; {remedy}") from error
+    if num_left > 0:
+        raise InputError(f"{path}: is damaged: more follows than its header announces; {remedy}")
+    if "vertex" not in ply:
+        raise InputError(f"{path}: has no element 'vertex', which points and meshes need; {remedy}")
+    return ply
+
+
+def _read_text(text: bytes) -> Any:
+    """A text file; where a cut leaves no rows, numpy would warn before plyfile finds them missing."""
+    from plyfile import PlyData
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return PlyData.read(io.BytesIO(text))
+
+
+def _read_binary(file: Any) -> Any:
+    """A binary file; triangles are read at once, faces of other sizes one by one."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        return PlyData.read(file, known_list_len={"face": dict.fromkeys(_FACE_LISTS, 3)})
+    except PlyParseError:
+        file.seek(0)
+        return PlyData.read(file)
+
+
+def _lines(text: bytes) -> int:
+    """The lines with anything in them after a PLY file's header."""
+    body = text.partition(b"end_header")[2]
+    return sum(bool(line.strip()) for line in body.splitlines())
+
+
+def raw_labels(column: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
+    """Raw labels of a column of any type; what is negative or not finite, or -1 in 32 bits, is none (65535)."""
+    values = column.astype(np.float64)
+    is_label = (values >= 0) & (values < 2**32 - 1)
+    return np.where(is_label, values, UNLABELLED[1]).astype(np.uint32)
+
+
+def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]:
+    """A mesh's triangles (T, 3, 3), or else a cloud's points (T, 1, 3), and their raw labels (T,).
+
+    Metres; faces of more than three vertices become fans of triangles. A file whose faces and vertices both have labels
+    is a mesh. Raises InputError where nothing has labels, and as ``read_ply`` does.
+    """
+    ply = read_ply(path, "write it again")
+    vertices = ply["vertex"].data
+    names = vertices.dtype.names or ()
+    missing = [name for name in "xyz" if name not in names or vertices[name].dtype.kind not in "iuf"]
+    if missing:
+        raise InputError(f"{path}: its vertices have no number '{missing[0]}'; write it with x, y and z in metres")
+    points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
+    labels = _label_column(ply, "face")
+    if labels is not None:
+        triangles, faces = _triangles(path, ply["face"].data, len(points))
+        return points[triangles], raw_labels(labels)[faces]
+    labels = _label_column(ply, "vertex")
+    if labels is None:
+        raise InputError(
+            f"{path}: neither its faces nor its vertices have labels; write one number for each as the property 'label'"
+        )
+    return points[:, None], raw_labels(labels)
+
+
+def _label_column(ply: Any, element: str) -> npt.NDArray[Any] | None:
+    """The labels of an element's rows; None without any."""
+    if element not in ply:
+        return None
+    rows = ply[element].data
+    present = set(rows.dtype.names or ())
+    names = (name for name in LABEL_FIELDS if name in present and rows[name].dtype.kind in "iuf")
+    return next((rows[name] for name in names), None)
+
+
+def _triangles(path: Path, faces: npt.NDArray[Any], num_vertices: int) -> tuple[Int64Array, Int64Array]:
+    """Vertices (T, 3) of the triangles that make up faces, and whose they are (T,)."""
+    name = next((name for name in _FACE_LISTS if name in (faces.dtype.names or ())), None)
+    if name is None:
+        raise InputError(f"{path}: its faces have no list 'vertex_indices'; write them with one")
+    lists = faces[name]
+    if lists.ndim == 2:
+        triangles, owners = lists.astype(np.int64), np.arange(len(lists))
+    else:
+        sizes = np.fromiter(map(len, lists), np.int64, len(lists))
+        flat = np.concatenate([np.empty(0, np.int64), *lists]).astype(np.int64)
+        num_triangles = np.maximum(sizes - 2, 0)
+        owners = np.repeat(np.arange(len(lists)), num_triangles)
+        first = (np.cumsum(sizes) - sizes)[owners]
+        # The n-th triangle of a fan has the first vertex and those after its n-th.
+        nth = np.arange(len(owners)) - (np.cumsum(num_triangles) - num_triangles)[owners]
+        triangles = flat[np.stack([first, first + nth + 1, first + nth + 2], axis=1)]
+    if triangles.size and (triangles.min() < 0 or triangles.max() >= num_vertices):
+        raise InputError(f"{path}: is damaged: a face names a vertex that is not there; write it again")
+    return triangles, owners

@@ -1,0 +1,288 @@
+"""Evaluations of small results with known answers, and of a recorded team."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dense_scores
+from octoreplay import Evaluation, evaluate_result, load_team_file, open_result, replay_team, resolve
+from octoreplay.config import CENTRAL
+from octoreplay.errors import InputError
+from octoreplay.evaluate.evaluation import truth_beside_logs
+from octoreplay.evaluate.records import MapScores
+from octoreplay.io.results.result_writer import ResultWriter
+from octoreplay.mapping.codec import encode_packet
+from octree_factory import cells_of, cube, octree_of
+from result_factory import state, write_result, write_until
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+FREE, GROUND, TREE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3)
+Cells = Mapping[tuple[int, ...], tuple[float, float]]
+
+HALF: Cells = cube((0, 0, 0), 4, FREE) | {(k, 0, 0): GROUND for k in range(4)}
+WHOLE: Cells = cube((0, 0, 0), 8, FREE) | {(k, 0, 0): GROUND for k in range(8)}
+TRUTH = {(k, 0, 0): 1 for k in range(10)} | {(0, 0, 9): 2}
+
+
+def packet(cells: Cells) -> bytes:
+    return encode_packet(octree_of(cells, resolution=0.2))
+
+
+def save_result(folder: Path, ticks: Mapping[int, Mapping[str, Cells]]) -> Path:
+    """A result that stores some maps after some ticks, as key frames."""
+    folder.mkdir(exist_ok=True)
+
+    def fill(writer: ResultWriter) -> None:
+        for sequence, (tick, maps) in enumerate(sorted(ticks.items())):
+            for name, cells in maps.items():
+                writer.write_state(state(name, sequence, tick, packet(cells), key=True))
+
+    return write_result(folder, fill)
+
+
+def save_truth(folder: Path, classes: Mapping[tuple[int, ...], int] = TRUTH, shift: int = 0) -> Path:
+    keys = np.array(list(classes), np.int32) + np.array([0, 0, shift], np.int32)
+    np.savez(
+        folder / "world.npz", keys=keys, class_ids=np.array(list(classes.values()), np.uint8),
+        resolution=np.float64(0.2), class_names=np.array(["ground", "tree"]),
+    )  # fmt: skip
+    return folder / "world.npz"
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """After tick 2 alpha knows half of what beta knows, after tick 4 both know the same."""
+    return save_result(
+        tmp_path,
+        {2: {"alpha": HALF, "beta": WHOLE, CENTRAL: WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE, CENTRAL: WHOLE}},
+    )
+
+
+def scores(evaluation: Evaluation, robot_id: str, tick: int = -1) -> MapScores:
+    return next(entry for entry in evaluation.ticks[tick].maps if entry.robot_id == robot_id)
+
+
+def same(a: object, b: object) -> bool:
+    """Equality in which NaN is NaN."""
+    return repr(a) == repr(b)
+
+
+def test_scores_over_time_and_at_the_end(result: Path, tmp_path: Path) -> None:
+    done: list[float] = []
+    evaluation = evaluate_result(result, truth=save_truth(tmp_path), progress=done.append)
+    assert evaluation.class_names == ("ground", "tree")
+    assert [(tick.tick, tick.seconds) for tick in evaluation.ticks] == [(2, 2.0), (4, 4.0)]
+    assert (len(done), done[-1]) == (2, 1.0)
+    alpha, beta, central = evaluation.ticks[0].maps
+    assert (alpha.robot_id, beta.robot_id, central.robot_id) == ("alpha", "beta", CENTRAL)
+    # Alpha misses what the team knows; in its own cells it is perfect.
+    assert (alpha.iou[0], alpha.mean_iou, alpha.mean_iou_known) == (0.5, 0.5, 1.0)
+    assert (alpha.coverage, beta.coverage) == (0.5, 1.0)
+    assert (alpha.world_coverage, beta.world_coverage) == (4 / 11, 8 / 11)
+    assert (alpha.num_cells, beta.num_cells) == (64, 512)
+    assert (alpha.agreement, alpha.agreement_occupied) == (64 / 512, 0.5)
+    assert (beta.agreement, beta.agreement_occupied, central.agreement) == (1.0, 1.0, 1.0)
+    assert (alpha.occupied_accuracy, alpha.free_accuracy) == (1.0, 1.0)
+    assert math.isnan(alpha.iou[1])
+    assert evaluation.ticks[0].label_disagreement == (512 - 64) / 512
+    assert evaluation.final.label_disagreement == 0.0
+    final = scores(evaluation, "alpha")
+    assert same(dataclasses.replace(final, robot_id="beta"), scores(evaluation, "beta"))
+    assert final.mean_iou == final.agreement == final.coverage == 1.0
+
+
+def test_entropy_and_calibration_are_those_of_the_distributions(result: Path, tmp_path: Path) -> None:
+    evaluation = evaluate_result(result, truth=save_truth(tmp_path))
+    classes = {key: 1 for key in TRUTH if TRUTH[key] == 1}
+    entropies = []
+    for values in WHOLE.values():
+        distribution = dense_scores.probabilities(values, 0.0, 1)
+        entropies.append(-np.sum(distribution * np.log2(distribution)))
+    for name, num_robots in (("alpha", 2), (CENTRAL, 1)):
+        found = scores(evaluation, name)
+        assert found.entropy_bits == pytest.approx(np.mean(entropies), abs=1e-6)
+        expected = [
+            dense_scores.calibration_error(WHOLE, classes, 0.0, robots, occupied=occupied)
+            for robots in (1, num_robots)
+            for occupied in (False, True)
+        ]
+        assert [
+            found.calibration_error, found.calibration_error_occupied, found.team_calibration_error,
+            found.team_calibration_error_occupied,
+        ] == pytest.approx(expected, abs=1e-6)  # fmt: skip
+
+
+def test_the_last_tick_alone_is_the_end_of_the_history(result: Path, tmp_path: Path) -> None:
+    truth = save_truth(tmp_path)
+    evaluation = evaluate_result(result, truth=truth, over_time=False)
+    assert same(evaluation.ticks, evaluate_result(result, truth=truth).ticks[-1:])
+
+
+def test_a_robot_without_a_stored_map_knows_nothing(tmp_path: Path) -> None:
+    path = save_result(tmp_path, {2: {"beta": WHOLE, CENTRAL: WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE}})
+    evaluation = evaluate_result(path, truth=save_truth(tmp_path))
+    alpha = scores(evaluation, "alpha", 0)
+    assert (alpha.num_cells, alpha.agreement, alpha.mean_iou, alpha.coverage) == (0, 0.0, 0.0, 0.0)
+    assert math.isnan(alpha.free_accuracy)
+    assert evaluation.ticks[0].label_disagreement == 1.0
+
+
+def test_without_a_truth_there_is_no_score_against_it(result: Path) -> None:
+    evaluation = evaluate_result(str(result))
+    assert evaluation.truth is None
+    alpha = scores(evaluation, "alpha", 0)
+    assert np.isnan([*alpha.iou, alpha.mean_iou, alpha.coverage, alpha.calibration_error]).all()
+    assert alpha.agreement == 64 / 512
+
+
+def test_without_a_centralised_map_the_run_says_what_agrees(tmp_path: Path) -> None:
+    path = save_result(tmp_path, {2: {"alpha": HALF, "beta": WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE}})
+    evaluation = evaluate_result(path, truth=save_truth(tmp_path))
+    assert evaluation.final.central is None
+    with open_result(path) as opened:
+        for tick in evaluation.ticks:
+            stored = next(metrics for metrics in opened.metrics if metrics.tick == tick.tick)
+            assert [entry.agreement for entry in tick.maps] == [robot.agreement for robot in stored.robots]
+            assert [entry.agreement_occupied for entry in tick.maps] == [r.agreement_occupied for r in stored.robots]
+    # What any robot knows stands for the team's evidence.
+    assert scores(evaluation, "alpha", 0).mean_iou == 0.5
+
+
+# --- against another result -------------------------------------------------------------------------------------------
+
+
+def test_a_result_agrees_with_itself(result: Path, tmp_path: Path) -> None:
+    own, other = evaluate_result(result), evaluate_result(result, against=result)
+    assert same(own.ticks, other.ticks)
+    assert (own.against, other.against) == (CENTRAL, str(result))
+    assert scores(other, CENTRAL, 0).agreement == scores(other, CENTRAL, 0).agreement_occupied == 1.0
+
+
+def test_a_shifted_result_does_not_agree(result: Path, tmp_path: Path) -> None:
+    shifted = {(x, y, z + 1): values for (x, y, z), values in WHOLE.items()}
+    other = save_result(tmp_path / "other", {2: {"alpha": HALF, CENTRAL: shifted}})
+    evaluation = evaluate_result(result, against=other)
+    beta = scores(evaluation, "beta", 0)
+    # Nine layers of 64; seven in common, of which the lowest has 8 cells of ground there.
+    assert beta.agreement == (7 * 64 - 8) / (9 * 64)
+    assert beta.agreement_occupied == 0.0
+    # The other one's last map stands for all later times.
+    assert scores(evaluation, CENTRAL).agreement == beta.agreement
+
+
+def test_the_other_result_is_asked_at_the_same_seconds(result: Path, tmp_path: Path) -> None:
+    other = save_result(tmp_path / "other", {3: {"alpha": HALF, CENTRAL: HALF}, 4: {"alpha": HALF, CENTRAL: WHOLE}})
+    evaluation = evaluate_result(result, against=other)
+    assert math.isnan(scores(evaluation, "beta", 0).agreement)
+    assert scores(evaluation, "beta").agreement == 1.0
+
+
+def test_a_reference_that_does_not_fit(result: Path, tmp_path: Path) -> None:
+    bare = save_result(tmp_path / "bare", {2: {"alpha": HALF}})
+    with pytest.raises(InputError, match=r"bare/result\.mcap: holds no centralised map"):
+        evaluate_result(result, against=bare)
+    config = resolve(load_team_file(FIXTURES / "pair" / "team.yaml")).with_parameters({"duration": 0.5})
+    replay_team(config, tmp_path / "pair.mcap")
+    with pytest.raises(InputError, match=r"pair\.mcap: has classes other than .*result\.mcap"):
+        evaluate_result(result, against=tmp_path / "pair.mcap")
+    replay_team(config.with_parameters({"resolution": 0.4}), tmp_path / "coarse.mcap")
+    with pytest.raises(InputError, match=r"coarse\.mcap: has a resolution other than .*pair\.mcap"):
+        evaluate_result(tmp_path / "pair.mcap", against=tmp_path / "coarse.mcap")
+    with pytest.raises(InputError, match=r"none\.mcap: cannot be read"):
+        evaluate_result(result, against=tmp_path / "none.mcap")
+
+
+# --- what cannot be evaluated -----------------------------------------------------------------------------------------
+
+
+def test_a_truth_that_lies_elsewhere(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"world\.npz: none of its surface lies where the maps of .* know anything"):
+        evaluate_result(result, truth=save_truth(tmp_path, shift=100))
+
+
+def test_a_result_without_maps(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"result\.mcap: holds no map"):
+        evaluate_result(write_result(tmp_path))
+
+
+def test_maps_without_metrics(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"result\.mcap: damaged: tick 9 has maps but no metrics"):
+        evaluate_result(save_result(tmp_path, {9: {"alpha": WHOLE, "beta": WHOLE, CENTRAL: WHOLE}}))
+
+
+def test_an_interrupted_run_without_a_tick(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):
+        write_until(ZeroDivisionError, tmp_path / "empty.mcap", [])
+    for path in tmp_path.glob("*.mcap"):
+        with pytest.raises(InputError):
+            evaluate_result(path)
+
+
+# --- a recorded team --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result of the pair, with a prior that is not uniform."""
+    config = resolve(load_team_file(FIXTURES / "pair" / "team.yaml"))
+    path = tmp_path_factory.mktemp("pair") / "pair.mcap"
+    replay_team(config.with_parameters({"state_every": 1.0, "prob_free": 0.2, "rule": "bayes"}), path)
+    return path
+
+
+def test_what_the_run_measured_is_found_again(pair: Path) -> None:
+    evaluation = evaluate_result(pair)
+    assert len(evaluation.ticks) > 3
+    with open_result(pair) as opened:
+        by_tick = {metrics.tick: metrics for metrics in opened.metrics}
+    for tick in evaluation.ticks:
+        stored = by_tick[tick.tick]
+        assert tick.label_disagreement == stored.label_disagreement
+        for found, robot in zip(tick.maps, stored.robots, strict=False):
+            assert (found.robot_id, found.is_active, found.num_cells) == (robot.robot_id, robot.active, robot.num_cells)
+            assert (found.agreement, found.agreement_occupied) == (robot.agreement, robot.agreement_occupied)
+            assert found.entropy_bits == pytest.approx(robot.entropy_bits)
+    again = evaluate_result(pair, against=pair)
+    for own, other in zip(evaluation.ticks, again.ticks, strict=True):
+        assert [entry.agreement for entry in own.maps] == pytest.approx([entry.agreement for entry in other.maps])
+        assert [entry.agreement_occupied for entry in own.maps] == pytest.approx(
+            [entry.agreement_occupied for entry in other.maps]
+        )
+
+
+def test_a_recorded_team_against_its_truth_cell_by_cell(pair: Path) -> None:
+    evaluation = evaluate_result(pair, truth=FIXTURES / "pair", over_time=False)
+    with np.load(FIXTURES / "pair" / "world.npz") as world, open_result(pair) as opened:
+        classes = dict(zip(map(tuple, world["keys"].tolist()), world["class_ids"].tolist(), strict=True))
+        maps = {name: opened.map(name) for name in (opened.robots[0], CENTRAL)}
+        num_classes, prior = opened.class_table.num_classes, maps[CENTRAL].prior
+    team = cells_of(maps[CENTRAL].octree)
+    for name, stored in maps.items():
+        found = scores(evaluation, name)
+        cells = {key: tuple(np.frombuffer(data, np.float32).tolist()) for key, data in cells_of(stored.octree).items()}
+        assert found.iou == pytest.approx(dense_scores.iou(cells, team, classes, prior), nan_ok=True)
+        assert len(found.iou) == num_classes
+        assert (found.occupied_accuracy, found.free_accuracy) == pytest.approx(
+            dense_scores.accuracies(cells, classes, prior)
+        )
+        assert found.coverage == pytest.approx(dense_scores.coverage(cells, team, classes, prior))
+        assert found.world_coverage == pytest.approx(dense_scores.coverage(cells, classes, classes, prior))
+        robots = 1 if name == CENTRAL else 2
+        assert found.team_calibration_error == pytest.approx(
+            dense_scores.calibration_error(cells, classes, prior, robots), abs=1e-4
+        )
+    assert 0.2 < found.mean_iou < 1.0
+    assert found.coverage > 0.4
+
+
+def test_the_truth_beside_the_logs_is_named(pair: Path, result: Path) -> None:
+    found = truth_beside_logs(pair)
+    assert found is not None
+    assert found.resolve() == FIXTURES / "pair" / "world.npz"
+    assert truth_beside_logs(result) is None

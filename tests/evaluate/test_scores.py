@@ -1,0 +1,232 @@
+"""Scores over spans against the cell-by-cell twin, and by hand."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dense_scores
+from octoreplay.evaluate.runs import Region
+from octoreplay.evaluate.scores import agreement, no_truth_scores, truth_scores
+from octoreplay.evaluate.truth import Truth
+from octoreplay.mapping.octree import SemanticOctree, keys_to_codes
+from octree_factory import cells_of, cube, octree_of
+
+FREE, GROUND, TREE, UNSURE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3), (-0.3, -0.4)
+VALUES = (FREE, GROUND, TREE, UNSURE, (0.25, 0.7), (-0.9, 0.35))
+
+
+def truth_of(classes):
+    """A truth of {key: class_id, or -1 for a class that the result does not have}."""
+    keys = np.array(list(classes), np.int64).reshape(-1, 3)
+    codes, numbers = keys_to_codes(keys), np.array([max(number, 0) for number in classes.values()], np.uint8)
+    order = np.argsort(codes)
+    return Truth(Path("truth.ply"), codes[order], numbers[order])
+
+
+def scores_of(cells, classes, *, prior=0.0, num_robots=1, team=None, observed=None):
+    """The scores of a map of some cells, where the team knows ``team`` and at the end ``observed``."""
+    octree, truth = octree_of(cells), truth_of(classes)
+    region = Region([octree_of(cells if team is None else team).spans()])
+    at_end = region if observed is None else Region([octree_of(observed).spans()])
+    return truth_scores(octree.spans(), prior, num_robots, truth, region, at_end.holds(truth.codes))
+
+
+@st.composite
+def scenes(draw):
+    """Cells of a map, of its team and of its team at the end, and a truth; all random, with large leaves among them."""
+    key = st.tuples(*[st.integers(-3, 6)] * 3)
+    cells, team, observed = {}, {}, {}
+    for content in (cells, team, observed):
+        for corner, edge, values in draw(
+            st.lists(st.tuples(key, st.sampled_from((1, 1, 2, 4)), st.sampled_from(VALUES)), min_size=1, max_size=6)
+        ):
+            content |= cube([edge * (k // edge) for k in corner], edge, values)
+    if draw(st.booleans()):
+        team |= cells
+    known = sorted(cells)
+    places = draw(st.lists(st.one_of(st.sampled_from(known), key), min_size=1, max_size=40))
+    classes = {place: draw(st.sampled_from((1, 1, 2, 2, -1))) for place in places}
+    return cells, team, observed, classes
+
+
+@settings(max_examples=80, deadline=None)
+@given(scenes(), st.sampled_from((0.0, -0.8, 0.15)), st.sampled_from((1, 3)))
+def test_spans_say_what_scikit_learn_says_of_cells(scene, prior, num_robots):
+    cells, team, observed, classes = scene
+    found = scores_of(cells, classes, prior=prior, num_robots=num_robots, team=team, observed=observed)
+    iou = dense_scores.iou(cells, team, classes, prior)
+    iou_known = dense_scores.iou(cells, cells, classes, prior)
+    accuracies = dense_scores.accuracies(cells, classes, prior)
+    expected = (
+        *iou,
+        np.mean(iou[~np.isnan(iou)]) if not np.isnan(iou).all() else np.nan,
+        np.mean(iou_known[~np.isnan(iou_known)]) if not np.isnan(iou_known).all() else np.nan,
+        *accuracies,
+        dense_scores.coverage(cells, observed, classes, prior),
+        dense_scores.coverage(cells, classes, classes, prior),
+        *(
+            dense_scores.calibration_error(cells, classes, prior, robots, occupied=occupied)
+            for robots in (1, num_robots)
+            for occupied in (False, True)
+        ),
+    )
+    np.testing.assert_allclose((*found.iou, *found[1:]), expected, atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(scenes(), st.sampled_from((0.0, -0.8)))
+def test_agreement_is_counted_cell_by_cell(scene, prior):
+    cells, reference, _, _ = scene
+    both = {**reference, **cells}
+    labels = {
+        key: [
+            int(np.argmax(dense_scores.probabilities(c[key], prior, 1))) if key in c else -1 for c in (cells, reference)
+        ]
+        for key in both
+    }
+    occupied = [pair for pair in labels.values() if pair[1] > 0]
+    expected = (
+        np.mean([a == b for a, b in labels.values()]),
+        np.mean([a == b for a, b in occupied]) if occupied else 1.0,
+    )
+    found = agreement(octree_of(cells).spans(), prior, octree_of(reference).spans(), prior, len(both))
+    np.testing.assert_allclose(found, expected)
+
+
+def test_a_tie_in_the_reference_is_agreement():
+    here = octree_of({(0, 0, 0): (1.0, 2.0), (1, 0, 0): FREE})
+    there = octree_of({(0, 0, 0): (2.0, 1.9995), (1, 0, 0): (0.0005, 0.0)})
+    assert agreement(here.spans(), 0.0, there.spans(), 0.0, 2) == (1.0, 1.0)
+    there = octree_of({(0, 0, 0): (2.0, 1.99), (1, 0, 0): (0.01, 0.0)})
+    assert agreement(here.spans(), 0.0, there.spans(), 0.0, 2) == (0.0, 0.0)
+
+
+def test_a_perfect_map_scores_one():
+    cells = cube((0, 0, 0), 8, FREE) | cube((0, 0, 0), 4, GROUND) | {(4, 4, 4): TREE}
+    classes = dict.fromkeys(cube((0, 0, 0), 4, GROUND), 1) | {(4, 4, 4): 2}
+    found = scores_of(cells, classes)
+    assert (found.iou, found.mean_iou, found.mean_iou_known) == ((1.0, 1.0), 1.0, 1.0)
+    assert (found.occupied_accuracy, found.free_accuracy, found.coverage, found.world_coverage) == (1, 1, 1, 1)
+    sure = dense_scores.probabilities(FREE, 0.0, 1).max() * 447, dense_scores.probabilities(GROUND, 0.0, 1).max() * 64
+    tree = dense_scores.probabilities(TREE, 0.0, 1).max()
+    assert found.calibration_error == pytest.approx(1 - (sum(sure) + tree) / 512, abs=1e-6)
+    assert found.calibration_error_occupied == pytest.approx(1 - (sure[1] + tree) / 65, abs=1e-6)
+
+
+def test_counts_worked_out_by_hand():
+    # Six cells of ground: three found, one called tree, one called free, one unknown; two free cells called ground.
+    cells = {(k, 0, 0): values for k, values in enumerate((GROUND, GROUND, GROUND, TREE, FREE))}
+    cells |= {(0, 1, 0): GROUND, (1, 1, 0): GROUND, (2, 1, 0): FREE, (3, 1, 0): FREE}
+    classes = {(k, 0, 0): 1 for k in range(6)} | {(9, 9, 9): 2}
+    team = cells | {(5, 0, 0): FREE}
+    found = scores_of(cells, classes, team=team)
+    assert found.iou == (3 / 8, 0.0)
+    assert found.mean_iou == 3 / 16
+    # Without the cell that the map does not know; the tree stands nowhere but in the map.
+    assert found.mean_iou_known == (3 / 7) / 2
+    assert (found.occupied_accuracy, found.free_accuracy) == (4 / 5, 2 / 4)
+    assert (found.coverage, found.world_coverage) == (4 / 6, 4 / 7)
+
+
+def test_a_class_in_neither_truth_nor_map_has_no_iou():
+    found = scores_of({(0, 0, 0): GROUND, (1, 0, 0): FREE}, {(0, 0, 0): 1})
+    assert found.iou[0] == 1.0
+    assert np.isnan(found.iou[1])
+    assert found.mean_iou == 1.0
+
+
+def test_surface_of_a_class_that_the_result_does_not_have_counts_for_nothing():
+    cells = {(0, 0, 0): GROUND, (1, 0, 0): TREE, (2, 0, 0): FREE, (3, 0, 0): FREE}
+    without = {key: value for key, value in cells.items() if key not in ((1, 0, 0), (2, 0, 0))}
+    assert scores_of(cells, {(0, 0, 0): 1, (1, 0, 0): -1, (2, 0, 0): -1})[2:] == scores_of(without, {(0, 0, 0): 1})[2:]
+
+
+def test_calibration_by_hand():
+    # Two cells 0.9 sure, one of them right; two 0.6 sure, both right: (2 |0.5 - 0.9| + 2 |1 - 0.6|) / 4.
+    sure, unsure = (np.log(18.0), 0.0), (np.log(3.0), 0.0)
+    cells = {(0, 0, 0): sure, (2, 0, 0): sure, (4, 0, 0): unsure, (6, 0, 0): unsure}
+    found = scores_of(cells, {(0, 0, 0): 1, (2, 0, 0): 2, (4, 0, 0): 1, (6, 0, 0): 1})
+    assert found.calibration_error == pytest.approx(0.4, abs=1e-6)
+    assert found.calibration_error == found.calibration_error_occupied == found.team_calibration_error
+
+
+def test_the_team_posterior_is_calibrated_where_the_robots_share_is_not():
+    # A million right to one: ten robots' mean of it is a tenth of the log-odds.
+    cells = cube((0, 0, 0), 4, (np.log(1e6) / 10, -3.0))
+    found = scores_of(cells, dict.fromkeys(cells, 1), num_robots=10)
+    assert found.calibration_error > 0.15
+    assert found.team_calibration_error < 1e-5
+
+
+def test_the_team_posterior_has_labels_of_its_own():
+    # With this prior 0.7 of evidence leaves the cell free, and three times as much does not.
+    cells = {(0, 0, 0): (0.25, 0.7), (3, 0, 0): FREE}
+    found = scores_of(cells, {(0, 0, 0): 2}, prior=-0.8, num_robots=3)
+    assert found.occupied_accuracy == 0.0
+    for error, num_robots in ((found.calibration_error, 1), (found.team_calibration_error, 3)):
+        expected = dense_scores.calibration_error(cells, {(0, 0, 0): 2}, -0.8, num_robots)
+        assert error == pytest.approx(expected, abs=1e-6)
+
+
+def test_there_are_fifteen_bins():
+    # 0.93 and 0.90 share the bin from 13/15 to 14/15: one right and one wrong there is |1 - 1.83| / 2.
+    cells = {(2 * k, 0, 0): (np.log(2 * p / (1 - p)), 0.0) for k, p in enumerate((0.9, 0.93))}
+    confidences = [dense_scores.probabilities(values, 0.0, 1).max() for values in cells.values()]
+    assert [int(15 * confidence) for confidence in confidences] == [13, 13]
+    found = scores_of(cells, {(0, 0, 0): 1, (2, 0, 0): 2})
+    assert found.calibration_error == pytest.approx(abs(1 - sum(confidences)) / 2, abs=1e-6)
+
+
+def test_a_shifted_map_scores_less():
+    keys = list(itertools.product(range(8), range(8), range(8)))
+    cells = {key: GROUND if key[2] < 4 else FREE for key in keys}
+    classes = {key: 1 for key in keys if key[2] < 4}
+    shifted = {(x, y, z + 1): values for (x, y, z), values in cells.items()}
+    right, wrong = (scores_of(moved, classes, team=cells) for moved in (cells, shifted))
+    assert right.mean_iou == 1.0
+    assert wrong.mean_iou == 3 / 5
+    assert (wrong.coverage, wrong.free_accuracy) == (3 / 4, 4 / 5)
+    spans = [octree_of(content).spans() for content in (cells, shifted)]
+    assert agreement(spans[0], 0.0, spans[0], 0.0, 512) == (1.0, 1.0)
+    assert agreement(spans[1], 0.0, spans[0], 0.0, 576) == (6 * 64 / 576, 3 / 4)
+
+
+def test_an_empty_map_knows_nothing():
+    empty = SemanticOctree(0.25, 2).spans()
+    truth = truth_of({(0, 0, 0): 1})
+    region = Region([octree_of({(0, 0, 0): GROUND}).spans()])
+    found = truth_scores(empty, 0.0, 3, truth, region, np.array([True]))
+    assert (found.iou[0], found.mean_iou, found.coverage, found.world_coverage) == (0.0, 0.0, 0.0, 0.0)
+    assert np.isnan([found.mean_iou_known, found.occupied_accuracy, found.calibration_error]).all()
+    assert agreement(empty, 0.0, empty, 0.0, 0) == (1.0, 1.0)
+    assert Region([empty]).num_cells == 0
+    assert Region([]).num_inside(octree_of({(0, 0, 0): GROUND}).spans()).tolist() == [0]
+
+
+def test_without_a_truth_everything_is_nan():
+    scores = no_truth_scores(3)
+    assert len(scores.iou) == 3
+    assert np.isnan([*scores.iou, *scores[1:]]).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(scenes())
+def test_a_region_holds_what_any_map_knows(scene):
+    maps = [octree_of(content) for content in scene[:3]]
+    known = set().union(*map(cells_of, maps))
+    region = Region([octree.spans() for octree in maps])
+    assert region.num_cells == len(known)
+    around = list(itertools.product(range(-5, 9), repeat=3))
+    assert region.holds(keys_to_codes(np.array(around, np.int64))).tolist() == [key in known for key in around]
+    spans = octree_of(scene[0]).spans()
+    assert Region([maps[1].spans()]).num_inside(spans).sum() == len(set(scene[0]) & set(scene[1]))
+    leaves = spans.leaves_at(keys_to_codes(np.array(around, np.int64)))
+    is_known = leaves >= 0
+    assert is_known.tolist() == [key in scene[0] for key in around]
+    assert (np.bincount(leaves[is_known], minlength=spans.codes.size) == spans.num_cells).all()

@@ -1,0 +1,52 @@
+"""Figures of evaluations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evaluation_factory import evaluation
+from octoreplay.errors import OutputError
+from octoreplay.report import evaluation_plots
+from octoreplay.report.evaluation_plots import write_evaluation_figures
+
+NAMES = ["agreement.png", "iou.png", "class_iou.png", "coverage.png", "calibration.png"]
+
+
+def test_figures_are_pictures_and_equal_every_time(tmp_path: Path) -> None:
+    paths = write_evaluation_figures(evaluation(), tmp_path / "a")
+    assert [path.name for path in paths] == NAMES
+    again = write_evaluation_figures(evaluation(), tmp_path / "b")
+    for path, other in zip(paths, again, strict=True):
+        assert path.read_bytes() == other.read_bytes()
+        assert np.asarray(Image.open(path).convert("L")).std() > 5
+
+
+@pytest.mark.parametrize("has_central", [True, False])
+@pytest.mark.parametrize("num_ticks", [1, 2])
+def test_one_tick_and_no_centralised_map_are_drawn(tmp_path: Path, num_ticks: int, has_central: bool) -> None:
+    judged = evaluation(num_ticks, has_central=has_central)
+    assert len(write_evaluation_figures(judged, tmp_path)) == len(NAMES)
+
+
+def test_without_truth_only_agreement_is_drawn(tmp_path: Path) -> None:
+    paths = write_evaluation_figures(evaluation(has_truth=False), tmp_path)
+    assert [path.name for path in paths] == ["agreement.png"]
+
+
+def test_curves_show_the_numbers() -> None:
+    judged = evaluation(6)
+    figure = evaluation_plots._curves("title", "label", judged.ticks, "coverage")
+    mean, central = figure.axes[0].lines
+    np.testing.assert_allclose(mean.get_ydata(), [tick.mean("coverage") for tick in judged.ticks])
+    np.testing.assert_allclose(central.get_ydata(), [t.central.coverage for t in judged.ticks if t.central is not None])
+    np.testing.assert_allclose(mean.get_xdata(), [tick.seconds for tick in judged.ticks])
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_evaluation_figures(evaluation(), tmp_path / "file")
