@@ -180,3 +180,10 @@ def test_numbers_are_for_comparing(value: float, text: str) -> None:
 def test_values_that_differ_a_little_look_different() -> None:
     row = CheckRow("min_agreement", 0.999, 0.9989999999, "alpha", None, None, passed=False)
     assert verdict_tables._values(row) == ("at least 0.999", "0.9989999999")
+
+
+def test_limits_hold_against_the_true_world(runs: dict[str, Path]) -> None:
+    world = FIXTURES / "pair" / "world.npz"
+    text = ends(0, "check", runs["pair"], "--truth", world, "--min-coverage", 0.5, "--min-mean-iou", 0.05)
+    assert text.endswith("\npassed: all 2 checks\n")
+    assert "failed: 1 of 1 check" in ends(1, "check", runs["pair"], "--truth", world, "--min-coverage", 1)

@@ -8,7 +8,6 @@ import math
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +21,6 @@ from octoreplay.evaluate.comparison import LabelChange, compare_results
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
-from octoreplay.mapping.octree import LeafSpans, codes_to_keys, keys_to_codes
 from result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25

@@ -1,4 +1,4 @@
-"""Experiments that one command repeats: octoreplay experiment paper."""
+"""Experiments that one command repeats: octoreplay experiment NAME."""
 
 from __future__ import annotations
 
@@ -72,6 +72,56 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
         ),
     )
     return 0
+
+
+def _with_question(name: str, duration: float, num_villages: int, question: str) -> None:
+    """Add the command of one of the questions."""
+
+    @experiment.command(name, short_help=question)
+    @click.argument("folder", type=existing_path, metavar="[DIR]", default=Path(f"octoreplay-{name}"), required=False)
+    @click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]")
+    @click.option("--villages", type=click.IntRange(1, 100), default=num_villages, show_default=True,
+                  help="so many villages, each with a team of its own")  # fmt: skip
+    @click.option("--jobs", type=int, metavar="N", help="runs at once on this machine  [default: its processors]")
+    @click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster, but for what is timed")
+    def answer(folder: Path, duration: float, villages: int, jobs: int | None, scheduler: str | None) -> int:
+        from octoreplay.io.text_files import write_whole
+        from octoreplay.report import tables
+        from octoreplay.report.experiment_plots import figures
+        from octoreplay.report.experiment_tables import answer_tables
+        from octoreplay.report.figures import save_figures
+        from octoreplay.study.experiments import run_experiment
+        from octoreplay.study.questions import QUESTIONS
+
+        with progress_bar(name) as update:
+            found = run_experiment(
+                QUESTIONS[name](duration, villages), folder, num_jobs=jobs, scheduler=scheduler,
+                progress=lambda stage, share: update(share, None, stage),
+            )  # fmt: skip
+        summary = folder / "tables.md"
+        write_whole(summary, answer_tables(name, found))
+        written = {
+            **dict.fromkeys(save_figures(figures(name, found), folder / "figures"), "figure"),
+            summary: "the answer as tables",
+            **{folder / f"{plan}.csv": "every run" for plan in found},
+        }
+        tables.show(tables.terminal(), tables.made_files(written))
+        return 0
+
+    answer.help = (
+        f"{question}\n\nSimulates the teams, runs the sweeps and writes tables and figures into DIR. The same command"
+        " goes on where it was stopped."
+    )
+
+
+for _name, _duration, _num_villages, _question in (
+    ("rules", 60.0, 3, "Which rule, on which graph?"),
+    ("steps", 60.0, 1, "How do epsilon and gamma trade consensus against the robots' own evidence?"),
+    ("scale", 20.0, 1, "How many robots, cells and classes are mapped in real time?"),
+    ("noise", 60.0, 1, "What does consensus repair of noisy labels, poses and depths, and what does it spread?"),
+    ("choose", 60.0, 2, "Which settings for a good radio, for a poor one, and for many robots?"),
+):
+    _with_question(_name, _duration, _num_villages, _question)
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig) -> Path:

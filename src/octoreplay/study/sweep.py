@@ -58,6 +58,10 @@ class Sweep:
         """The runs that failed; their ``error`` says why."""
         return tuple(row for row in self.rows if row["status"] == FAILED)
 
+    def result(self, row: Row) -> Path:
+        """Where the result of a run is kept, of a sweep that keeps them."""
+        return SweepFolder(self.folder).result(_name({name: row[name] for name in ("team", *self.names, "seed")}))
+
     @property
     def lost_data(self) -> bool:
         """True when any log was cut or any frame could not be used."""
@@ -223,7 +227,7 @@ def _task(
     robots = tuple(robot.with_absolute_paths() for robot in run.config.robots)
     config = dataclasses.replace(run.config, robots=robots)
     team = dump_team(config)
-    name = ",".join(f"{key}={value}" for key, value in labels.items())
+    name = _name(labels)
     return Task(
         name=name,
         key=keys.key(config, team, truth),
@@ -236,6 +240,11 @@ def _task(
         version=__version__,
         num_threads=num_threads,
     )
+
+
+def _name(labels: Mapping[str, Any]) -> str:
+    """A run's name, from what tells it from the others."""
+    return ",".join(f"{key}={value}" for key, value in labels.items())
 
 
 def _labels(teams: Sequence[Path]) -> dict[str, Path]:

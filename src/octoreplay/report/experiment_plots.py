@@ -1,0 +1,203 @@
+"""The experiments' answers as figures, from the rows of their sweeps (docs/experiments.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from octoreplay.report.experiment_tables import Key, Row, Tables, groups, mean, of_noise, variant
+from octoreplay.report.figures import BLUE, COLORS, GREEN, GREY, MARKERS, ORANGE, legend_below, new_figure, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_RULE_COLORS = {"local": GREY, "gradient": BLUE, "bayes": ORANGE, "central": GREEN}
+
+
+def figures(name: str, found: Tables) -> dict[str, Figure]:
+    """An experiment's figures by their file names."""
+    makers = {"rules": _rules, "steps": _steps, "scale": _scale, "noise": _noise, "choose": _choose}
+    return makers[name](found)
+
+
+def _rules(found: Tables) -> dict[str, Figure]:
+    """Each rule a line, each graph a mark: disagreement, agreement, truth, bytes."""
+    rows = found["rules"]
+    labels = list(dict.fromkeys(variant(row) for row in rows))
+    figure = new_figure(13.0, 5.2)
+    panels = figure.subplots(1, 4, sharey=True)
+    for axes, (column, title, scale) in zip(
+        panels,
+        (("total_distance_all_log_end", "Φ, all pairs, at the log's end", 1.0),
+         ("agreement_occupied_mean", "agreement over the log, occupied", 1.0),
+         ("mean_iou", "mean IoU, settled", 1.0),
+         ("sent_bytes_per_second", "kB a robot and second", 1e-3)),
+        strict=True,
+    ):  # fmt: skip
+        style(axes, title)
+        for index, ((topology,), part) in enumerate(groups(rows, "topology").items()):
+            values = {variant(own[0]): own for own in groups(part, "rule", "evidence", "gamma", "gamma_power").values()}
+            places = [labels.index(label) + 0.16 * (index - 1.5) for label in values]
+            axes.plot(
+                [mean(own, column) * scale for own in values.values()], places, MARKERS[index], color=COLORS[index],
+                markersize=5, label=topology,
+            )  # fmt: skip
+        if column in ("total_distance_all_log_end", "sent_bytes_per_second"):
+            axes.set_xscale("log")
+    panels[2].axvline(mean(rows, "central_mean_iou"), color="black", linewidth=1, linestyle="--")
+    panels[0].set_yticks(range(len(labels)), labels, fontsize=9)
+    panels[0].invert_yaxis()
+    legend_below(figure, panels[0])
+    return {"rules.png": figure}
+
+
+def _steps(found: Tables) -> dict[str, Figure]:
+    return {"steps.png": _trade_off(found["steps"]), "bound.png": _bound(found["bound"])}
+
+
+def _trade_off(rows: Sequence[Row]) -> Figure:
+    """Every pair of steps as a square, for both rules that have two of them."""
+    columns = (
+        ("total_distance_all_log_end", "Φ, all pairs, at the log's end", "{:.1e}"),
+        ("agreement_occupied_mean", "agreement over the log, occupied", "{:.3f}"),
+        ("agreement_occupied", "agreement settled, occupied", "{:.4f}"),
+    )
+    by_rule = groups(rows, "rule")
+    figure = new_figure(13.0, 3.4 * len(by_rule))
+    panels = figure.subplots(len(by_rule), len(columns), squeeze=False)
+    for line, ((rule,), part) in zip(panels, by_rule.items(), strict=True):
+        for axes, (column, title, form) in zip(line, columns, strict=True):
+            _squares(axes, part, column, form)
+            axes.set_title(f"{rule}: {title}", loc="left", fontsize=10)
+    return figure
+
+
+def _squares(axes: Axes, rows: Sequence[Row], column: str, form: str) -> None:
+    """The mean of a column for every epsilon and gamma, written into squares; darker is worse."""
+    epsilons, gammas = ([key for (key,) in groups(rows, name)] for name in ("epsilon", "gamma"))
+    cells = groups(rows, "epsilon", "gamma")
+    values = np.array([[mean(cells.get((e, g), []), column) for g in gammas] for e in epsilons])
+    shade = -np.log10(np.maximum(values, 1e-12)) if column.startswith("total") else values
+    axes.imshow(shade, cmap="viridis", aspect="auto")
+    middle = np.nanmean([np.nanmin(shade), np.nanmax(shade)])
+    for (y, x), value in np.ndenumerate(values):
+        color = "white" if shade[y, x] < middle else "black"
+        axes.text(x, y, form.format(value), ha="center", va="center", fontsize=7.5, color=color)
+    axes.set_xticks(range(len(gammas)), gammas)
+    axes.set_yticks(range(len(epsilons)), epsilons)
+    axes.set_xlabel("gamma")
+    axes.set_ylabel("epsilon")
+
+
+def _bound(rows: Sequence[Row]) -> Figure:
+    """How Phi shrinks while a team settles: what theory says as lines, what was measured as marks."""
+    figure = new_figure(7.0, 4.2)
+    axes = style(figure.add_subplot(), "Mixing alone (bayes, settling)", "epsilon / bound", "Φ shrinks in a tick by")
+    for index, ((topology,), part) in enumerate(groups(rows, "topology").items()):
+        shares = [row["epsilon_share"] for row in part]
+        for name, form, label in (("contraction_theory", "-", f"{topology}, theory"), ("contraction", "", topology)):
+            values = [row[name] for row in part]
+            axes.plot(
+                shares, values, form or MARKERS[index], color=COLORS[index], label=label, markersize=5, linewidth=1.2
+            )
+    axes.axvline(1.0, color="black", linewidth=1, linestyle="--")
+    axes.axhline(1.0, color="black", linewidth=1, linestyle=":")
+    axes.set_ylim(0.0, 1.25)
+    legend_below(figure, axes)
+    return figure
+
+
+def _scale(found: Tables) -> dict[str, Figure]:
+    """Speed, memory and bytes over robots, resolution and classes."""
+    figure = new_figure(12.0, 8.0)
+    panels = figure.subplots(3, 3, sharex="col", sharey="row")
+    quantities = (
+        ("realtime_factor", "times real time", 1.0),
+        ("peak_rss_bytes", "peak memory [MB]", 1e-6),
+        ("sent_bytes_per_second", "kB a robot and second", 1e-3),
+    )
+    for column, (plan, name, x_label, series) in enumerate((
+        ("robots", "num_robots", "robots", "topology"),
+        ("resolution", "resolution", "resolution [m]", "rule"),
+        ("classes", "num_classes", "classes", "rule"),
+    )):  # fmt: skip
+        for line, (quantity, label, factor) in enumerate(quantities):
+            axes = style(panels[line, column], "", x_label if line == 2 else "", label if column == 0 else "")
+            for index, ((key,), rows) in enumerate(groups(found[plan], series).items()):
+                _line(axes, rows, name, quantity, factor, COLORS[index + (3 if plan == "robots" else 0)], str(key))
+            axes.set_yscale("log")
+            axes.set_xscale("log")
+            ticks = [float(key) for (key,) in groups(found[plan], name)]
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
+            axes.set_xticks([], minor=True)
+            if quantity == "realtime_factor":
+                axes.axhline(1.0, color="black", linewidth=1, linestyle="--")
+                axes.legend(frameon=False, fontsize=9)
+    return {"scale.png": figure}
+
+
+def _line(axes: Axes, rows: Sequence[Row], x: str, y: str, factor: float, color: str, label: str) -> None:
+    """The means of a column over another one."""
+    points = {float(key): mean(part, y) * factor for (key,), part in groups(rows, x).items()}
+    axes.plot(list(points), list(points.values()), "o-", color=color, markersize=4, linewidth=1.5, label=label)
+
+
+_NOISES = {
+    "label_noise": "labels that are wrong, share",
+    "pose_noise": "pose noise [m]",
+    "depth_noise": "depth noise, times the camera's",
+}
+
+
+def _noise(found: Tables) -> dict[str, Figure]:
+    """Truth, calibration, and what consensus changes, over each kind of noise."""
+    figure = new_figure(12.0, 8.5)
+    panels = figure.subplots(3, 3, sharex="col", sharey="row")
+    titles = ("mean IoU", "calibration error, occupied cells", "share of a robot's own occupied cells")
+    for column, (kind, x_label) in enumerate(_NOISES.items()):
+        rows = of_noise(found["noise"], kind)
+        iou, calibration, change = panels[:, column]
+        for axes, title in zip(panels[:, column], titles, strict=True):
+            style(axes, "", x_label if axes is change else "", "" if column else title)
+        _line(iou, rows, kind, "central_mean_iou", 1.0, _RULE_COLORS["central"], "centralised")
+        _line(
+            calibration, rows, kind, "central_calibration_error_occupied", 1.0, _RULE_COLORS["central"], "centralised"
+        )
+        for (rule,), part in groups(rows, "rule").items():
+            color, exchanges = _RULE_COLORS[rule], rule != "local"
+            _line(iou, part, kind, "mean_iou", 1.0, color, rule)
+            quantity = "team_calibration_error_occupied" if exchanges else "calibration_error_occupied"
+            _line(calibration, part, kind, quantity, 1.0, color, f"{rule}, N h" if exchanges else rule)
+            if exchanges:
+                _line(change, part, kind, "repaired", 1.0, color, f"{rule}: put right")
+                _line(change, part, kind, "spread", 1.0, color, f"{rule}: made wrong")
+                change.lines[-1].set_linestyle("--")
+    for axes in panels[:, 0]:
+        axes.legend(frameon=False, fontsize=9)
+    return {"noise.png": figure}
+
+
+def _choose(found: Tables) -> dict[str, Figure]:
+    """What each choice costs in radio, and how well the worst robot's map agrees while the logs last."""
+    figure = new_figure(13.0, 4.6)
+    panels = figure.subplots(1, len(found), sharey=True)
+    rules = list(dict.fromkeys(str(row["rule"]) for rows in found.values() for row in rows))
+    forms: list[Key] = list(dict.fromkeys(key for rows in found.values() for key in groups(rows, "packets", "content")))
+    for axes, (plan, rows) in zip(panels, found.items(), strict=True):
+        style(axes, plan.replace("_", " "), "kB a robot and second")
+        for (rule, *sent), part in groups(rows, "rule", "packets", "content").items():
+            axes.plot(
+                mean(part, "sent_bytes_per_second") / 1e3, mean(part, "agreement_occupied_mean"),
+                MARKERS[forms.index(tuple(sent))], color=COLORS[rules.index(rule)], markersize=7,
+            )  # fmt: skip
+        axes.set_xscale("log")
+    panels[0].set_ylabel("agreement over the log, occupied, worst robot")
+    for rule, color in zip(rules, COLORS, strict=False):
+        panels[0].plot([], [], "o", color=color, label=rule)
+    for form, marker in zip(forms, MARKERS, strict=False):
+        panels[0].plot([], [], marker, color=GREY, label=" ".join(form))
+    legend_below(figure, panels[0], columns=len(rules) + len(forms))
+    return {"choose.png": figure}

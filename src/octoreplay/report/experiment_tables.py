@@ -1,0 +1,194 @@
+"""The experiments' answers as tables in Markdown, from the rows of their sweeps (docs/experiments.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+Row = Mapping[str, Any]
+Tables = Mapping[str, Sequence[Row]]
+"""The rows of an experiment's sweeps by the plans' names."""
+
+Key = tuple[Any, ...]
+
+_SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("0.5", "1"): "γ 0.5/k", ("1", "1"): "γ 1/k"}
+
+
+class Column(NamedTuple):
+    """A column of a table: its heading, and the text of a group of rows."""
+
+    heading: str
+    text: Callable[[Sequence[Row]], str]
+
+
+def answer_tables(name: str, found: Tables) -> str:
+    """An experiment's answer as Markdown."""
+    makers = {"rules": _rules, "steps": _steps, "scale": _scale, "noise": _noise, "choose": _choose}
+    return "\n".join(makers[name](found)) + "\n"
+
+
+def groups(rows: Sequence[Row], *names: str) -> dict[Key, list[Row]]:
+    """Rows that are equal in the named columns, in the order of their first."""
+    found: dict[Key, list[Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in names), []).append(row)
+    return found
+
+
+def mean(rows: Sequence[Row], name: str) -> float:
+    """The mean of a column over the runs that have it; NaN where none has."""
+    values = [float(row[name]) for row in rows if row.get(name) is not None and not math.isnan(float(row[name]))]
+    return sum(values) / len(values) if values else math.nan
+
+
+NOISES = {"label_noise": 0.1, "pose_noise": 0.0, "depth_noise": 1.0}
+"""The kinds of noise and what each is while another one is varied."""
+
+
+def of_noise(rows: Sequence[Row], kind: str) -> list[Row]:
+    """The rows in which only one kind of noise differs from what it is otherwise, ascending."""
+    others = {name: value for name, value in NOISES.items() if name != kind}
+    found = [row for row in rows if all(float(row[name]) == value for name, value in others.items())]
+    return sorted(found, key=lambda row: float(row[kind]))
+
+
+def variant(row: Row) -> str:
+    """A rule with its evidence and steps, in words."""
+    if row["rule"] not in ("gradient", "natural"):
+        return str(row["rule"])
+    return f"{row['rule']}, {row['evidence']}, {_SCHEDULES[row['gamma'], row['gamma_power']]}"
+
+
+def _rules(found: Tables) -> Iterator[str]:
+    for (topology,), rows in groups(found["rules"], "topology").items():
+        yield f"**{topology}**\n"
+        columns = (
+            Column("Φ, all pairs, at the log's end", _number("total_distance_all_log_end")),
+            Column("settled", _number("total_distance_all")),
+            Column("worst robot over the log, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")),
+            Column("settled", _pair("agreement", "agreement_occupied")),
+            Column("mean IoU", _share("mean_iou", 3)),
+            Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
+            Column("ticks to consensus", _ticks),
+        )
+        yield from _table("rule, evidence, steps", columns, {(variant(r[0]),): r for r in _by_variant(rows)})
+        yield f"The centralised map's mean IoU: {_share('central_mean_iou', 3)(rows)}.\n"
+
+
+def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
+    return list(groups(rows, "rule", "evidence", "gamma", "gamma_power").values())
+
+
+def _steps(found: Tables) -> Iterator[str]:
+    columns = (
+        Column("epsilon / bound", _share("epsilon_share", 2)),
+        Column("Φ shrinks in a tick by", _share("contraction", 4)),
+        Column("in theory", _share("contraction_theory", 4)),
+        Column("ticks to consensus", _ticks),
+    )
+    yield from _table("graph, epsilon", columns, groups(found["bound"], "topology", "epsilon"))
+
+
+def _scale(found: Tables) -> Iterator[str]:
+    columns = (
+        Column("times real time", _number("realtime_factor")),
+        Column("peak memory", _megabytes("peak_rss_bytes")),
+        Column("a robot's map", _megabytes("memory_bytes")),
+        Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
+        Column("leaves of a map", _number("num_leaves")),
+    )
+    for plan, names in (
+        ("robots", ("team", "topology")), ("resolution", ("resolution", "rule")), ("classes", ("team", "rule")),
+    ):  # fmt: skip
+        yield from _table(", ".join(names), columns, groups(found[plan], *names))
+
+
+def _noise(found: Tables) -> Iterator[str]:
+    columns = (
+        Column("mean IoU", _share("mean_iou", 3)),
+        Column("mean IoU of what the robot knows", _share("mean_iou_known", 3)),
+        Column("own occupied cells wrong", _percent("wrong")),
+        Column("put right", _percent("repaired")),
+        Column("made wrong", _percent("spread")),
+        Column("calibration error, h / N h", _pair("calibration_error_occupied", "team_calibration_error_occupied")),
+        Column("centralised mean IoU", _share("central_mean_iou", 3)),
+    )
+    for kind in NOISES:
+        yield from _table(
+            f"{kind.replace('_', ' ')}, rule", columns, groups(of_noise(found["noise"], kind), kind, "rule")
+        )
+
+
+def _choose(found: Tables) -> Iterator[str]:
+    columns = (
+        Column("worst robot over the log, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")),
+        Column("settled", _pair("agreement", "agreement_occupied")),
+        Column("mean IoU", _share("mean_iou", 3)),
+        Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
+        Column("ticks to consensus", _ticks),
+        Column("a robot's memory", _megabytes("memory_bytes")),
+        Column("times real time", _number("realtime_factor")),
+    )
+    for plan, rows in found.items():
+        yield f"**{plan.replace('_', ' ')}**\n"
+        yield from _table("rule, packets, content", columns, groups(rows, "rule", "packets", "content"))
+
+
+def _table(title: str, columns: Sequence[Column], rows: Mapping[Key, Sequence[Row]]) -> Iterator[str]:
+    """A table in Markdown with a line for each group of rows."""
+    yield f"| {' | '.join([title, *(column.heading for column in columns)])} |"
+    yield f"|---{'|---:' * len(columns)}|"
+    for key, group in rows.items():
+        yield f"| {' | '.join([', '.join(map(_named, key)), *(column.text(group) for column in columns)])} |"
+    yield ""
+
+
+def _named(value: Any) -> str:
+    """A part of a line's name."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _number(name: str) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: _short(mean(rows, name))
+
+
+def _share(name: str, digits: int) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: _fixed(mean(rows, name), digits)
+
+
+def _percent(name: str) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: "-" if math.isnan(value := mean(rows, name)) else f"{100 * value:.2f} %"
+
+
+def _pair(first: str, second: str) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: f"{_fixed(mean(rows, first), 4)} / {_fixed(mean(rows, second), 4)}"
+
+
+def _kilobytes(name: str) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: _short(mean(rows, name) / 1e3)
+
+
+def _megabytes(name: str) -> Callable[[Sequence[Row]], str]:
+    return lambda rows: "-" if math.isnan(value := mean(rows, name)) else f"{value / 1e6:,.0f} MB"
+
+
+def _ticks(rows: Sequence[Row]) -> str:
+    """The mean of the ticks where all runs agreed in the end, else how many did not."""
+    never = sum(math.isnan(float(row["ticks_to_consensus"])) for row in rows)
+    if never:
+        return "never" if never == len(rows) else f"never in {never} of {len(rows)}"
+    return _short(mean(rows, "ticks_to_consensus"))
+
+
+def _fixed(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _short(value: float) -> str:
+    """Three digits, in powers of ten where it is very small or large."""
+    if math.isnan(value):
+        return "-"
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:,.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.3g}"
+    return f"{value:.1e}"

@@ -1,0 +1,199 @@
+"""The questions that the paper left open, as experiments (docs/experiments.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from octoreplay.evaluate import mixing
+from octoreplay.evaluate.evaluation import truth_beside_logs
+from octoreplay.evaluate.repairs import repairs
+from octoreplay.evaluate.truth import load_truth
+from octoreplay.result import open_result
+from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.world import village_classes
+from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam
+from octoreplay.study.sweep import Sweep
+from octoreplay.study.task import Row
+
+RADIO_RANGE = 25.0
+"""In the village, whose robots drive in a square of 70 m, teams of six fall apart and meet again with it [m]."""
+
+_FINAL_STATES = {"state_every": 1e6, "view_every": 1e6}
+"""Only the last maps are read: a result needs no others."""
+
+_LABEL_NOISES = (0.0, 0.1, 0.2, 0.3, 0.4)
+_POSE_NOISES = (0.05, 0.1, 0.2, 0.4)
+_DEPTH_NOISES = (2.0, 4.0, 8.0)
+_NUM_ROBOTS = (2, 4, 8, 16, 32)
+_RESOLUTIONS = (0.1, 0.15, 0.2, 0.3, 0.5)
+_EPSILON_SHARES = (0.1, 0.25, 0.5, 0.67, 0.8, 0.9, 0.95, 0.99)
+
+
+def rules(duration: float, num_villages: int) -> Experiment:
+    """Which rule on which graph?"""
+    teams = _villages(duration, num_villages)
+    variants = (
+        *(f"gradient+{evidence}+{steps}" for evidence in ("sum", "time-average", "cell-average")
+          for steps in ("0.5+0", "1+0", "1+1")),
+        "natural+sum+0.5+0", "natural+sum+1+1", "bayes+-+-+-", "ratio+-+-+-", "flood+-+-+-", "merge+-+-+-",
+        "local+-+-+-",
+    )  # fmt: skip
+    vary = (
+        f"rule+evidence+gamma+gamma_power={','.join(variants)}",
+        "topology=complete,ring,line,range",
+    )
+    settings = {"radio_range": RADIO_RANGE, **_FINAL_STATES}
+    return Experiment(teams, (Plan("rules", tuple(teams), vary, settings),))
+
+
+def steps(duration: float, num_villages: int) -> Experiment:
+    """How do the steps trade consensus against the pull of the robots' own evidence?"""
+    teams = _villages(duration, num_villages)
+    bounds = ",".join(
+        f"{topology}+{share * mixing.epsilon_bound(topology, 6):.6g}"
+        for topology in ("complete", "ring", "line", "star")
+        for share in _EPSILON_SHARES
+    )
+    return Experiment(
+        teams,
+        (
+            Plan(
+                "steps",
+                tuple(teams),
+                ("rule=gradient,natural", "epsilon=0.1,0.2,0.35,0.5,0.7", "gamma=0.05,0.1,0.25,0.5,1,1.5"),
+                {"topology": "ring", "settle_max": 60, **_FINAL_STATES},
+            ),
+            Plan(
+                "bound",
+                tuple(teams)[:1],
+                (f"topology+epsilon={bounds}",),
+                {"rule": "bayes", "duration": min(duration, 20.0), "settle_max": 200, **_FINAL_STATES},
+                has_truth=False,
+                more=_theory,
+            ),
+        ),
+    )
+
+
+def scale(duration: float, num_villages: int) -> Experiment:
+    """How many robots, cells and classes are mapped in real time?"""
+    del num_villages  # the work depends on the numbers, hardly on the village
+    robots = {
+        f"robots_{count:02d}": SimulatedTeam(SimulationConfig(num_robots=count, duration=duration))
+        for count in _NUM_ROBOTS
+    }
+    six = {"six": SimulatedTeam(SimulationConfig(duration=duration))}
+    classes = {
+        "classes_04": SimulatedTeam(
+            SimulationConfig(duration=duration),
+            (("ground", ("grass", "dirt_road")), ("house", ("building", "roof")), ("tree", ("trunk", "foliage")),
+             ("obstacle", ("fence", "car"))),
+        ),
+        "classes_08": SimulatedTeam(SimulationConfig(duration=duration)),
+        "classes_16": SimulatedTeam(SimulationConfig(duration=duration, kinds_per_class=2)),
+        "classes_32": SimulatedTeam(SimulationConfig(duration=duration, kinds_per_class=4)),
+    }  # fmt: skip
+    resolutions = ",".join(f"{resolution:g}" for resolution in _RESOLUTIONS)
+    return Experiment(
+        {**robots, **six, **classes},
+        (
+            _timed("robots", robots, ("topology=complete,nearest",), {"num_nearest": 3}),
+            _timed("resolution", six, (f"resolution={resolutions}", "rule=gradient,bayes"), {}),
+            _timed("classes", classes, ("rule=gradient,bayes",), {}),
+        ),
+    )
+
+
+def noise(duration: float, num_villages: int) -> Experiment:
+    """What does consensus repair of noisy labels, poses and depths, and what does it spread?"""
+    levels: dict[str, dict[str, float]] = {
+        **{f"label_{level:g}": {"label_noise": level} for level in _LABEL_NOISES},
+        **{f"pose_{level:g}": {"pose_noise": level} for level in _POSE_NOISES},
+        **{f"depth_{level:g}": {"depth_noise": level} for level in _DEPTH_NOISES},
+    }
+    teams = {
+        f"{label}_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **values))  # type: ignore[arg-type]
+        for label, values in levels.items()
+        for seed in range(num_villages)
+    }
+    plan = Plan(
+        "noise", tuple(teams), ("rule=local,gradient,bayes",), _FINAL_STATES, keep=True, more=_noise_and_repairs
+    )
+    return Experiment(teams, (plan,))
+
+
+def choose(duration: float, num_villages: int) -> Experiment:
+    """Which settings for a good radio, for a poor one, and for many robots?"""
+    teams = _villages(duration, num_villages)
+    many = {
+        f"many_{seed}": SimulatedTeam(SimulationConfig(num_robots=16, duration=duration / 2, seed=seed))
+        for seed in range(num_villages)
+    }
+    variants = (
+        *(f"{rule}+{sent}" for rule in ("gradient", "natural", "bayes", "flood")
+          for sent in ("full+float32", "delta+float32", "delta+int8")),
+        "ratio+full+float32",
+    )  # fmt: skip
+    vary = (f"rule+packets+content={','.join(variants)}",)
+    poor = {"topology": "range", "radio_range": RADIO_RANGE, "loss": 0.3, "latency": 0.2, "rate": 50_000}
+    return Experiment(
+        {**teams, **many},
+        (
+            Plan("good_radio", tuple(teams), vary, _FINAL_STATES),
+            Plan("poor_radio", tuple(teams), vary, {**poor, **_FINAL_STATES}),
+            Plan("many_robots", tuple(many), vary, {"topology": "nearest", "num_nearest": 3, **_FINAL_STATES}),
+        ),
+    )
+
+
+QUESTIONS = {make.__name__: make for make in (rules, steps, scale, noise, choose)}
+"""The experiments by name: each is made from the length of the logs in seconds and the number of villages."""
+
+
+def _villages(duration: float, num_villages: int) -> dict[str, SimulatedTeam]:
+    """Six robots in so many villages."""
+    return {
+        f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed)) for seed in range(num_villages)
+    }
+
+
+def _timed(
+    name: str, teams: Mapping[str, SimulatedTeam], vary: tuple[str, ...], settings: Mapping[str, object]
+) -> Plan:
+    """A plan that measures time: two threads, nothing beside it, and no truth to wait for."""
+    return Plan(name, tuple(teams), vary, {**settings, **_FINAL_STATES}, has_truth=False, num_threads=2, more=_sizes)
+
+
+def _theory(team: SimulatedTeam, row: Row, _: Sweep) -> Row:
+    """Epsilon as a share of its bound, and the factor by which Phi should shrink, by theory."""
+    graph, epsilon = (row["topology"], team.simulation.num_robots), float(row["epsilon"])
+    bound = mixing.epsilon_bound(*graph)
+    return {"epsilon_share": epsilon / bound, "contraction_theory": mixing.contraction(*graph, epsilon)}
+
+
+def _sizes(team: SimulatedTeam, *_: object) -> Row:
+    """How many robots and classes a team has."""
+    simulation = team.simulation
+    return {
+        "num_robots": simulation.num_robots,
+        "num_classes": len(team.merge_classes) or len(village_classes(simulation.kinds_per_class).classes),
+    }
+
+
+def _noise_and_repairs(team: SimulatedTeam, row: Row, sweep: Sweep) -> Row:
+    """A team's noise; shares of the robots' own occupied cells that are wrong, put right, and made wrong."""
+    simulation = team.simulation
+    noise = {name: getattr(simulation, name) for name in ("label_noise", "pose_noise", "depth_noise")}
+    with (
+        open_result(sweep.result({**row, "rule": "local"})) as own,
+        open_result(sweep.result(row)) as after,
+    ):
+        world = truth_beside_logs(own.path)
+        assert world is not None
+        truth = load_truth(world, own.class_table, own.config.map.resolution)
+        counts = [repairs(own.map(robot_id), after.map(robot_id), truth) for robot_id in own.robots]
+    num_cells, *changes = (sum(count) for count in zip(*counts, strict=True))
+    return {
+        **noise,
+        **dict(zip(("wrong", "repaired", "spread"), (change / num_cells for change in changes), strict=True)),
+    }

@@ -1,0 +1,67 @@
+"""What an exchange repairs and spreads, counted by hand and cell by cell."""
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import octree_factory
+from octoreplay.evaluate.repairs import Repairs, repairs
+from octoreplay.evaluate.truth import Truth
+from octoreplay.mapping.octree import keys_to_codes
+from octoreplay.result import StoredMap
+
+FREE, GROUND, TREE = [-2.0, -2.0], [2.0, -1.0], [-1.0, 2.0]
+VALUES = {0: FREE, 1: GROUND, 2: TREE}
+
+
+def stored(labels: dict[tuple[int, int, int], int]) -> StoredMap:
+    """A map that gives each of these cells its label."""
+    octree = octree_factory.octree_of({key: VALUES[label] for key, label in labels.items()}, resolution=1.0)
+    return StoredMap(octree, "alpha", 1, 0, 0.0, 2)
+
+
+def truth_of(labels: dict[tuple[int, int, int], int]) -> Truth:
+    """The truth with these surface cells; 0 is a class that the maps do not have."""
+    codes = keys_to_codes(np.array(list(labels), np.int64).reshape(-1, 3))
+    order = np.argsort(codes)
+    return Truth(Path("world.npz"), codes[order], np.array(list(labels.values()), np.uint8)[order])
+
+
+def test_each_kind_of_change_by_hand() -> None:
+    own = {(0, 0, 0): 1, (1, 0, 0): 2, (2, 0, 0): 0, (3, 0, 0): 2, (4, 0, 0): 1, (5, 0, 0): 0, (6, 0, 0): 1}
+    after = {(0, 0, 0): 1, (1, 0, 0): 1, (2, 0, 0): 2, (3, 0, 0): 0, (4, 0, 0): 2, (6, 0, 0): 2, (9, 0, 0): 1}
+    #       right: stays    put right     put right     put right     made wrong    counts not   of no class
+    surface = {(0, 0, 0): 1, (1, 0, 0): 1, (2, 0, 0): 2, (4, 0, 0): 1, (6, 0, 0): 0, (9, 0, 0): 1}
+    assert repairs(stored(own), stored(after), truth_of(surface)) == Repairs(5, 3, 3, 1)
+
+
+def test_what_the_exchange_forgot_is_as_the_prior_says() -> None:
+    own, surface = {(0, 0, 0): 1, (1, 0, 0): 1}, {(0, 0, 0): 1, (7, 7, 7): 2}
+    # The prior's label is free: right for the cell without surface, wrong for the other one.
+    assert repairs(stored(own), stored({(5, 5, 5): 0}), truth_of(surface)) == Repairs(2, 1, 1, 1)
+
+
+KEYS = st.tuples(*[st.integers(-3, 4)] * 3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    own=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
+    after=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
+    surface=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
+)
+def test_cell_by_cell(own, after, surface) -> None:
+    counted = [
+        (own[key] == surface.get(key, 0), after.get(key, 0) == surface.get(key, 0))
+        for key in own
+        if (key in surface or own[key] > 0) and not (key in surface and surface[key] == 0)
+    ]
+    expected = Repairs(
+        len(counted),
+        sum(not before for before, _ in counted),
+        sum(not before and now for before, now in counted),
+        sum(before and not now for before, now in counted),
+    )
+    assert repairs(stored(own), stored(after), truth_of(surface)) == expected
