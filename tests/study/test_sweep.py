@@ -229,7 +229,7 @@ def test_what_cannot_be_done_is_said_before_any_run(tmp_path: Path) -> None:
         (["--jobs", "0"], 2, "error: jobs: 0 is below the least value 1"),
         (["--threads", "0"], 2, "error: threads: 0 is below the least value 1"),
         (["--seeds", "0"], 2, "error: seeds: 0 is below the least value 1"),
-        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither here nor beside {TEAM}"),
+        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither beside {TEAM} nor here"),
     ):
         done = sweep(TEAM, *arguments, "-o", tmp_path / "s")
         assert done.returncode == code, done.stderr

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
               help="a parameter and its values, or NAME+NAME=V1+V1,V2+V2,... for several; may be repeated")  # fmt: skip
 @click.option("--seeds", type=int, metavar="N", help="every combination with network_seed 0 to N - 1")
 @click.option("--truth", type=existing_path, metavar="FILE",
-              help="evaluate against this truth, found as given or beside each team file")  # fmt: skip
+              help="evaluate against this truth, found beside each team file or as given")  # fmt: skip
 @click.option("--keep", is_flag=True, help="keep every run's result in DIR/runs")
 @click.option("--jobs", type=int, metavar="N", help="runs at once on this machine  [default: processors over threads]")
 @click.option("--threads", type=int, default=1, show_default=True, metavar="N", help="threads of each run")

@@ -122,8 +122,8 @@ def _team_file(team: SimulatedTeam, folder: Path, progress: Callable[[float], No
     if not team.merge_classes:
         return path
     config = dataclasses.replace(load_team_file(path), merge_classes=team.merge_classes)
-    merged = folder.parent / f"{folder.name}.yaml"
-    write_whole(merged, dump_team(config, merged.parent.resolve()))
+    merged = folder / "merged.yaml"
+    write_whole(merged, dump_team(config, folder.resolve()))
     return merged
 
 

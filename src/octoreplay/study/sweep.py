@@ -86,7 +86,7 @@ def run_sweep(
 
     ``variations`` are texts such as ``topology=complete,ring`` (docs/sweeps.md), ``settings`` parameters of all runs by
     name, and ``preset``; ``num_seeds`` runs every combination with so many values of network_seed. ``truth`` is the
-    file to evaluate against, as given or beside each team file; ``keep`` keeps the results. The runs are processes on
+    file to evaluate against, beside each team file or as given; ``keep`` keeps the results. The runs are processes on
     this machine, ``num_jobs`` at once (unless given, as many as there are processors for ``num_threads`` each), or on
     the dask cluster of ``scheduler``. What ``output`` holds of the same runs is not run again. A run that fails has a
     row that says why.
@@ -259,11 +259,11 @@ def _labels(teams: Sequence[Path]) -> dict[str, Path]:
 
 
 def _truth(truth: Path, team: Path) -> Path:
-    """The truth, a file or a folder that holds one: as given, else beside the team file."""
-    for path in dict.fromkeys((truth, team.parent / truth)):
+    """The truth, a file or a folder that holds one: beside the team file, else as given."""
+    for path in dict.fromkeys((team.parent / truth, truth)):
         if path.exists():
             return path
-    raise InputError(f"{truth}: not found, neither here nor beside {team}")
+    raise InputError(f"{truth}: not found, neither beside {team} nor here")
 
 
 def _columns(names: Sequence[str], *, has_truth: bool) -> tuple[str, ...]:

@@ -1,0 +1,88 @@
+"""Experiments: their questions are sweeps that can be run, and a small one is run from beginning to end."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from octoreplay.errors import InputError
+from octoreplay.simulate.team import SimulationConfig
+from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_experiment
+from octoreplay.study.grid import check_variations, combinations, parse_variation
+from octoreplay.study.questions import QUESTIONS
+from octoreplay.team_file import load_team_file
+
+PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
+
+NUM_RUNS = {
+    "rules": {"rules": 16 * 4 * 2},
+    "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
+    "scale": {"robots": 5 * 2, "resolution": 5 * 2, "classes": 4 * 2},
+    "noise": {"noise": 12 * 3 * 2},
+    "choose": {"good_radio": 13 * 2, "poor_radio": 13 * 2, "many_robots": 13 * 2},
+}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_every_question_is_made_of_runs_that_can_be(name: str) -> None:
+    experiment = QUESTIONS[name](30.0, 2)
+    base = load_team_file(PAIR)
+    counts = {}
+    for plan in experiment.plans:
+        assert set(plan.teams) <= set(experiment.teams)
+        variations = [parse_variation(text) for text in plan.vary]
+        check_variations(variations, plan.settings, None)
+        runs = list(combinations(dict.fromkeys(plan.teams, base), variations, plan.settings, None))
+        counts[plan.name] = len(runs)
+    assert counts == NUM_RUNS[name]
+    # What is not varied is what every run has; each run is another one.
+    assert len({str(run.config) + run.team for run in runs}) == len(runs)
+
+
+def small(**plan) -> Experiment:
+    """Two robots for two seconds, in two villages; the second has fewer classes."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    teams = {
+        f"village_{seed}": SimulatedTeam(
+            SimulationConfig(num_robots=2, duration=2.0, seed=seed, rate=2.0, image=(48, 36), world_size=20.0),
+            (("plant", ("grass", "foliage")),) if seed else (),
+        )
+        for seed in (0, 1)
+    }
+    return Experiment(teams, (Plan("first", tuple(teams), **plan),))
+
+
+def test_a_small_experiment_from_beginning_to_end(tmp_path: Path) -> None:
+    stages: list[str] = []
+    experiment = small(
+        vary=("rule=local,bayes",), settings={"settle": 0}, keep=True,
+        more=lambda team, row, sweep: {"seed_of_team": team.simulation.seed, "is_kept": sweep.result(row).is_file()},
+    )  # fmt: skip
+    rows = run_experiment(experiment, tmp_path, progress=lambda stage, _: stages.append(stage))["first"]
+    assert [(row["team"], row["rule"]) for row in rows] == [
+        ("village_0", "local"), ("village_0", "bayes"), ("village_1", "local"), ("village_1", "bayes"),
+    ]  # fmt: skip
+    assert [row["seed_of_team"] for row in rows] == [0, 0, 1, 1]
+    assert all(row["is_kept"] for row in rows)
+    assert all(0 < row["central_mean_iou"] <= 1 for row in rows)
+    # Nothing is exchanged by rule local.
+    assert [row["sent_bytes_per_second"] > 0 for row in rows] == [False, True, False, True]
+    assert "simulating team 2 of 2" in stages
+    assert stages[-1] == "first: run 4 of 4"
+    merged = load_team_file(tmp_path / "teams" / "village_1" / "merged.yaml")
+    assert merged.classes is not None
+    assert merged.classes.names[0] == "plant"
+    assert merged.classes.num_classes == 7
+
+    stored = list(csv.DictReader((tmp_path / "first.csv").open(encoding="utf-8")))
+    assert [{name: str(value) for name, value in row.items()} for row in rows] == stored
+    again = run_experiment(experiment, tmp_path)["first"]
+    assert str(again) == str(rows)
+
+
+def test_an_answer_is_given_only_where_all_runs_are_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"first: 2 of 4 runs failed, the first: .*epsilon.*; the same command does"):
+        run_experiment(small(vary=("epsilon=0.5,4",), settings={"topology": "range", "radio_range": 1e3}), tmp_path)
+    assert not (tmp_path / "first.csv").exists()
