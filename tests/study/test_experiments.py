@@ -76,7 +76,7 @@ def test_a_small_experiment_from_beginning_to_end(tmp_path: Path) -> None:
     assert merged.classes.names[0] == "plant"
     assert merged.classes.num_classes == 7
 
-    stored = list(csv.DictReader((tmp_path / "first.csv").open(encoding="utf-8")))
+    stored = list(csv.DictReader((tmp_path / "first.csv").read_text(encoding="utf-8").splitlines()))
     assert [{name: str(value) for name, value in row.items()} for row in rows] == stored
     again = run_experiment(experiment, tmp_path)["first"]
     assert str(again) == str(rows)
