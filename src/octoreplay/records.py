@@ -251,6 +251,11 @@ class TickMetrics:
     robots: tuple[RobotMetrics, ...]
     links: tuple[LinkMetrics, ...]
 
+    @property
+    def counted_robots(self) -> tuple[RobotMetrics, ...]:
+        """The active robots, of which the worst or the mean is taken; all where none is active."""
+        return tuple(robot for robot in self.robots if robot.active) or self.robots
+
 
 class LinkTotals:
     """Each directed link over many ticks: sums, and the mean of ``bytes_per_second``."""

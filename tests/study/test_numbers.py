@@ -38,6 +38,8 @@ def test_contraction_is_the_factor_of_the_later_half() -> None:
     assert contraction([0.25**n for n in range(9)]) == pytest.approx(0.25)
     # The first half counts for nothing; of the other one only how far it went in all.
     assert contraction([7.0, 900.0, 8.0, 3.0, 1.0, 1.0]) == pytest.approx((1 / 8) ** (1 / 3))
+    # Rounding keeps a distance from vanishing; that is no mixing.
+    assert contraction([*(0.25**n for n in range(14)), *[1e-13] * 40]) == pytest.approx(0.25)
     assert math.isnan(contraction([8.0, 4.0, 2.0]))
     assert math.isnan(contraction([8.0, 4.0, 2.0, 0.0]))
     assert math.isnan(contraction([]))

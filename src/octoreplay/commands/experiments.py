@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,17 +75,16 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     return 0
 
 
-def _with_question(name: str, duration: float, num_villages: int, question: str) -> None:
+def _add_question(name: str, duration: float, num_villages: int, question: str, *, is_timed: bool = False) -> None:
     """Add the command of one of the questions."""
 
-    @experiment.command(name, short_help=question)
-    @click.argument("folder", type=existing_path, metavar="[DIR]", default=Path(f"octoreplay-{name}"), required=False)
-    @click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]")
-    @click.option("--villages", type=click.IntRange(1, 100), default=num_villages, show_default=True,
-                  help="so many villages, each with a team of its own")  # fmt: skip
-    @click.option("--jobs", type=int, metavar="N", help="runs at once on this machine  [default: its processors]")
-    @click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster, but for what is timed")
-    def answer(folder: Path, duration: float, villages: int, jobs: int | None, scheduler: str | None) -> int:
+    def answer(
+        folder: Path,
+        duration: float,
+        villages: int = 1,
+        jobs: int | None = None,
+        scheduler: str | None = None,
+    ) -> int:
         from octoreplay.io.text_files import write_whole
         from octoreplay.report import tables
         from octoreplay.report.experiment_plots import figures
@@ -108,20 +108,34 @@ def _with_question(name: str, duration: float, num_villages: int, question: str)
         tables.show(tables.terminal(), tables.made_files(written))
         return 0
 
-    answer.help = (
-        f"{question}\n\nSimulates the teams, runs the sweeps and writes tables and figures into DIR. The same command"
-        " goes on where it was stopped."
+    default = Path(f"octoreplay-{name}")
+    # These make no sense where time is measured.
+    of_sweeps = (
+        click.option("--villages", type=click.IntRange(1, 100), default=num_villages, show_default=True,
+                     help="so many villages, each with a team of its own"),
+        click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="runs at once  [default: processors]"),
+        click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster, not on this machine"),
+    )  # fmt: skip
+    options = (
+        click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False),
+        click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]"),
+        *(() if is_timed else of_sweeps),
     )
+    text = (
+        f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR ({default}). The same"
+        " command goes on where it was stopped."
+    )
+    command: Callable[..., int] = answer
+    for option in reversed(options):
+        command = option(command)
+    experiment.command(name, help=text, short_help=question)(command)
 
 
-for _name, _duration, _num_villages, _question in (
-    ("rules", 60.0, 3, "Which rule, on which graph?"),
-    ("steps", 60.0, 1, "How do epsilon and gamma trade consensus against the robots' own evidence?"),
-    ("scale", 20.0, 1, "How many robots, cells and classes are mapped in real time?"),
-    ("noise", 60.0, 1, "What does consensus repair of noisy labels, poses and depths, and what does it spread?"),
-    ("choose", 60.0, 2, "Which settings for a good radio, for a poor one, and for many robots?"),
-):
-    _with_question(_name, _duration, _num_villages, _question)
+_add_question("rules", 60.0, 3, "Which rule, on which graph?")
+_add_question("steps", 60.0, 1, "How do epsilon and gamma trade consensus against the robots' own evidence?")
+_add_question("scale", 30.0, 1, "How many robots, cells and classes are mapped in real time?", is_timed=True)
+_add_question("noise", 60.0, 1, "What does consensus repair of noisy labels, poses and depths, what does it spread?")
+_add_question("choose", 60.0, 2, "Which settings for a good radio, for a poor one, and for many robots?")
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig) -> Path:

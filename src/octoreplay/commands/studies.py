@@ -43,8 +43,6 @@ def sweep(
     from octoreplay.report import tables
     from octoreplay.study.sweep import run_sweep
 
-    if jobs is not None and scheduler is not None:
-        raise click.UsageError("--jobs is for this machine and --scheduler for another; leave one out")
     with progress_bar("sweep") as update:
 
         def show(progress: SweepProgress) -> None:

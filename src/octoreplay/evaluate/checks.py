@@ -201,8 +201,7 @@ def _of_robots(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
     """A number of each robot in the last tick, as the table of results has it: of the active ones, else of all."""
 
     def measure(subject: _Subject) -> Iterable[Measurement]:
-        last = subject.summary.last
-        robots = [robot for robot in last.robots if robot.active] or last.robots
+        robots = subject.summary.last.counted_robots
         return [Measurement(float(getattr(robot, name)), robot.robot_id, seconds=subject.end) for robot in robots]
 
     return measure
@@ -253,7 +252,8 @@ def _frames_lost_share(subject: _Subject) -> Iterable[Measurement]:
     """Of each robot's frames, the share that was not mapped."""
     for robot_id, counts in subject.summary.frame_counts.items():
         num_frames = counts.used + counts.skipped
-        yield Measurement(counts.skipped / num_frames if num_frames else math.nan, robot_id)
+        is_known = num_frames > 0 and not counts.truncated_files
+        yield Measurement(counts.skipped / num_frames if is_known else math.nan, robot_id)
 
 
 def _of_truth(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
@@ -287,13 +287,14 @@ QUANTITIES = (
              _of_robots("num_leaves")),
     Quantity("memory_bytes", ("max",), "memory of a robot's evidence and map, the most of any tick",
              _of_any_tick("memory_bytes")),
-    Quantity("packet_bytes", ("max",), "the largest packet of any robot in any tick", _of_any_tick("packet_bytes")),
+    Quantity("packet_bytes", ("max",), "a packet of any robot in any tick, in the mean over its receivers",
+             _of_any_tick("packet_bytes")),
     Quantity("sent_bytes_per_second", ("max",), "mean over the time of the logs, of the robot that sends the most",
              _sent_bytes_per_second),
     Quantity("delivered_share", ("min",), "share of the packets that arrived over the run, on the worst link",
              _delivered_share, is_share=True),
     Quantity("frames_lost_share", ("max",), "share of a robot's frames that could not be mapped, of the worst robot",
-             _frames_lost_share, is_share=True),
+             _frames_lost_share, is_share=True, absent="there are no frames, or a log was cut or damaged"),
     Quantity("mean_iou", ("min",), "mean intersection over union of the classes, of the worst robot; needs --truth",
              _of_truth("mean_iou"), is_share=True, needs_truth=True),
     Quantity("coverage", ("min",), "share of the observed surface that the worst robot's map has; needs --truth",

@@ -8,16 +8,16 @@ import numpy as np
 
 from octoreplay.evaluate.truth import Truth
 from octoreplay.io.results import posterior
-from octoreplay.mapping.octree import LeafSpans
-from octoreplay.records import NO_CLASS, BoolArray, Int64Array, UInt8Array
+from octoreplay.records import NO_CLASS
 from octoreplay.result import StoredMap
 
 
 class Repairs(NamedTuple):
-    """Counts of the cells that a robot knows by itself and that hold surface in truth, or in its own map.
+    """Counts of cells that a robot knows by itself.
 
-    ``num_wrong`` of the ``num_cells`` have a wrong label in its own map, ``num_repaired`` of these the right one
-    after the exchange; ``num_spread`` have the right label in its own map and a wrong one afterwards.
+    ``num_cells`` are those that hold surface in truth or that its own map calls occupied, and ``num_wrong`` of these
+    have a wrong label in it. ``num_repaired`` are wrong in its own map and right after the exchange; ``num_spread`` are
+    right in its own map and wrong afterwards, free cells that became occupied among them.
     """
 
     num_cells: int
@@ -32,38 +32,30 @@ def repairs(own: StoredMap, after: StoredMap, truth: Truth) -> Repairs:
     A cell without surface is truly free; cells whose true class the maps do not have count for nothing.
     """
     own_spans, after_spans = own.octree.spans(), after.octree.spans()
-    own_labels = posterior.labels(own_spans.deviations + np.float32(own.prior))
-    codes = np.union1d(truth.codes, _cells(own_spans, own_labels > 0))
-    leaves = own_spans.leaves_at(codes)
-    codes, before = codes[leaves >= 0], own_labels[leaves[leaves >= 0]]
-    true = np.zeros(codes.size, np.uint8)
+    own_labels, after_labels = (
+        posterior.labels(spans.deviations + np.float32(stored.prior))
+        for spans, stored in ((own_spans, own), (after_spans, after))
+    )
+    # Everywhere else all three say free.
+    codes = np.unique(
+        np.concatenate([truth.codes, own_spans.cells_in(own_labels > 0), after_spans.cells_in(after_labels > 0)])
+    )
+    codes = codes[own_spans.leaves_at(codes) >= 0]
+    true, is_known = np.zeros(codes.size, np.uint8), np.ones(codes.size, np.bool_)
     place = np.minimum(np.searchsorted(truth.codes, codes), truth.codes.size - 1)
     is_surface = truth.codes[place] == codes
     true[is_surface] = truth.class_ids[place[is_surface]]
-    counts = ~is_surface | (true != NO_CLASS)
-    was_right = (before == true)[counts]
-    is_right = (_labels_at(after_spans, codes, after.prior) == true)[counts]
+    is_known[is_surface] = true[is_surface] != NO_CLASS
+    codes, true, is_surface = codes[is_known], true[is_known], is_surface[is_known]
+    before, now = (
+        posterior.labels(spans.deviations_at(codes) + np.float32(stored.prior))
+        for spans, stored in ((own_spans, own), (after_spans, after))
+    )
+    was_right, is_right = before == true, now == true
+    counts = is_surface | (before > 0)
     return Repairs(
         int(counts.sum()),
-        int((~was_right).sum()),
+        int((counts & ~was_right).sum()),
         int((~was_right & is_right).sum()),
         int((was_right & ~is_right).sum()),
     )
-
-
-def _cells(spans: LeafSpans, chosen: BoolArray) -> Int64Array:
-    """The codes (n,) of all finest cells in the chosen leaves (L,)."""
-    starts, lengths = spans.codes[chosen], spans.num_cells[chosen]
-    first = np.cumsum(lengths) - lengths
-    cells: Int64Array = np.arange(lengths.sum()) + np.repeat(starts - first, lengths)
-    return cells
-
-
-def _labels_at(spans: LeafSpans, codes: Int64Array, prior: float) -> UInt8Array:
-    """The label (n,) of each cell, that of the prior where it is not known."""
-    values = np.full((codes.size, spans.deviations.shape[1]), np.float32(prior))
-    leaves = spans.leaves_at(codes)
-    is_known = leaves >= 0
-    values[is_known] += spans.deviations[leaves[is_known]]
-    labels: UInt8Array = posterior.labels(values)
-    return labels

@@ -77,6 +77,20 @@ class LeafSpans(NamedTuple):
         leaves[inside] = np.where(codes[inside] < self.codes[held] + self.num_cells[held], held, -1)
         return leaves
 
+    def deviations_at(self, codes: Int64Array) -> Float32Array:
+        """The values (n, C) of each cell of ``codes`` (n,), 0 where no leaf holds it."""
+        values = np.zeros((codes.size, self.deviations.shape[1]), np.float32)
+        leaves = self.leaves_at(codes)
+        values[leaves >= 0] = self.deviations[leaves[leaves >= 0]]
+        return values
+
+    def cells_in(self, chosen: BoolArray) -> Int64Array:
+        """The codes (n,) of all finest cells in the ``chosen`` leaves (L,)."""
+        starts, lengths = self.codes[chosen], self.num_cells[chosen]
+        first = np.cumsum(lengths) - lengths
+        cells: Int64Array = np.arange(lengths.sum()) + np.repeat(starts - first, lengths)
+        return cells
+
 
 class SemanticOctree:
     """An octree over the key space [-2^18, 2^18)^3 with ``num_classes`` occupied classes.

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from octoreplay.report.experiment_tables import Key, Row, Tables, groups, mean, of_noise, variant
-from octoreplay.report.figures import BLUE, COLORS, GREEN, GREY, MARKERS, ORANGE, legend_below, new_figure, style
+from octoreplay.report.figures import (
+    BLUE,
+    COLORS,
+    GREEN,
+    GREY,
+    MARKERS,
+    ORANGE,
+    label_plainly,
+    legend_below,
+    new_figure,
+    style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,9 +56,12 @@ def _rules(found: Tables) -> dict[str, Figure]:
                 [mean(own, column) * scale for own in values.values()], places, MARKERS[index], color=COLORS[index],
                 markersize=5, label=topology,
             )  # fmt: skip
-        if column in ("total_distance_all_log_end", "sent_bytes_per_second"):
+        if column == "sent_bytes_per_second":
             axes.set_xscale("log")
-    panels[2].axvline(mean(rows, "central_mean_iou"), color="black", linewidth=1, linestyle="--")
+            label_plainly(axes.xaxis)
+    panels[0].set_xscale("log")
+    oracle = [row for row in rows if row["rule"] == "flood"]
+    panels[2].axvline(mean(oracle, "central_mean_iou"), color="black", linewidth=1, linestyle="--")
     panels[0].set_yticks(range(len(labels)), labels, fontsize=9)
     panels[0].invert_yaxis()
     legend_below(figure, panels[0])
@@ -120,15 +134,17 @@ def _scale(found: Tables) -> dict[str, Figure]:
         ("sent_bytes_per_second", "kB a robot and second", 1e-3),
     )
     for column, (plan, name, x_label, series) in enumerate((
-        ("robots", "num_robots", "robots", "topology"),
-        ("resolution", "resolution", "resolution [m]", "rule"),
-        ("classes", "num_classes", "classes", "rule"),
+        ("robots", "num_robots", "robots", ("topology", "resolution")),
+        ("resolution", "resolution", "resolution [m]", ("rule",)),
+        ("classes", "num_classes", "classes", ("rule",)),
     )):  # fmt: skip
         for line, (quantity, label, factor) in enumerate(quantities):
             axes = style(panels[line, column], "", x_label if line == 2 else "", label if column == 0 else "")
-            for index, ((key,), rows) in enumerate(groups(found[plan], series).items()):
-                _line(axes, rows, name, quantity, factor, COLORS[index + (3 if plan == "robots" else 0)], str(key))
+            for index, (key, rows) in enumerate(groups(found[plan], *series).items()):
+                label_of_line = " ".join(map(str, key)) + (" m" if plan == "robots" else "")
+                _line(axes, rows, name, quantity, factor, COLORS[index + (2 if plan == "robots" else 0)], label_of_line)
             axes.set_yscale("log")
+            label_plainly(axes.yaxis)
             axes.set_xscale("log")
             ticks = [float(key) for (key,) in groups(found[plan], name)]
             axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
@@ -156,7 +172,7 @@ def _noise(found: Tables) -> dict[str, Figure]:
     """Truth, calibration, and what consensus changes, over each kind of noise."""
     figure = new_figure(12.0, 8.5)
     panels = figure.subplots(3, 3, sharex="col", sharey="row")
-    titles = ("mean IoU", "calibration error, occupied cells", "share of a robot's own occupied cells")
+    titles = ("mean IoU", "calibration error, occupied cells", "put right, made wrong (share)")
     for column, (kind, x_label) in enumerate(_NOISES.items()):
         rows = of_noise(found["noise"], kind)
         iou, calibration, change = panels[:, column]
@@ -194,6 +210,7 @@ def _choose(found: Tables) -> dict[str, Figure]:
                 MARKERS[forms.index(tuple(sent))], color=COLORS[rules.index(rule)], markersize=7,
             )  # fmt: skip
         axes.set_xscale("log")
+        label_plainly(axes.xaxis)
     panels[0].set_ylabel("agreement over the log, occupied, worst robot")
     for rule, color in zip(rules, COLORS, strict=False):
         panels[0].plot([], [], "o", color=color, label=rule)

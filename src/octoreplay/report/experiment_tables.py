@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ Tables = Mapping[str, Sequence[Row]]
 
 Key = tuple[Any, ...]
 
-_SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("0.5", "1"): "γ 0.5/k", ("1", "1"): "γ 1/k"}
+_SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("1", "1"): "γ 1/k"}
 
 
 class Column(NamedTuple):
@@ -42,14 +43,14 @@ def mean(rows: Sequence[Row], name: str) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
-NOISES = {"label_noise": 0.1, "pose_noise": 0.0, "depth_noise": 1.0}
-"""The kinds of noise and what each is while another one is varied."""
+NOISES = ("label_noise", "pose_noise", "depth_noise")
+"""The kinds of noise, of which one at a time is varied."""
 
 
 def of_noise(rows: Sequence[Row], kind: str) -> list[Row]:
-    """The rows in which only one kind of noise differs from what it is otherwise, ascending."""
-    others = {name: value for name, value in NOISES.items() if name != kind}
-    found = [row for row in rows if all(float(row[name]) == value for name, value in others.items())]
+    """The rows in which no other kind of noise is varied, ascending by this one."""
+    usual = {name: Counter(row[name] for row in rows).most_common(1)[0][0] for name in NOISES if name != kind}
+    found = [row for row in rows if all(row[name] == value for name, value in usual.items())]
     return sorted(found, key=lambda row: float(row[kind]))
 
 
@@ -69,11 +70,11 @@ def _rules(found: Tables) -> Iterator[str]:
             Column("worst robot over the log, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")),
             Column("settled", _pair("agreement", "agreement_occupied")),
             Column("mean IoU", _share("mean_iou", 3)),
+            Column("of the oracle", _share("central_mean_iou", 3)),
             Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
             Column("ticks to consensus", _ticks),
         )
         yield from _table("rule, evidence, steps", columns, {(variant(r[0]),): r for r in _by_variant(rows)})
-        yield f"The centralised map's mean IoU: {_share('central_mean_iou', 3)(rows)}.\n"
 
 
 def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
@@ -94,13 +95,15 @@ def _scale(found: Tables) -> Iterator[str]:
     columns = (
         Column("times real time", _number("realtime_factor")),
         Column("peak memory", _megabytes("peak_rss_bytes")),
-        Column("a robot's map", _megabytes("memory_bytes")),
+        Column("memory of the largest robot", _megabytes("memory_bytes")),
         Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
         Column("leaves of a map", _number("num_leaves")),
     )
     for plan, names in (
-        ("robots", ("team", "topology")), ("resolution", ("resolution", "rule")), ("classes", ("team", "rule")),
-    ):  # fmt: skip
+        ("robots", ("num_robots", "topology", "resolution")),
+        ("resolution", ("resolution", "rule")),
+        ("classes", ("num_classes", "rule")),
+    ):
         yield from _table(", ".join(names), columns, groups(found[plan], *names))
 
 
@@ -108,7 +111,7 @@ def _noise(found: Tables) -> Iterator[str]:
     columns = (
         Column("mean IoU", _share("mean_iou", 3)),
         Column("mean IoU of what the robot knows", _share("mean_iou_known", 3)),
-        Column("own occupied cells wrong", _percent("wrong")),
+        Column("wrong alone", _percent("wrong")),
         Column("put right", _percent("repaired")),
         Column("made wrong", _percent("spread")),
         Column("calibration error, h / N h", _pair("calibration_error_occupied", "team_calibration_error_occupied")),
@@ -127,8 +130,7 @@ def _choose(found: Tables) -> Iterator[str]:
         Column("mean IoU", _share("mean_iou", 3)),
         Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
         Column("ticks to consensus", _ticks),
-        Column("a robot's memory", _megabytes("memory_bytes")),
-        Column("times real time", _number("realtime_factor")),
+        Column("memory of the largest robot", _megabytes("memory_bytes")),
     )
     for plan, rows in found.items():
         yield f"**{plan.replace('_', ' ')}**\n"

@@ -12,6 +12,7 @@ from octoreplay.io.text_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
@@ -61,12 +62,25 @@ def legend_below(figure: Figure, axes: Axes | None = None, columns: int = 4) -> 
 
 def label_in_bytes(axes: Axes) -> None:
     """Ticks on a logarithmic axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
-    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import EngFormatter
 
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
-    axes.yaxis.set_minor_locator(NullLocator())
+    _decades(axes.yaxis)
     axes.yaxis.set_major_formatter(EngFormatter(unit="B"))
+
+
+def label_plainly(axis: Axis) -> None:
+    """Ticks of a logarithmic axis as plain numbers, as far apart as those of ``label_in_bytes``."""
+    _decades(axis)
+    axis.set_major_formatter("{x:,g}")
+
+
+def _decades(axis: Axis) -> None:
+    """A tick at every decade, and at 2 and 5 between where there is room."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
+    axis.set_minor_locator(NullLocator())
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.io.results import posterior
-from octoreplay.mapping.octree import LeafSpans, codes_to_keys
-from octoreplay.records import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array, UInt64Array
+from octoreplay.mapping.octree import codes_to_keys
+from octoreplay.records import Float64Array, Int64Array, UInt8Array, UInt64Array
 from octoreplay.result import StoredMap
 
 BACKGROUND = (236, 239, 243)
@@ -128,8 +128,8 @@ def overlay(maps: Sequence[StoredMap]) -> Overlay:
     prior = np.float32(maps[0].prior)
     # A mean above zero needs a robot above zero: all other cells are free.
     chosen = [np.any(span.deviations + prior > 0, axis=1) | bool(prior > 0) for span in spans]
-    codes = np.unique(np.concatenate([_cells(span, rows) for span, rows in zip(spans, chosen, strict=True)]))
-    values = np.stack([_deviations_at(span, codes) for span in spans])
+    codes = np.unique(np.concatenate([span.cells_in(rows) for span, rows in zip(spans, chosen, strict=True)]))
+    values = np.stack([span.deviations_at(codes) for span in spans])
     mean = values.mean(axis=0) + prior
     labels = posterior.labels(mean)
     occupied = labels > 0
@@ -195,26 +195,6 @@ def draw(faces: Faces, view: View, supersampling: int = 2) -> UInt8Array:
         blended = blended.reshape(-1, supersampling, view.width, supersampling, 3).mean(axis=(1, 3))
         picture[rows.start // supersampling : rows.stop // supersampling] = np.rint(np.clip(blended, 0, 255))
     return picture
-
-
-def _cells(spans: LeafSpans, chosen: BoolArray) -> Int64Array:
-    """Morton codes of all finest cells in some leaves."""
-    counts = spans.num_cells[chosen]
-    ends = np.cumsum(counts)
-    codes: Int64Array = np.repeat(spans.codes[chosen] - (ends - counts), counts) + np.arange(
-        ends[-1] if len(ends) else 0
-    )
-    return codes
-
-
-def _deviations_at(spans: LeafSpans, codes: Int64Array) -> Float32Array:
-    """What leaves say of finest cells: (M, C), 0 where nothing is known."""
-    leaf = np.searchsorted(spans.codes, codes, side="right") - 1
-    known = leaf >= 0
-    known[known] = codes[known] < (spans.codes + spans.num_cells)[leaf[known]]
-    values = np.zeros((len(codes), spans.deviations.shape[1]), np.float32)
-    values[known] = spans.deviations[leaf[known]]
-    return values
 
 
 def _packed(keys: Int64Array) -> Int64Array:

@@ -222,7 +222,7 @@ def _team_table(summary: RunSummary) -> Table:
         f"{number(last.total_distance_all)} at the end, {number(summary.peak_total_distance_all)} at most",
     )
     table.add_row("cells with different labels", share(last.label_disagreement))
-    robots = [robot for robot in last.robots if robot.active] or last.robots
+    robots = last.counted_robots
     worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")

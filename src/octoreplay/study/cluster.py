@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import logging
-import re
 from collections.abc import Generator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
@@ -88,8 +87,6 @@ def _row(future: Any, scheduler: str) -> Row:
 def _connected(scheduler: str) -> Generator[Any]:
     """A client of the scheduler, which does not become dask's default one."""
     distributed = _distributed()
-    if not re.fullmatch(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d{1,5}/?", scheduler):
-        raise ConfigError(f"scheduler: '{scheduler}' is not an address such as tcp://host:8786")
     try:
         client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
     # What is there may be no scheduler, and its answer then means anything.

@@ -12,9 +12,10 @@ from typing import Any
 from octoreplay.class_tables.edits import Merges
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
+from octoreplay.replay.session import replay_team
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study.folder import table_csv
-from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
+from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep
 from octoreplay.study.task import Row
 from octoreplay.study.teams import simulated_team
 from octoreplay.team_file import dump_team, load_team_file
@@ -76,6 +77,7 @@ def run_experiment(
     ``scheduler`` are as ``run_sweep`` takes them, for the plans that do not measure time. Raises InputError
     where a run failed, and what ``simulated_team`` and ``run_sweep`` raise.
     """
+    check_workers(num_jobs, 1, scheduler)
     show = progress or _nobody_watches
     teams = {}
     for index, (label, team) in enumerate(experiment.teams.items()):
@@ -88,6 +90,8 @@ def run_experiment(
             show(f"{name}: run {runs.num_finished} of {runs.num_runs}", runs.num_finished / runs.num_runs)
 
         measures_time = plan.num_threads > 1
+        if measures_time:
+            _compile(teams[plan.teams[0]])
         sweep = run_sweep(
             [teams[label] for label in plan.teams], plan.vary, folder / plan.name, settings=plan.settings,
             truth=TRUTH if plan.has_truth else None, keep=plan.keep, num_threads=plan.num_threads,
@@ -125,6 +129,11 @@ def _team_file(team: SimulatedTeam, folder: Path, progress: Callable[[float], No
     merged = folder / "merged.yaml"
     write_whole(merged, dump_team(config, folder.resolve()))
     return merged
+
+
+def _compile(team: Path) -> None:
+    """Replay a second of a team's logs, so that what is measured after it finds its kernels compiled."""
+    replay_team(load_team_file(team).with_parameters({"duration": 1.0}), None)
 
 
 def _nobody_watches(*_: object) -> None:

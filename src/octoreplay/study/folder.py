@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from octoreplay import __version__
 from octoreplay.errors import OutputError
 from octoreplay.io.text_files import json_text, write_whole
 from octoreplay.study.task import Row, from_json, to_json
@@ -54,8 +55,7 @@ class SweepFolder:
         folder = cls(path)
         with _writing(path):
             path.mkdir(parents=True, exist_ok=True)
-            others = {entry.name for entry in path.iterdir()} - {_LOCK}
-            if others and not others & {"sweep.json", "rows"}:
+            if {entry.name for entry in path.iterdir()} - {_LOCK} and not folder._is_sweep():
                 raise OutputError(f"{path}: is not empty and holds no sweep; give a folder of its own")
             lock = (path / _LOCK).open("a+", encoding="utf-8")
         with lock:
@@ -108,9 +108,18 @@ class SweepFolder:
     def _row_path(self, name: str) -> Path:
         return self._rows / f"{file_name(name)}.json"
 
+    def _is_sweep(self) -> bool:
+        """Whether a sweep has been at work here."""
+        try:
+            return "octoreplay" in json.loads((self.path / "sweep.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError, TypeError):
+            return False
+
     def _begin(self) -> None:
         """Make the folders, and take away what sweeps that were killed left behind."""
-        # The rows come first: they say whose folder this is.
+        # This comes first: it says whose folder this is.
+        if not self._is_sweep():
+            self.describe({"octoreplay": __version__})
         for folder in (self._rows, self._runs):
             folder.mkdir(exist_ok=True)
         shutil.rmtree(self._unfinished.parent, ignore_errors=True)

@@ -7,10 +7,12 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from octoreplay.evaluate.checks import ticks_to_consensus
-from octoreplay.records import RobotMetrics, RunSummary, TickMetrics
+from octoreplay.records import RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation
+
+_ROUNDING = 1e-9
 
 RUN_COLUMNS = (
     "stop_reason", "num_ticks", "num_settling_ticks", "ticks_to_consensus", "log_seconds", "num_known_cells",
@@ -97,18 +99,19 @@ def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
 def contraction(distances: Sequence[float]) -> float:
     """The factor by which the total distance shrank per tick: the geometric mean over the later half of the ticks.
 
-    ``distances`` are those of the settling ticks. NaN where there are fewer than four, and where one is 0.
+    ``distances`` are those of the settling ticks; what is below a billionth of the first is rounding, and ends them.
+    NaN where fewer than four are left.
     """
-    later = distances[len(distances) // 2 - 1 :]
-    if len(distances) < 4 or not min(later) > 0.0:
+    num_ticks = next((n for n, value in enumerate(distances) if value <= _ROUNDING * distances[0]), len(distances))
+    if num_ticks < 4:
         return math.nan
+    later = distances[num_ticks // 2 - 1 : num_ticks]
     return float((later[-1] / later[0]) ** (1.0 / (len(later) - 1)))
 
 
 def _worst(tick: TickMetrics, name: str) -> float:
     """The least of one number over the robots that are active; over all where none is."""
-    robots: Sequence[RobotMetrics] = [robot for robot in tick.robots if robot.active] or tick.robots
-    return min((float(getattr(robot, name)) for robot in robots), key=lambda v: (not math.isnan(v), v))
+    return min((float(getattr(robot, name)) for robot in tick.counted_robots), key=lambda v: (not math.isnan(v), v))
 
 
 def _mean(values: Iterable[float]) -> float:

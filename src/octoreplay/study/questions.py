@@ -97,7 +97,12 @@ def scale(duration: float, num_villages: int) -> Experiment:
     return Experiment(
         {**robots, **six, **classes},
         (
-            _timed("robots", robots, ("topology=complete,nearest",), {"num_nearest": 3}),
+            _timed(
+                "robots",
+                robots,
+                ("topology+resolution=complete+0.3,nearest+0.3,nearest+0.2,nearest+0.1",),
+                {"num_nearest": 3},
+            ),
             _timed("resolution", six, (f"resolution={resolutions}", "rule=gradient,bayes"), {}),
             _timed("classes", classes, ("rule=gradient,bayes",), {}),
         ),
@@ -160,8 +165,16 @@ def _villages(duration: float, num_villages: int) -> dict[str, SimulatedTeam]:
 def _timed(
     name: str, teams: Mapping[str, SimulatedTeam], vary: tuple[str, ...], settings: Mapping[str, object]
 ) -> Plan:
-    """A plan that measures time: two threads, nothing beside it, and no truth to wait for."""
-    return Plan(name, tuple(teams), vary, {**settings, **_FINAL_STATES}, has_truth=False, num_threads=2, more=_sizes)
+    """A plan that measures time: two threads, nothing beside it, no settling and no truth to wait for."""
+    return Plan(
+        name,
+        tuple(teams),
+        vary,
+        {**settings, "settle": 0, **_FINAL_STATES},
+        has_truth=False,
+        num_threads=2,
+        more=_sizes,
+    )
 
 
 def _theory(team: SimulatedTeam, row: Row, _: Sweep) -> Row:
@@ -181,7 +194,7 @@ def _sizes(team: SimulatedTeam, *_: object) -> Row:
 
 
 def _noise_and_repairs(team: SimulatedTeam, row: Row, sweep: Sweep) -> Row:
-    """A team's noise; shares of the robots' own occupied cells that are wrong, put right, and made wrong."""
+    """A team's noise; which cells are wrong, put right and made wrong, as shares of those that count (``Repairs``)."""
     simulation = team.simulation
     noise = {name: getattr(simulation, name) for name in ("label_noise", "pose_noise", "depth_noise")}
     with (

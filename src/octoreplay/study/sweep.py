@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
@@ -97,9 +98,7 @@ def run_sweep(
     fixed = {name: value for name, value in (settings or {}).items() if value is not None}
     parsed = [parse_variation(text) for text in variations]
     check_variations(parsed, fixed, num_seeds)
-    for name, number in (("jobs", num_jobs), ("threads", num_threads)):
-        if number is not None and number < 1:
-            raise ConfigError(f"{name}: {number} is below the least value 1")
+    check_workers(num_jobs, num_threads, scheduler)
     paths = _labels([Path(team) for team in ([teams] if isinstance(teams, str | Path) else teams)])
     bases = {label: load_team_file(path) for label, path in paths.items()}
     truths = {label: None if truth is None else _truth(Path(truth), path) for label, path in paths.items()}
@@ -136,6 +135,18 @@ def _on_cluster(tasks: Sequence[Task], scheduler: str) -> Generator[tuple[Task, 
     return run_on_cluster(tasks, scheduler)
 
 
+def check_workers(num_jobs: int | None, num_threads: int, scheduler: str | None) -> None:
+    """Refuse what says wrongly where runs are done. Raises ConfigError."""
+    for name, number in (("jobs", num_jobs), ("threads", num_threads)):
+        if number is not None and number < 1:
+            raise ConfigError(f"{name}: {number} is below the least value 1")
+    if scheduler is not None:
+        if num_jobs is not None:
+            raise ConfigError("--jobs is for this machine and --scheduler for another; leave one out")
+        if not re.fullmatch(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d{1,5}/?", scheduler):
+            raise ConfigError(f"scheduler: '{scheduler}' is not an address such as tcp://host:8786")
+
+
 class _Board:
     """What is finished: the rows, the table, and the progress."""
 
@@ -159,7 +170,8 @@ class _Board:
         for task in self._tasks:
             row = self._folder.row(task.name, task.key)
             has_result = not task.keep or Path(task.result).exists()
-            if row is not None and row["status"] != FAILED and has_result:
+            # A row of another version of the table, or of a run that failed, is made again.
+            if row is not None and set(self._columns) <= {*row, *task.labels} and has_result:
                 self.rows[task.name] = {**row, **task.labels}
         self._num_earlier = len(self.rows)
         self.write()
@@ -169,6 +181,9 @@ class _Board:
     def add(self, task: Task, row: Row) -> None:
         """Take in one run."""
         self.rows[task.name] = {**task.labels, **row}
+        if not task.keep or row["status"] == FAILED:
+            # An earlier sweep's, of other settings.
+            Path(task.result).unlink(missing_ok=True)
         self._folder.add_row(task.name, task.key, self.rows[task.name])
         if time.monotonic() > self._written + _TABLE_SECONDS:
             self.write()

@@ -83,6 +83,7 @@ def _run(task: Task) -> Row:
     unfinished = Path(task.unfinished)
     config = parse_team(task.team, source=task.name, folder=Path("/"))
     summary = replay_team(config, unfinished, num_threads=task.num_threads)
+    timing = _timing(summary)
     with open_result(unfinished) as result:
         row = run_numbers(summary, result.metrics)
     if task.truth is not None:
@@ -92,7 +93,7 @@ def _run(task: Task) -> Row:
     if task.keep:
         unfinished.replace(task.result)
     lost = "; ".join(f"{robot_id}: {_loss(c)}" for robot_id, c in summary.frame_counts.items() if c.lost_data)
-    return {"status": DATA_LOST if lost else OK, "error": lost, **row, **_timing(summary)}
+    return {"status": DATA_LOST if lost else OK, "error": lost, **row, **timing}
 
 
 def _compile_first() -> None:
