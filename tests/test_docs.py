@@ -1,5 +1,6 @@
 """The documentation names what there is."""
 
+import csv
 import dataclasses
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from octoreplay.evaluate.records import EvaluatedTick, MapScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
 from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
+from octoreplay.report.experiment_tables import answer_tables
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -69,3 +71,13 @@ def test_links_between_pages_lead_somewhere() -> None:
     for page in pages:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name} -> {target}"
+
+
+@pytest.mark.parametrize("name", ["rules", "steps", "scale", "noise", "choose"])
+def test_the_page_on_experiments_has_the_tables_of_the_stored_runs(name: str) -> None:
+    tables = {}
+    for path in sorted((DOCS / "experiments" / name).glob("*.csv")):
+        tables[path.stem] = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    page = (DOCS / "experiments.md").read_text(encoding="utf-8")
+    stored = page.partition(f"<!-- {name} -->\n")[2].partition("<!-- end -->")[0]
+    assert stored == answer_tables(name, tables)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from octoreplay.report.experiment_tables import Key, Row, Tables, groups, mean, of_noise, variant
+from octoreplay.report.experiment_tables import SITUATIONS, Key, Row, Tables, groups, mean, of_noise, variant
 from octoreplay.report.figures import (
     BLUE,
     COLORS,
@@ -199,12 +199,12 @@ def _noise(found: Tables) -> dict[str, Figure]:
 def _choose(found: Tables) -> dict[str, Figure]:
     """What each choice costs in radio, and how well the worst robot's map agrees while the logs last."""
     figure = new_figure(13.0, 4.6)
-    panels = figure.subplots(1, len(found), sharey=True)
+    panels = figure.subplots(1, len(SITUATIONS), sharey=True)
     rules = list(dict.fromkeys(str(row["rule"]) for rows in found.values() for row in rows))
     forms: list[Key] = list(dict.fromkeys(key for rows in found.values() for key in groups(rows, "packets", "content")))
-    for axes, (plan, rows) in zip(panels, found.items(), strict=True):
+    for axes, plan in zip(panels, SITUATIONS, strict=True):
         style(axes, plan.replace("_", " "), "kB a robot and second")
-        for (rule, *sent), part in groups(rows, "rule", "packets", "content").items():
+        for (rule, *sent), part in groups(found[plan], "rule", "packets", "content").items():
             axes.plot(
                 mean(part, "sent_bytes_per_second") / 1e3, mean(part, "agreement_occupied_mean"),
                 MARKERS[forms.index(tuple(sent))], color=COLORS[rules.index(rule)], markersize=7,

@@ -43,6 +43,9 @@ def mean(rows: Sequence[Row], name: str) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
+SITUATIONS = ("good_radio", "poor_radio", "many_robots")
+"""The plans of ``choose``, in their order."""
+
 NOISES = ("label_noise", "pose_noise", "depth_noise")
 """The kinds of noise, of which one at a time is varied."""
 
@@ -132,9 +135,9 @@ def _choose(found: Tables) -> Iterator[str]:
         Column("ticks to consensus", _ticks),
         Column("memory of the largest robot", _megabytes("memory_bytes")),
     )
-    for plan, rows in found.items():
+    for plan in SITUATIONS:
         yield f"**{plan.replace('_', ' ')}**\n"
-        yield from _table("rule, packets, content", columns, groups(rows, "rule", "packets", "content"))
+        yield from _table("rule, packets, content", columns, groups(found[plan], "rule", "packets", "content"))
 
 
 def _table(title: str, columns: Sequence[Column], rows: Mapping[Key, Sequence[Row]]) -> Iterator[str]:
@@ -147,8 +150,11 @@ def _table(title: str, columns: Sequence[Column], rows: Mapping[Key, Sequence[Ro
 
 
 def _named(value: Any) -> str:
-    """A part of a line's name."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    """A part of a line's name, the same for a number and for its text."""
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return str(value)
 
 
 def _number(name: str) -> Callable[[Sequence[Row]], str]:
