@@ -13,6 +13,7 @@ Tables = Mapping[str, Sequence[Row]]
 
 Key = tuple[Any, ...]
 
+_IOUS = ("mean_iou", "central_mean_iou")
 _SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("1", "1"): "γ 1/k"}
 
 
@@ -77,7 +78,22 @@ def _rules(found: Tables) -> Iterator[str]:
             Column("kB a robot and second", _kilobytes("sent_bytes_per_second")),
             Column("ticks to consensus", _ticks),
         )
-        yield from _table("rule, evidence, steps", columns, {(variant(r[0]),): r for r in _by_variant(rows)})
+        yield from _table(
+            "rule, evidence, steps",
+            columns,
+            {(variant(r[0]),): r for r in _by_variant(rows)} | {("central, the oracle",): _oracle(rows)},
+        )
+
+
+def _oracle(rows: Sequence[Row]) -> list[Row]:
+    """What a rule would come to whose robots all had the centralised map of summed evidence."""
+    same = {"total_distance_all_log_end": 0.0, "total_distance_all": 0.0, "ticks_to_consensus": 0.0}
+    agreements = ("agreement_mean", "agreement_occupied_mean", "agreement", "agreement_occupied")
+    return [
+        {**same, **dict.fromkeys(agreements, 1.0), **dict.fromkeys(_IOUS, row["central_mean_iou"])}
+        for row in rows
+        if row["evidence"] in ("sum", "-")
+    ]
 
 
 def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
