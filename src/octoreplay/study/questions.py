@@ -140,7 +140,10 @@ def choose(duration: float, num_villages: int) -> Experiment:
         "ratio+full+float32",
     )  # fmt: skip
     vary = (f"rule+packets+content={','.join(variants)}",)
-    poor = {"topology": "range", "radio_range": RADIO_RANGE, "loss": 0.3, "latency": 0.2, "rate": 50_000}
+    # Packets of seconds need hundreds of ticks to come to rest; a minute is what a team would wait.
+    poor = {
+        "topology": "range", "radio_range": RADIO_RANGE, "loss": 0.3, "latency": 0.2, "rate": 50_000, "settle_max": 60,
+    }  # fmt: skip
     return Experiment(
         {**teams, **many},
         (
