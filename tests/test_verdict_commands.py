@@ -100,7 +100,7 @@ def test_results_that_cannot_be_compared_are_one_sentence(runs: dict[str, Path],
     assert text.count("\n") == 1
     assert "no result of octoreplay" in text
     assert "cannot be read" in ends(1, "compare", runs["pair"], tmp_path / "none.mcap")
-    assert "no map of robot 'nobody'" in ends(1, "compare", runs["pair"], runs["again"], "--robot", "nobody")
+    assert "has a map of robot 'nobody'" in ends(1, "compare", runs["pair"], runs["again"], "--robot", "nobody")
 
 
 def test_wrong_usage_of_compare(runs: dict[str, Path], tmp_path: Path) -> None:

@@ -279,6 +279,11 @@ class LinkConfig:
             raise ConfigError(f"jitter: {self.jitter:g} is above latency {self.latency:g}; a delay cannot be negative")
 
     @property
+    def is_random(self) -> bool:
+        """True where chance decides what becomes of a packet."""
+        return any((self.jitter, self.loss, self.burst_start, self.corruption))
+
+    @property
     def mean_loss(self) -> float:
         """Share of the packets that do not arrive whole, over a long time and without rate limit."""
         in_burst = self.burst_start / (self.burst_start + self.burst_end)

@@ -169,7 +169,18 @@ def test_nothing_sent_and_no_frames_fail(tmp_path: Path) -> None:
     metrics = ticks()
     of_run = dataclasses.replace(run_summary(metrics), links=(), frame_counts={"alpha": FrameCounts()})
     rows = check_result(stored(tmp_path, metrics, of_run), {"min_delivered_share": 0, "max_frames_lost_share": 1})
-    assert [(row.passed, row.detail) for row in rows] == [(False, "there is nothing to measure")] * 2
+    assert [(row.passed, row.detail) for row in rows] == [
+        (False, "there is nothing to measure"),
+        (False, "there are no frames, or a log was cut or damaged"),
+    ]
+    # How many frames a cut log would have had nobody knows.
+    (tmp_path / "cut").mkdir()
+    cut = {"alpha": FrameCounts(used=9, truncated_files=["a.mcap: is cut off"])}
+    row = only(
+        stored(tmp_path / "cut", metrics, dataclasses.replace(of_run, frame_counts=cut)), max_frames_lost_share=0
+    )
+    assert (row.passed, row.robot) == (False, "alpha")
+    assert math.isnan(row.measured)
 
 
 def test_links_that_were_given_nothing_do_not_count(tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ def test_robots_that_only_one_result_has(tmp_path: Path) -> None:
     assert compare_results(a, b, robot="alpha").is_same
     lonely = compare_results(a, b, robot="beta")
     assert (lonely.is_same, lonely.maps, lonely.only_a) == (False, (), ("beta",))
-    with pytest.raises(InputError, match="no map of robot 'delta' is in either; robots: alpha, beta"):
+    with pytest.raises(InputError, match="has a map of robot 'delta'; robots: alpha, beta"):
         compare_results(a, b, robot="delta")
 
 

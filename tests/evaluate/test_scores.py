@@ -55,6 +55,12 @@ def scenes(draw):
     return cells, team, observed, classes
 
 
+def mean_of_true_classes(iou, region, classes):
+    """The mean over the classes that the truth has in the region; NaN where it has none."""
+    true = sorted({classes[key] for key in region if classes.get(key, 0) > 0})
+    return np.mean([iou[class_id - 1] for class_id in true]) if true else np.nan
+
+
 @settings(max_examples=80, deadline=None)
 @given(scenes(), st.sampled_from((0.0, -0.8, 0.15)), st.sampled_from((1, 3)))
 def test_spans_say_what_scikit_learn_says_of_cells(scene, prior, num_robots):
@@ -65,8 +71,8 @@ def test_spans_say_what_scikit_learn_says_of_cells(scene, prior, num_robots):
     accuracies = dense_scores.accuracies(cells, classes, prior)
     expected = (
         *iou,
-        np.mean(iou[~np.isnan(iou)]) if not np.isnan(iou).all() else np.nan,
-        np.mean(iou_known[~np.isnan(iou_known)]) if not np.isnan(iou_known).all() else np.nan,
+        mean_of_true_classes(iou, team, classes),
+        mean_of_true_classes(iou_known, cells, classes),
         *accuracies,
         dense_scores.coverage(cells, observed, classes, prior),
         dense_scores.coverage(cells, classes, classes, prior),
@@ -127,9 +133,10 @@ def test_counts_worked_out_by_hand():
     team = cells | {(5, 0, 0): FREE}
     found = scores_of(cells, classes, team=team)
     assert found.iou == (3 / 8, 0.0)
-    assert found.mean_iou == 3 / 16
-    # Without the cell that the map does not know; the tree stands nowhere but in the map.
-    assert found.mean_iou_known == (3 / 7) / 2
+    # The tree stands nowhere in the region but in the map, so it does not count in the mean.
+    assert found.mean_iou == 3 / 8
+    # Without the cell that the map does not know.
+    assert found.mean_iou_known == 3 / 7
     assert (found.occupied_accuracy, found.free_accuracy) == (4 / 5, 2 / 4)
     assert (found.coverage, found.world_coverage) == (4 / 6, 4 / 7)
 

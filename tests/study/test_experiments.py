@@ -21,7 +21,7 @@ NUM_RUNS = {
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
     "scale": {"robots": 5 * 4, "resolution": 5 * 2, "classes": 4 * 2},
     "noise": {"noise": 12 * 3 * 2},
-    "choose": {"good_radio": 13 * 2, "poor_radio": 13 * 2, "many_robots": 13 * 2},
+    "choose": {"good_radio": 13 * 2, "poor_radio": 13 * 2, "many_robots": 13},
 }
 
 

@@ -105,7 +105,7 @@ def test_nothing_is_set_twice() -> None:
         check_variations([loss, parse_variation("loss+latency=0+1")], {}, None)
     with pytest.raises(ConfigError, match=r"loss: is varied and set to 0\.25 as well; leave one out"):
         check_variations([loss], {"loss": 0.25}, None)
-    with pytest.raises(ConfigError, match="vary: 'network_seed' is listed twice"):
+    with pytest.raises(ConfigError, match="network_seed: is varied, and so does --seeds; leave one out"):
         check_variations([parse_variation("network_seed=1,2")], {}, 3)
     with pytest.raises(ConfigError, match="seeds: 0 is below the least value 1"):
         check_variations([loss], {}, 0)

@@ -133,7 +133,7 @@ def _add_question(name: str, duration: float, num_villages: int, question: str, 
 
 _add_question("rules", 60.0, 3, "Which rule, on which graph?")
 _add_question("steps", 60.0, 1, "How do epsilon and gamma trade consensus against the robots' own evidence?")
-_add_question("scale", 30.0, 1, "How many robots, cells and classes are mapped in real time?", is_timed=True)
+_add_question("scale", 20.0, 1, "How many robots, cells and classes are mapped in real time?", is_timed=True)
 _add_question("noise", 60.0, 1, "What does consensus repair of noisy labels, poses and depths, what does it spread?")
 _add_question("choose", 60.0, 2, "Which settings for a good radio, for a poor one, and for many robots?")
 

@@ -10,7 +10,7 @@ import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import SectionedCommand, existing_path, with_parameters
-from octoreplay.commands.progress import progress_bar
+from octoreplay.commands.progress import progress_bar, warn
 from octoreplay.config import PRESETS
 
 if TYPE_CHECKING:
@@ -54,7 +54,9 @@ def sweep(
         )  # fmt: skip
     out = tables.terminal()
     earlier = f", {done.num_earlier} of them before" if done.num_earlier else ""
-    out.print(f"wrote {done.table} ({len(done.rows)} runs{earlier})", soft_wrap=True)
+    for sentence in done.warnings:
+        warn(tables.terminal(stderr=True), sentence)
+    out.print(f"wrote {done.table} ({len(done.rows)} runs{earlier}), figures in {output / 'figures'}", soft_wrap=True)
     return _end(done)
 
 

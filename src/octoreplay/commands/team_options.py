@@ -42,6 +42,9 @@ def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console
         if len(inputs) > 1:
             raise click.UsageError("give one team file, or logs, not both")
         return load_team_file(inputs[0])
+    for path in inputs:
+        if (path / "team.yaml").is_file():
+            raise ConfigError(f"{path}: holds a team file; give {path / 'team.yaml'}, or its logs one by one")
     return RunConfig(robots=discover.discover(inputs))
 
 

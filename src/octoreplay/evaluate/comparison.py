@@ -131,7 +131,9 @@ def compare_results(
         _check_comparable(result_a, result_b)
         names_a, names_b = (_chosen(result, robot) for result in (result_a, result_b))
         if not names_a and not names_b:
-            raise InputError(f"{a}, {b}: no map of robot '{robot}' is in either; robots: {', '.join(result_a.robots)}")
+            raise InputError(
+                f"{b}: neither it nor {a} has a map of robot '{robot}'; robots: {', '.join(result_a.robots)}"
+            )
         maps = tuple(_map_difference(result_a, result_b, name, at, tolerance) for name in names_a if name in names_b)
         only_a = tuple(name for name in names_a if name not in names_b)
         only_b = tuple(name for name in names_b if name not in names_a)

@@ -14,10 +14,11 @@ class MapScores:
 
     ``agreement`` and ``agreement_occupied`` are with the reference map (docs/metrics.md); NaN where there is none.
     What needs the truth is NaN without it: ``iou`` (C,) of each class over the cells that the team's evidence covers
-    (NaN where a class occurs neither in the truth nor in the map) and ``mean_iou``, their mean; ``mean_iou_known``, the
-    same over the cells that this map knows; ``occupied_accuracy`` and ``free_accuracy``, the share of truly occupied
-    and of truly free known cells that the map calls so; ``coverage``, the share of the surface observed by the team in
-    the whole run that the map calls occupied; ``world_coverage``, the same of all surface; ``calibration_error``, the
+    (NaN where a class occurs neither in the truth nor in the map) and ``mean_iou``, their mean over the classes that
+    the truth has there; ``mean_iou_known``, the same over the cells that this map knows; ``occupied_accuracy`` and
+    ``free_accuracy``, the share of truly occupied and of truly free known cells that the map calls so; ``coverage``,
+    the share of the surface observed by the team in the whole run that the map calls occupied; ``world_coverage``, the
+    same of all surface; ``calibration_error``, the
     expected calibration error over known cells, and over those that are occupied in map or truth, of h; ``team_`` the
     same of h_0 + N (h - h_0).
     """

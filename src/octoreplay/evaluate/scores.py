@@ -70,8 +70,8 @@ def truth_scores(
         team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
     return TruthScores(
         tuple(iou.tolist()),
-        _mean(iou),
-        _mean(_intersections_over_unions(confusion)),
+        _mean(iou, of_team),
+        _mean(_intersections_over_unions(confusion), confusion),
         _ratio(confusion[1:, 1:].sum(), confusion[1:].sum()),
         _ratio(confusion[0, 0], confusion[0].sum()),
         _ratio((is_seen & is_observed & truth.is_class).sum(), (is_observed & truth.is_class).sum()),
@@ -201,10 +201,10 @@ def _sums(places: npt.NDArray[np.integer], weights: Int64Array, size: int) -> In
     return sums
 
 
-def _mean(values: Float64Array) -> float:
-    """The mean of the values that are no NaN."""
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if values.size else math.nan
+def _mean(iou: Float64Array, confusion: Int64Array) -> float:
+    """The mean of the IoU (C,) over the classes that the truth has; NaN where it has none."""
+    of_truth = iou[confusion.sum(axis=1)[1:] > 0]
+    return float(of_truth.mean()) if of_truth.size else math.nan
 
 
 def _ratio(part: float | np.number, whole: float | np.number) -> float:

@@ -56,8 +56,8 @@ def _curves(title: str, y_label: str, ticks: Sequence[EvaluatedTick], name: str)
 def _calibration_figure(ticks: Sequence[EvaluatedTick]) -> Figure:
     """The expected calibration error of h, of N h and of the centralised map."""
     figure, [axes] = over_log_time("Expected calibration error", ["error"])
-    _draw_robots(axes, ticks, "calibration_error", BLUE, "h")
-    _draw_robots(axes, ticks, "team_calibration_error", GREEN, "N h")
+    _draw_robots(axes, ticks, "calibration_error", BLUE, "robots' maps, h")
+    _draw_robots(axes, ticks, "team_calibration_error", GREEN, "the team's posterior, N h")
     _draw_central(axes, ticks, "calibration_error", ORANGE, "centralised map")
     return _finished(figure, axes)
 

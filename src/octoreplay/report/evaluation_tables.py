@@ -41,6 +41,7 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
     ]
     if evaluation.truth is not None:
         parts += ["", _title(f"Against {evaluation.truth}"), _truth_table(final)]
+        parts += ["h: the map itself; N h: h_0 + N (h - h_0), the team's posterior (docs/evaluation.md)"]
         parts += ["", _title("IoU of the classes"), _classes_table(evaluation.class_names, final)]
     if len(evaluation.ticks) > 1:
         parts += ["", _title("Over time, mean over the robots"), _times_table(evaluation)]

@@ -13,6 +13,7 @@ from octoreplay.errors import OutputError
 from octoreplay.report.figures import COLORS, new_figure, save_figures, style
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Axis = tuple[str, ...]
@@ -66,11 +67,12 @@ def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis
 
 @dataclass(frozen=True)
 class _Spread:
-    """A mean over seeds with the least and the largest value."""
+    """A mean over seeds with the least and the largest value; ``note`` says what a drawing of them would not."""
 
     mean: float
     least: float
     largest: float
+    note: str
 
 
 @dataclass(frozen=True)
@@ -151,9 +153,18 @@ def _spreads(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) ->
     """The values of a column by label along the figure and label of the series."""
     found: dict[tuple[str, str], list[float]] = {}
     for row in rows:
-        if math.isfinite(row[column]):
-            found.setdefault((_label(row, layout.along), _label(row, layout.series)), []).append(row[column])
-    return {key: _Spread(math.fsum(values) / len(values), min(values), max(values)) for key, values in found.items()}
+        found.setdefault((_label(row, layout.along), _label(row, layout.series)), []).append(row[column])
+    return {key: _spread(values) for key, values in found.items()}
+
+
+def _spread(values: Sequence[float]) -> _Spread:
+    """The mean and range of those of the values that there are."""
+    there = [value for value in values if math.isfinite(value)]
+    missing = len(values) - len(there)
+    if not there:
+        return _Spread(math.nan, math.nan, math.nan, "none")
+    note = f"none in {missing} of {len(values)}" if missing else "0" if not any(there) else ""
+    return _Spread(math.fsum(there) / len(there), min(there), max(there), note)
 
 
 def _scale(rows: Sequence[Mapping[str, Any]], column: str) -> str:
@@ -179,6 +190,8 @@ def _draw_lines(
     order = sorted(range(len(along)), key=lambda index: numbers[index])
     for index, name in enumerate(series):
         points = [(numbers[n], spreads[along[n], name]) for n in order if (along[n], name) in spreads]
+        for x, spread in points:
+            _write_note(axes, x, spread, index)
         axes.errorbar(
             [x for x, _ in points], [spread.mean for _, spread in points], yerr=_ranges([s for _, s in points]),
             label=name, color=COLORS[index % len(COLORS)], linewidth=1.6, marker="os^Dv"[index % 5], markersize=4,
@@ -195,6 +208,8 @@ def _draw_bars(
     width = 0.8 / len(series)
     for index, name in enumerate(series):
         places = [(n, spreads[label, name]) for n, label in enumerate(along) if (label, name) in spreads]
+        for n, spread in places:
+            _write_note(axes, n + (index - (len(series) - 1) / 2) * width, spread, 0)
         axes.bar(
             [n + (index - (len(series) - 1) / 2) * width for n, _ in places], [spread.mean for _, spread in places],
             0.9 * width, label=name, color=COLORS[index % len(COLORS)],
@@ -207,8 +222,17 @@ def _draw_bars(
     axes.set_xlim(-0.6, len(along) - 0.4)
 
 
+def _write_note(axes: Axes, x: float, spread: _Spread, line: int) -> None:
+    """Say at the foot of the figure what a bar or a point cannot show: no value, or a value of 0."""
+    if spread.note:
+        axes.text(
+            x, 0.02 + 0.06 * line, spread.note, transform=axes.get_xaxis_transform(), rotation=90, fontsize=7,
+            ha="center", va="bottom", color=COLORS[line % len(COLORS)] if line else "#444444",
+        )  # fmt: skip
+
+
 def _ranges(spreads: Sequence[_Spread]) -> list[list[float]] | None:
     """How far each mean is above the least and below the largest value; None where there is no range to show."""
-    if all(spread.least == spread.largest for spread in spreads):
+    if all(spread.least == spread.largest or math.isnan(spread.mean) for spread in spreads):
         return None
     return [[max(s.mean - s.least, 0.0) for s in spreads], [max(s.largest - s.mean, 0.0) for s in spreads]]

@@ -61,9 +61,11 @@ def check_variations(variations: Sequence[Variation], settings: Mapping[str, Any
     """Refuse a parameter that would be set twice. Raises ConfigError."""
     if num_seeds is not None and num_seeds < 1:
         raise ConfigError(f"seeds: {num_seeds} is below the least value 1")
-    seeds = () if num_seeds is None else (SEED,)
-    names = (*(name for variation in variations for name in variation.names), *seeds)
-    _check_distinct("vary", names)
+    varied = [name for variation in variations for name in variation.names]
+    _check_distinct("vary", varied)
+    if num_seeds is not None and SEED in varied:
+        raise ConfigError(f"{SEED}: is varied, and so does --seeds; leave one out")
+    names = (*varied, *(() if num_seeds is None else (SEED,)))
     for name in names:
         if settings.get(name) is not None:
             raise ConfigError(f"{name}: is varied and set to {settings[name]} as well; leave one out")

@@ -8,7 +8,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +44,7 @@ class SweepProgress:
 class Sweep:
     """A finished sweep. ``rows`` are the runs in the order of the combinations, by column; ``names`` what is varied.
 
-    ``num_earlier`` of them were finished before and not run again.
+    ``num_earlier`` of them were finished before and not run again; ``warnings`` are sentences.
     """
 
     folder: Path
@@ -53,6 +53,7 @@ class Sweep:
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
     num_earlier: int
+    warnings: tuple[str, ...]
 
     @property
     def failed(self) -> tuple[Row, ...]:
@@ -126,7 +127,8 @@ def run_sweep(
                 board.write()
         varied = [variation.names for variation in parsed]
         write_sweep_figures(board.ordered(), varied, folder.figures)
-        return Sweep(folder.path, folder.table, names, columns, board.ordered(), len(tasks) - len(left))
+        rows, num_earlier = board.ordered(), len(tasks) - len(left)
+        return Sweep(folder.path, folder.table, names, columns, rows, num_earlier, tuple(_warnings(runs, num_seeds)))
 
 
 def _on_cluster(tasks: Sequence[Task], scheduler: str) -> Generator[tuple[Task, Row]]:
@@ -255,6 +257,18 @@ def _task(
         version=__version__,
         num_threads=num_threads,
     )
+
+
+def _warnings(runs: Sequence[Combination], num_seeds: int | None) -> Iterator[str]:
+    """What is worth knowing of a sweep that can be done."""
+    if (num_seeds or 1) > 1 and not any(_draws(run.config) for run in runs):
+        yield "no setting of these runs leaves anything to chance, so --seeds repeats the same runs; leave it out"
+
+
+def _draws(config: RunConfig) -> bool:
+    """Whether a run depends on its seed."""
+    overrides = (value for *_, values in config.link_overrides for _, value in values)
+    return config.network.topology == "random" or config.link.is_random or any(overrides)
 
 
 def _name(labels: Mapping[str, Any]) -> str:
