@@ -96,4 +96,5 @@ def test_what_cannot_be_evaluated_is_one_sentence(trio: Path, tmp_path: Path) ->
     fails(1, r"^error: .*none\.mcap: cannot be read", trio, "--against", tmp_path / "none.mcap")
     fails(2, r"^error: .*must end in \.csv", trio, "--csv", tmp_path / "a.txt")
     fails(1, r"^error: .*the folder .* does not exist", trio, "--json", tmp_path / "none" / "a.json")
+    fails(1, r"^error: .*empty\.npz: is a file; give a folder", trio, "--plot", tmp_path / "empty.npz")
     fails(2, "Missing argument")

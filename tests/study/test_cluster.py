@@ -15,6 +15,7 @@ import pytest
 import octoreplay
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.study import cluster
+from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
 from study.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
 
@@ -64,7 +65,7 @@ def dask(tmp_path: Path) -> Iterator[Cluster]:
 def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
     done = sweep(TEAM, *GRID, "-o", tmp_path / "d", "--scheduler", dask.address)
     assert done.returncode == 0, done.stderr
-    assert done.stdout == f"wrote {tmp_path / 'd' / 'table.csv'} (4 runs)\n"
+    assert done.stdout == f"wrote {tmp_path / 'd' / 'table.csv'} (4 runs), figures in {tmp_path / 'd' / 'figures'}\n"
     assert sweep(TEAM, *GRID, "-o", tmp_path / "s").returncode == 0
     assert table(tmp_path / "d") == table(tmp_path / "s")
     done = sweep(TEAM, *GRID, "-o", tmp_path / "s", "--scheduler", dask.address)
@@ -130,7 +131,7 @@ def test_a_scheduler_that_is_none_is_one_sentence(tmp_path: Path, monkeypatch: p
         list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
     for address in ("here", "http://127.0.0.1:80", "tcp://here", "tcp://:x"):
         with pytest.raises(ConfigError, match=f"scheduler: '{address}' is not an address such as tcp://host:8786"):
-            list(cluster.run_on_cluster([task], address))
+            check_workers(None, 1, address)
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"not installed; pip install 'octoreplay\[cluster\]'"):
         list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))

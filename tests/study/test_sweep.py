@@ -36,7 +36,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a sweep that nothing happened to."""
     folder = tmp_path_factory.mktemp("sweep") / "whole"
     done = sweep(TEAM, *GRID, "-o", folder)
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"wrote {folder / 'table.csv'} (4 runs)\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (
+        0, f"wrote {folder / 'table.csv'} (4 runs), figures in {folder / 'figures'}\n", "",
+    )  # fmt: skip
     return folder
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from octoreplay.commands.options import check_output, existing_path
-from octoreplay.commands.progress import progress_bar
+from octoreplay.commands.options import check_folder, check_output, existing_path
+from octoreplay.commands.progress import progress_bar, warn
 from octoreplay.config import CENTRAL
 
 
@@ -34,12 +34,18 @@ def evaluate(
     from octoreplay.report.evaluation_files import write_evaluation
     from octoreplay.report.evaluation_plots import write_evaluation_figures
     from octoreplay.report.evaluation_tables import evaluation_tables
+    from octoreplay.result import open_result
 
     inputs = [result, *([truth] if truth is not None else []), Path(against)]
     for path, suffix in ((csv, ".csv"), (json, ".json")):
         if path is not None:
             check_output(path, suffix, inputs)
+    if plot is not None:
+        check_folder(plot)
     out, err = tables.terminal(), tables.terminal(stderr=True)
+    with open_result(result) as opened:
+        if not opened.is_complete:
+            warn(err, f"{result}: is of an interrupted run; these are the maps that it had stored")
     with progress_bar("evaluate") as update:
         evaluation = evaluate_result(
             result, truth=truth, against=against, over_time=not last, progress=lambda share: update(share, None, "")

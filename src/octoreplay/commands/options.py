@@ -74,6 +74,12 @@ def numbers(name: str, text: str, count: int) -> tuple[float, ...]:
     return numbers
 
 
+def check_folder(path: Path) -> None:
+    """Refuse a folder for figures that is a file, before any work is done."""
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file; give a folder")
+
+
 def check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
     """Refuse an output before any work is done: another kind of file, no file at all, or an input of the command."""
     if path.exists() and not path.is_file():

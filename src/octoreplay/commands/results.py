@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from octoreplay.commands.options import check_output, existing_path
+from octoreplay.commands.options import check_folder, check_output, existing_path
 from octoreplay.errors import ConfigError
 
 
@@ -23,6 +23,8 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
 
     if csv is not None:
         check_output(csv, ".csv")
+    if plot is not None:
+        check_folder(plot)
     with open_result(result) as opened:
         tables.show(tables.terminal(), tables.results(opened.summary))
         written: list[Path] = []

@@ -126,6 +126,9 @@ class _Evaluator:
         if self._other is not None:
             agreements = self._agreements_with_other(self._other, spans, seconds)
             counts = [_Counts(*count[:2], *pair) for count, pair in zip(counts, agreements, strict=True)]
+        if not region.num_cells:
+            # Maps that hold nothing neither agree nor differ.
+            disagreement, counts = math.nan, [_Counts(*count[:2], math.nan, math.nan) for count in counts]
         is_active = {robot.robot_id: robot.active for robot in metrics.robots}
         return EvaluatedTick(
             tick,

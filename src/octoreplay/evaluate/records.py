@@ -44,7 +44,9 @@ class MapScores:
 
 @dataclass(frozen=True)
 class EvaluatedTick:
-    """All maps at one stored tick; ``seconds`` since the run's start, ``label_disagreement`` between the robots."""
+    """All maps at one stored tick; ``seconds`` since the run's start, ``label_disagreement`` between the robots, NaN
+    where no map holds anything.
+    """
 
     tick: int
     seconds: float

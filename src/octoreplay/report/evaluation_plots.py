@@ -107,7 +107,9 @@ def _marker(ticks: Sequence[EvaluatedTick]) -> str | None:
 
 
 def _finished(figure: Figure, axes: Axes) -> Figure:
-    """A figure of shares with its legend."""
+    """A figure of shares with its legend; what is over time goes on while the team settles."""
+    if axes.get_xlabel():
+        axes.set_xlabel("time since the start, settling included [s]")
     axes.set_ylim(0.0, 1.0)
     legend_below(figure)
     return figure
