@@ -85,7 +85,9 @@ class Report:
         rows = [{**asdict(row), "verdict": row.verdict} for row in self.rows]
         content = {
             "benchmark": self.benchmark, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "machine": machine(), "options": {name: str(value) for name, value in self.options.items()},
+            "machine": machine(),
+            # Where the report goes says nothing of what was measured.
+            "options": {name: str(value) for name, value in self.options.items() if name != "json"},
             "remarks": self.remarks, "rows": rows,
         }  # fmt: skip
         text = json.dumps(content, indent=1) + "\n"

@@ -215,6 +215,7 @@ def dump_team(config: RunConfig, folder: Path | None = None) -> str:
     buffer = io.StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
+    # The library knows this attribute as None only.
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.width = 110
     yaml.dump(_content(config, folder), buffer)

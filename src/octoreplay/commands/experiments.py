@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from octoreplay.commands.options import existing_path
-from octoreplay.commands.progress import progress_bar
+from octoreplay.commands.progress import progress_bar, replay_bar
 from octoreplay.config import RunConfig
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from octoreplay.replay.session import Progress
     from octoreplay.simulate.team import SimulationConfig
     from octoreplay.study.paper import PaperNumbers
 
@@ -54,24 +53,17 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
         f" in the mean over time, {numbers.least_ratio:.2f} at least\n",
         soft_wrap=True,
     )
-    tables.show(
-        out,
-        tables.made_files(
-            {
-                folder
-                / study.FIGURES
-                / "maps.png": "the maps, cells as transparent as robots deviate, and the village",
-                folder / study.FIGURES / "total_distance.png": "\u03a6 over time",
-                folder / study.FIGURES / "agreement.png": "agreement and different labels over time",
-                folder
-                / study.FIGURES
-                / "packet_size.png": "bytes of a map as octree and as uniform grid, and the ratio",
-                folder / study.NUMBERS: "the numbers of this table and more",
-                folder / study.RESULT: "the result, for 'octoreplay metrics', 'export' and 'query'",
-                folder / study.TEAM: "what the robots recorded, and the village they drove through",
-            }
-        ),
-    )
+    figures = folder / study.FIGURES
+    made = {
+        figures / "maps.png": "the maps, cells as transparent as robots deviate, and the village",
+        figures / "total_distance.png": "\u03a6 over time",
+        figures / "agreement.png": "agreement and different labels over time",
+        figures / "packet_size.png": "bytes of a map as octree and as uniform grid, and the ratio",
+        folder / study.NUMBERS: "the numbers of this table and more",
+        folder / study.RESULT: "the result, for 'octoreplay metrics', 'export' and 'query'",
+        folder / study.TEAM: "what the robots recorded, and the village they drove through",
+    }
+    tables.show(out, tables.made_files(made))
     return 0
 
 
@@ -154,13 +146,7 @@ def result_with_bar(config: RunConfig, output: Path) -> Path:
     from octoreplay.study.teams import is_replayed, replayed_team
 
     is_there = is_replayed(config, output)
-    with progress_bar("replay") as update:
-
-        def show(progress: Progress) -> None:
-            elapsed = progress.log_ns / 1e9
-            done = None if not progress.total_ns else min(1.0, progress.log_ns / progress.total_ns)
-            update(done, elapsed, f"{elapsed:.1f} s  \u03a6 {progress.total_distance:.3g}")
-
+    with replay_bar() as show:
         replayed_team(config, output, show)
     click.echo(f"used {output} again" if is_there else f"wrote {output}", err=True)
     return output

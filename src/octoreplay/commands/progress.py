@@ -23,6 +23,18 @@ def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
     from octoreplay.io.results.result_writer import partial_path
     from octoreplay.replay.session import replay_team
 
+    with replay_bar() as show:
+        try:
+            return replay_team(config, output, progress=show)
+        except KeyboardInterrupt:
+            partial = partial_path(output)
+            kept = f"; what was finished is in {partial}" if partial.exists() else ""
+            raise KeyboardInterrupt(f"interrupted{kept}") from None
+
+
+@contextlib.contextmanager
+def replay_bar() -> Iterator[Callable[[Progress], None]]:
+    """A progress bar of a replay: what is to be told of every tick."""
     with progress_bar("replay") as update:
 
         def show(progress: Progress) -> None:
@@ -31,12 +43,7 @@ def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
             stage = f"settling, tick {progress.tick}" if progress.settling else f"{elapsed:.1f} s"
             update(done, None if progress.settling else elapsed, f"{stage}  \u03a6 {progress.total_distance:.3g}")
 
-        try:
-            return replay_team(config, output, progress=show)
-        except KeyboardInterrupt:
-            partial = partial_path(output)
-            kept = f"; what was finished is in {partial}" if partial.exists() else ""
-            raise KeyboardInterrupt(f"interrupted{kept}") from None
+        yield show
 
 
 def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:

@@ -24,7 +24,7 @@ class RunProcess:
 
     def __init__(self, task: Task) -> None:
         self._row = tempfile.TemporaryFile()  # noqa: SIM115 (closed in wait)
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (closed in wait)
         # With -P nothing is imported from the working folder; Ctrl-C reaches only the process that ends this one.
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "octoreplay.study.task"], stdin=subprocess.PIPE, stdout=self._row,

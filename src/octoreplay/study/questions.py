@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from octoreplay.evaluate import mixing
 from octoreplay.evaluate.evaluation import truth_beside_logs
@@ -114,13 +115,13 @@ def scale(duration: float, num_villages: int) -> Experiment:
 
 def noise(duration: float, num_villages: int) -> Experiment:
     """What does consensus repair of noisy labels, poses and depths, and what does it spread?"""
-    levels: dict[str, dict[str, float]] = {
+    levels: dict[str, dict[str, Any]] = {
         **{f"label_{level:g}": {"label_noise": level} for level in _LABEL_NOISES},
         **{f"pose_{level:g}": {"pose_noise": level} for level in _POSE_NOISES},
         **{f"depth_{level:g}": {"depth_noise": level} for level in _DEPTH_NOISES},
     }
     teams = {
-        f"{label}_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **values))  # type: ignore[arg-type]
+        f"{label}_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **values))
         for label, values in levels.items()
         for seed in range(num_villages)
     }
