@@ -16,7 +16,7 @@ import scenes
 from rounds import Report, Row, arguments, measured, pinned
 from scenes import NUM_CLASSES
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.codec import decode_packet, encode_packet
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree

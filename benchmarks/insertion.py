@@ -16,7 +16,7 @@ from peers import MissingPeerError, NativeOctomap, PyOctomap, write_clouds
 from rounds import Report, Row, arguments, interleave, measured, pinned, speedup
 from scenes import NUM_CLASSES, PointCloud, Scene
 
-from octoreplay.config import MapConfig
+from octoreplay.config.sensor import MapConfig
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import CloudFrame, Float32Array, Float64Array, Int32Array, Int64Array

@@ -15,7 +15,7 @@ from peers import MissingPeerError, NativeOctomap, PyOctomap, write_clouds
 from rounds import Report, Row, arguments
 from scenes import NUM_CLASSES, PointCloud, Scene
 
-from octoreplay.config import MapConfig
+from octoreplay.config.sensor import MapConfig
 from octoreplay.mapping.codec import decode_packet, encode_packet
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments

@@ -25,7 +25,10 @@ import scenes
 import zstandard
 from rounds import Report, Row, arguments, measured
 
-from octoreplay.config import MapConfig, RunConfig, ScheduleEntry
+from octoreplay.config.network import ScheduleEntry
+from octoreplay.config.run import RunConfig
+from octoreplay.config.sensor import MapConfig
+from octoreplay.config.team_file import load_team_file
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping import codec
@@ -35,12 +38,11 @@ from octoreplay.mapping.kernels.storage import KEY_BITS
 from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array, TickMetrics
-from octoreplay.replay.exchange import Source
-from octoreplay.replay.robot import Robot
+from octoreplay.replay.exchange.messages import Source
+from octoreplay.replay.robots.robot import Robot
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
 from octoreplay.simulate.team import SimulationConfig, simulate_team
-from octoreplay.team_file import load_team_file
 
 NUM_ROBOTS = 6
 PACKET_RESOLUTION = 0.3

@@ -29,7 +29,8 @@ from rosbags.typesys import Stores, get_typestore
 from rounds import Report, Row, arguments, interleave, measured
 from scenes import cache_folder
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.io.messages.sensor_messages import convert
 from octoreplay.io.robots.discover import describe, resolve
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead

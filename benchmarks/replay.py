@@ -22,7 +22,8 @@ from typing import Any
 from rounds import Report, Row, arguments, interleave, measured
 from scenes import cache_folder
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import load_team_file
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
@@ -30,7 +31,6 @@ from octoreplay.records import RunSummary
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import Progress, Session, replay_team
 from octoreplay.simulate.team import SimulationConfig, simulate_team
-from octoreplay.team_file import load_team_file
 
 NUM_THREADS = 2
 STAGES: tuple[tuple[str, type, tuple[str, ...]], ...] = (

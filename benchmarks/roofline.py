@@ -17,7 +17,7 @@ from consensus import NUM_ROBOTS, WARM_TICKS, Team, complete_graph, never_hit_sh
 from rounds import Report, Row, arguments, pinned
 from scenes import NUM_CLASSES
 
-from octoreplay.config import MapConfig
+from octoreplay.config.sensor import MapConfig
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import MapConfig, SensorConfig, TimeConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from octoreplay.config import CENTRAL
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.records import CENTRAL
 
 
 def map_scores(robot_id: str, start: float, *, is_active: bool = True, has_truth: bool = True) -> MapScores:

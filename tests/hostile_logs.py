@@ -23,7 +23,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import room
 from log_damage import MUTATIONS, damage_log, reseal_chunk
 from log_factory import Row, write_rows
-from octoreplay.config import ConsensusConfig, RunConfig, TimeConfig
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, OctoreplayError
 from octoreplay.io.containers.log_reader import normalise_type_name
 from octoreplay.io.messages.ros_types import typestore

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay.class_file import class_table
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.class_file import class_table
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import (
     FrameCounts,

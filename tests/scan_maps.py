@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments

@@ -15,13 +15,16 @@ import pytest
 from mcap.reader import make_reader
 from plyfile import PlyData
 
-from octoreplay import __version__, cli, settings
+from octoreplay import __version__, cli
 from octoreplay.commands import running, team_options
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.config import PARAMETERS, RobotConfig, RunConfig
+from octoreplay.config import presets
+from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError
 from octoreplay.result import open_result
-from octoreplay.team_file import load_team_file
 
 FIXTURES = Path(__file__).parent / "fixtures"
 PAIR = FIXTURES / "pair" / "team.yaml"
@@ -118,22 +121,22 @@ def base() -> RunConfig:
 
 def test_options_beat_the_preset_and_the_preset_beats_the_file() -> None:
     file = base().with_parameters({"evidence": "cell-average", "gamma": 0.125, "hit": 2.0})
-    config = settings.with_options(file, "paper", None, {"gamma": 0.75})
+    config = presets.with_options(file, "paper", None, {"gamma": 0.75})
     assert config.consensus.evidence == "time-average"
     assert config.consensus.gamma == 0.75
     assert config.sensor.hit == 2.0
-    assert settings.with_options(file, None, None, {}) == file
+    assert presets.with_options(file, None, None, {}) == file
 
 
 def test_edges_set_the_topology_and_the_weights() -> None:
-    config = settings.with_options(base(), None, "a:b, b:c", {})
+    config = presets.with_options(base(), None, "a:b, b:c", {})
     assert (config.network.topology, config.network.weights) == ("edges", "metropolis")
     assert config.network.edges == (("a", "b", None), ("b", "c", None))
-    weighted = settings.with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
+    weighted = presets.with_options(base(), None, "a:b:0.25,b:c:0.5", {"epsilon": 0.1})
     assert (weighted.network.weights, weighted.network.edges[1]) == ("given", ("b", "c", 0.5))
-    back = settings.with_options(weighted, None, None, {"topology": "ring"})
+    back = presets.with_options(weighted, None, None, {"topology": "ring"})
     assert (back.network.topology, back.network.weights, back.network.edges) == ("ring", "metropolis", ())
-    kept = settings.with_options(weighted, None, None, {"hit": 2.0})
+    kept = presets.with_options(weighted, None, None, {"hit": 2.0})
     assert kept.network == weighted.network
 
 
@@ -144,7 +147,7 @@ def test_edges_set_the_topology_and_the_weights() -> None:
 )  # fmt: skip
 def test_bad_edges_are_one_sentence(edges: str, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
-        settings.with_options(base(), None, edges, {})
+        presets.with_options(base(), None, edges, {})
 
 
 def test_a_saved_team_file_holds_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 from octoreplay import cli
-from octoreplay.class_file import class_table, with_classes
-from octoreplay.class_tables.label_rows import BUILT_IN
 from octoreplay.commands import progress
-from octoreplay.config import PALETTE, RobotConfig, RunConfig
+from octoreplay.config.class_file import class_table, with_classes
+from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.class_tables.palette import PALETTE
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.records import ClassTable, FrameCounts, SemanticClass
-from octoreplay.team_file import dump_team, load_team_file, parse_team
 from recordings import RECORDINGS, needs_recordings
 
 HYDRA = RECORDINGS / "semantic_labels" / "hydra_label_spaces"

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.config import LinkConfig, NetworkConfig, PacketConfig, RobotConfig, RunConfig, ScheduleEntry
+from octoreplay.config.network import LinkConfig, NetworkConfig, ScheduleEntry
+from octoreplay.config.packets import PacketConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, load_schedule, parse_team, schedule
 from octoreplay.errors import ConfigError
-from octoreplay.team_file import dump_team, load_schedule, parse_team, schedule
 
 FOLDER = Path("/team")
 ROBOTS = "robots: [{id: husky, log: husky.mcap}, {id: jackal, log: jackal.mcap}, {id: spot, log: spot.mcap}]\n"

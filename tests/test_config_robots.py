@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.errors import ConfigError
-from octoreplay.team_file import dump_team, parse_team
 
 FULL = RobotConfig(
     "a", (Path("/logs/a.mcap"), Path("/logs/b.mcap")), depth_topic="/depth", label_topic="", confidence_topic="/sure",

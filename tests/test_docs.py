@@ -9,7 +9,7 @@ import click
 import pytest
 
 from octoreplay import cli
-from octoreplay.config import PARAMETERS
+from octoreplay.config.parameters import PARAMETERS
 from octoreplay.evaluate.records import EvaluatedTick, MapScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.class_file import class_table
-from octoreplay.config import PARAMETERS, RobotConfig, RunConfig, ScheduleEntry
-from octoreplay.team_file import _TEAM_KEYS, dump_team, parse_team, team_template
+from octoreplay.config.class_file import class_table
+from octoreplay.config.network import ScheduleEntry
+from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import _TEAM_KEYS, dump_team, parse_team, team_template
 
 CLASSES = class_table(
     [

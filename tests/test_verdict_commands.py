@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
 from octoreplay.replay.session import replay_team
 from octoreplay.report import verdict_tables
-from octoreplay.team_file import load_team_file
 from result_factory import tick_metrics, write_until
 
 FIXTURES = Path(__file__).parent / "fixtures"

@@ -7,10 +7,12 @@ used, so that ``import octoreplay`` and the command line's ``--help`` stay quick
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from octoreplay._version import __version__
 
 if TYPE_CHECKING:
-    from octoreplay.config import RobotConfig, RunConfig
+    from octoreplay.config.robot import RobotConfig
+    from octoreplay.config.run import RunConfig
+    from octoreplay.config.team_file import load_team_file
     from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError, PacketError
     from octoreplay.evaluate.checks import CheckRow, check_result
     from octoreplay.evaluate.comparison import ResultComparison, compare_results
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.simulate.team import SimulationConfig, simulate_team
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
-    from octoreplay.team_file import load_team_file
 
 _HOMES = {
     "CheckRow": "evaluate.checks",
@@ -40,8 +41,8 @@ _HOMES = {
     "Progress": "replay.session",
     "Result": "result",
     "ResultComparison": "evaluate.comparison",
-    "RobotConfig": "config",
-    "RunConfig": "config",
+    "RobotConfig": "config.robot",
+    "RunConfig": "config.run",
     "RunSummary": "records",
     "SemanticClass": "records",
     "SimulationConfig": "simulate.team",
@@ -54,7 +55,7 @@ _HOMES = {
     "discover": "io.robots.discover",
     "evaluate_result": "evaluate.evaluation",
     "export_ply": "report.export",
-    "load_team_file": "team_file",
+    "load_team_file": "config.team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
     "replay_team": "replay.session",

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import click
 
-from octoreplay import __version__
+from octoreplay._version import __version__
 from octoreplay.commands import evaluation, experiments, logs, results, running, studies, verdicts
 from octoreplay.commands.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.errors import ConfigError, OctoreplayError

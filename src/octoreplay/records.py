@@ -22,6 +22,9 @@ Float64Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Color: TypeAlias = tuple[int, int, int]
 
+CENTRAL = "central"
+"""The name under which a result holds the centralised map, the sum of all robots' evidence."""
+
 NO_CLASS = 0
 """The class_id of a measured point that carries no usable label: it frees its ray and hits nothing."""
 

@@ -20,13 +20,14 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import CENTRAL, RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError, PacketError
-from octoreplay.io.results import posterior
 from octoreplay.io.results.result_reader import ResultReader
+from octoreplay.log_odds import best_labels, class_probabilities, team_log_odds
 from octoreplay.mapping.codec import apply_delta, decode_packet
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
+    CENTRAL,
     BoolArray,
     ClassTable,
     Float32Array,
@@ -91,8 +92,8 @@ class StoredMap:
             raise ValueError(f"points: expects an array (P, 3), got {coords.shape}")
         deviation, known, sizes = self.octree.lookup(coords)
         log_odds = self._scaled((deviation + np.float32(self.prior)).astype(np.float32), team_posterior)
-        probabilities = posterior.posterior(log_odds).astype(np.float32)
-        return PointQuery(log_odds, probabilities, posterior.labels(log_odds), known, np.where(known, sizes, 0.0))
+        probabilities = class_probabilities(log_odds).astype(np.float32)
+        return PointQuery(log_odds, probabilities, best_labels(log_odds), known, np.where(known, sizes, 0.0))
 
     def query_box(self, lower: npt.ArrayLike, upper: npt.ArrayLike, *, team_posterior: bool = False) -> LeafTable:
         """The leaves that overlap a box with corners ``lower`` and ``upper`` (3,), metres in the team's frame.
@@ -113,7 +114,7 @@ class StoredMap:
         """The robot's log-odds, or the team's."""
         if not team_posterior:
             return log_odds
-        scaled: FloatArray = posterior.team_posterior(log_odds, self.prior, self.num_robots)
+        scaled: FloatArray = team_log_odds(log_odds, self.prior, self.num_robots)
         return scaled.astype(np.float32)
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.class_tables.edits import MAX_CLASSES, edited
+from octoreplay.config.class_tables.edits import MAX_CLASSES, edited
 from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable, SemanticClass
 

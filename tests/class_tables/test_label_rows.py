@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from octoreplay.class_tables.label_rows import (
+from octoreplay.config.class_tables.label_rows import (
     BUILT_IN,
     LabelRow,
     built_in_rows,
@@ -10,7 +10,7 @@ from octoreplay.class_tables.label_rows import (
     kimera_rows,
     table_of_rows,
 )
-from octoreplay.config import PALETTE
+from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError
 
 # Read off the data sets' own files (class_tables/SOURCES.md): number of labels, of ignored ones, and some labels.

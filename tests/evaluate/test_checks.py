@@ -12,14 +12,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from octoreplay.config import CENTRAL
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate import checks
 from octoreplay.evaluate.checks import LIMITS, CheckRow, check_result, ticks_to_consensus
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
-from octoreplay.records import CONVERGED, FrameCounts, RobotMetrics, RunSummary, TickMetrics
+from octoreplay.records import CENTRAL, CONVERGED, FrameCounts, RobotMetrics, RunSummary, TickMetrics
 from result_factory import CLASSES, summary, team, tick_metrics, write_until
 
 DOCS = Path(__file__).parents[2] / "docs"

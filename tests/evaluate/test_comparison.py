@@ -13,14 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import octree_factory
-from octoreplay.class_file import class_table
-from octoreplay.config import CENTRAL, RobotConfig
+from octoreplay.config.class_file import class_table
+from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate import comparison
 from octoreplay.evaluate.comparison import LabelChange, compare_results
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
+from octoreplay.records import CENTRAL
 from result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25

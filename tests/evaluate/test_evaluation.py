@@ -12,12 +12,12 @@ import pytest
 
 import dense_scores
 from octoreplay import Evaluation, evaluate_result, load_team_file, open_result, replay_team, resolve
-from octoreplay.config import CENTRAL
 from octoreplay.errors import InputError
 from octoreplay.evaluate.evaluation import truth_beside_logs
 from octoreplay.evaluate.records import MapScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping.codec import encode_packet
+from octoreplay.records import CENTRAL
 from octree_factory import cells_of, cube, octree_of
 from result_factory import state, write_result, write_until
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from octoreplay.class_file import class_table
+from octoreplay.config.class_file import class_table
 from octoreplay.errors import InputError
 from octoreplay.evaluate.truth import load_truth
 from octoreplay.mapping.octree import codes_to_keys

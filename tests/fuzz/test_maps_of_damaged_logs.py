@@ -19,7 +19,8 @@ from hostile_logs import (
     write_hostile_log,
 )
 from log_factory import write_rows
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.replay.session import replay_team
 
 CASES = 12

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.robots.discover import describe, discover, resolve

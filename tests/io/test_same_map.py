@@ -43,7 +43,9 @@ from fixtures.make_containers import (
     write_mcap,
 )
 from log_factory import IDENTITY, SECOND, Entry
-from octoreplay.config import RobotConfig, RunConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog

@@ -22,7 +22,8 @@ import octoreplay
 import room
 from fixtures.make_containers import write_mcap
 from log_factory import OPTICAL, SECOND, Entry, ros2
-from octoreplay.config import RunConfig, TimeConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, SemanticClass
 from scan_maps import octree_of, packet_of, states_of

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.errors import PacketError
-from octoreplay.mapping.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
+from octoreplay.replay.exchange.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
 
 U16, U32 = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
 ENTRIES = st.lists(st.builds(Possession, U16, U32, st.none() | U32), max_size=5)

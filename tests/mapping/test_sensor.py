@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import ends, storage
 from octoreplay.mapping.octree import SemanticOctree

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.config import SensorConfig
+from octoreplay.config.sensor import SensorConfig
 from octoreplay.records import Float64Array, Int64Array
 
 

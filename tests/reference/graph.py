@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.config import ConsensusConfig, NetworkConfig, ScheduleEntry
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.network import NetworkConfig, ScheduleEntry
 from octoreplay.errors import ConfigError
 from octoreplay.records import Float64Array
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.records import CameraModel, ClassTable, CloudFrame, DepthFrame, SemanticClass
 
 START_NS = 5_000_000_000

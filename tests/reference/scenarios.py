@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from octoreplay.config import PALETTE, NetworkConfig, RobotConfig, RunConfig
+from octoreplay.config.class_tables.palette import PALETTE
+from octoreplay.config.network import NetworkConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.records import (
     NO_CLASS,
     CameraModel,

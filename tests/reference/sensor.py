@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.records import (
     NO_CLASS,
     BodyBox,

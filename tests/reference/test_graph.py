@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from octoreplay.config import ConsensusConfig, NetworkConfig, ScheduleEntry
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.network import NetworkConfig, ScheduleEntry
 from octoreplay.errors import ConfigError
 from reference import graph
 

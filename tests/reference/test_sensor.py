@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.records import BodyBox
 from reference.hand_made import cloud, depth_frame, ray
 from reference.sensor import measurements, scan_update

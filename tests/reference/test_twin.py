@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from octoreplay.config import PRESETS
+from octoreplay.config.presets import PRESETS
 from octoreplay.errors import ConfigError, InputError
 from reference import rules
 from reference.hand_made import START_NS, ray, team_config

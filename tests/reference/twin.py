@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.records import BoolArray, Float64Array, Frame, Int64Array
 from reference import graph, rules

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from log_factory import robot_entries, write_mcap
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.team_bodies import TeamBodies

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config import ScheduleEntry
+from octoreplay.config.network import ScheduleEntry
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping import codec
 from octoreplay.replay import session as session_module
-from octoreplay.replay.exchange import Source
+from octoreplay.replay.exchange.messages import Source
 from octoreplay.replay.session import Session, _rule_warnings, replay_team
 from octoreplay.result import open_result
-from octoreplay.team_file import load_team_file
 from reference.comparison import compare_map
 from reference.scenarios import START_NS, TeamShape, make_scenario
 from reference.twin import Twin, record

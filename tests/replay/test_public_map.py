@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.quantise import quantised, top_classes
-from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
-from octoreplay.replay.public_map import PublicMap
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import HeldMap, Source
+from octoreplay.replay.exchange.public_map import PublicMap
 from octree_factory import cells_of, octree_of
 
 SOURCE = Source(0, 0)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.config import ScheduleEntry
+from octoreplay.config.network import ScheduleEntry
+from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.session import replay_team
 from octoreplay.result import open_result
-from octoreplay.team_file import load_team_file
 
 TRIO = Path(__file__).parents[1] / "fixtures" / "trio" / "team.yaml"
 

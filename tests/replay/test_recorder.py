@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.replay.session import replay_team
 from octoreplay.result import open_result
-from octoreplay.team_file import load_team_file, parse_team
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from octoreplay.config import ScheduleEntry
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.errors import ConfigError
-from octoreplay.replay.schedule import Schedule
+from octoreplay.replay.network.schedule import Schedule
 
 NAMES = ("husky", "jackal", "spot", "warthog")
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from octoreplay.config import PRESETS
+from octoreplay.config.presets import PRESETS
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.replay import consensus_robot as consensus_module
-from octoreplay.replay import robot as robot_module
 from octoreplay.replay import session as session_module
+from octoreplay.replay.robots import consensus as consensus_module
+from octoreplay.replay.robots import robot as robot_module
 from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
 from octree_factory import class_rows
 from reference import rules

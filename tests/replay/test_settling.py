@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config import LinkConfig, RobotConfig, RunConfig
-from octoreplay.replay.graph import TeamNetwork, settle_ticks_max, step_size
+from octoreplay.config.network import LinkConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.replay.network.graph import TeamNetwork, settle_ticks_max, step_size
 from octoreplay.replay.settling import QUIET_PROB, num_quiet_ticks, num_settle_ticks
 
 IDS = ("a", "b", "c", "d")

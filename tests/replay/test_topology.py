@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.config import NetworkConfig
-from octoreplay.replay.topology import Topology
+from octoreplay.config.network import NetworkConfig
+from octoreplay.replay.network.topology import Topology
 from reference import graph as reference
 
 NAMES = tuple(f"robot_{number}" for number in range(64))

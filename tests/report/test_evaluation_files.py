@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from evaluation_factory import evaluation
-from octoreplay.config import CENTRAL
 from octoreplay.errors import OutputError
 from octoreplay.evaluate.records import MapScores
+from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import SCORES, evaluation_csv, evaluation_json, write_evaluation
 
 

@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData
 
 import leaf_list
-from octoreplay.config import PALETTE
+from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable

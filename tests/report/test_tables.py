@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import RenderableType
 
-from octoreplay.config import RobotConfig
+from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.discover import LogDescription, LogSummary, RobotSummary, TopicSummary
 from octoreplay.records import RobotMetrics
 from octoreplay.report import tables

@@ -11,11 +11,11 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from fixtures.make_fixtures import FIXTURES
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.simulate import team
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
 from octoreplay.simulate.world import make_village, village_classes
-from octoreplay.team_file import load_team_file
 from stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_experiment
 from octoreplay.study.grid import check_variations, combinations, parse_variation
 from octoreplay.study.questions import QUESTIONS
-from octoreplay.team_file import load_team_file
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 

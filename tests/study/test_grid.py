@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.study.grid import Variation, check_variations, combinations, parse_variation
 

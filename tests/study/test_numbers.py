@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
 from octoreplay.records import RunSummary, TickMetrics
 from octoreplay.replay.session import replay_team
@@ -21,7 +22,6 @@ from octoreplay.study.numbers import (
     run_numbers,
     truth_numbers,
 )
-from octoreplay.team_file import load_team_file
 from result_factory import tick_metrics
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import octoreplay
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError, OutputError
 from octoreplay.replay.session import replay_team
 from octoreplay.result import open_result
@@ -24,7 +25,6 @@ from octoreplay.study.numbers import run_numbers
 from octoreplay.study.process import RunProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
-from octoreplay.team_file import load_team_file
 from study.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError, OutputError
 from octoreplay.result import open_result
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study import teams
 from octoreplay.study.teams import is_replayed, is_simulated, replayed_team, simulated_team
-from octoreplay.team_file import load_team_file
 
 pytest.importorskip("open3d", exc_type=ImportError)
 

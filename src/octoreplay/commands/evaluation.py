@@ -8,7 +8,7 @@ import click
 
 from octoreplay.commands.options import check_folder, check_output, existing_path
 from octoreplay.commands.progress import progress_bar, warn
-from octoreplay.config import CENTRAL
+from octoreplay.records import CENTRAL
 
 
 @click.command(short_help="Judge a result's maps: IoU, coverage, calibration, agreement.")

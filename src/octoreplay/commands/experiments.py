@@ -10,7 +10,7 @@ import click
 
 from octoreplay.commands.options import existing_path
 from octoreplay.commands.progress import progress_bar, replay_bar
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -10,7 +10,7 @@ import click
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import check_output, existing_path, numbers
 from octoreplay.commands.progress import progress_bar
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.text_files import write_whole
 
@@ -40,8 +40,8 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
 
     What a run would still miss stands in it too, and is said.
     """
+    from octoreplay.config.team_file import team_template
     from octoreplay.io.robots import discover
-    from octoreplay.team_file import team_template
 
     check_output(output, ".yaml", logs)
     if output.exists() and not force:
@@ -81,8 +81,8 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
 @click.option("--every", type=int, default=1, show_default=True, help="take one image of so many")
 def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, **options: Any) -> int:
     """Write a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) as a robot's log."""
+    from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import rgbd_folder
-    from octoreplay.team_file import load_team_file
 
     check_output(output, ".mcap")
     camera = None if intrinsics is None else numbers("intrinsics", intrinsics, 4)
@@ -125,8 +125,8 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
 @click.option("--every", type=int, default=1, show_default=True, help="take one cloud of so many")
 def import_clouds(folder: Path, output: Path, classes_from: Path | None, **options: Any) -> int:
     """Write a folder of point clouds with poses (PCD, PLY, KITTI) as a robot's log."""
+    from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import cloud_folder
-    from octoreplay.team_file import load_team_file
 
     check_output(output, ".mcap")
     table = None if classes_from is None else load_team_file(classes_from).classes

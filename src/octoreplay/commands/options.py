@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from octoreplay.config import PARAMETERS, SECTIONS, Parameter
+from octoreplay.config.parameters import PARAMETERS, SECTIONS, Parameter
 from octoreplay.errors import ConfigError, OutputError
 
 _WORDS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
@@ -32,8 +32,8 @@ class SectionedCommand(click.Command):
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None and isinstance(parameter, click.Option):
-                section = getattr(parameter, "section", "")
-                groups.setdefault(SECTIONS.get(section, "Options"), []).append(record)
+                section = SECTIONS.get(getattr(parameter, "section", ""))
+                groups.setdefault(section.title if section else "Options", []).append(record)
         for heading, records in groups.items():
             with formatter.section(heading):
                 formatter.write_dl(records)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,15 +7,14 @@ from typing import Any
 
 import click
 
-from octoreplay.class_file import with_classes
-from octoreplay.class_tables.label_rows import BUILT_IN
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar
 from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
-from octoreplay.config import PRESETS
+from octoreplay.config.class_file import with_classes
+from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
-from octoreplay.settings import with_options
 
 
 @with_parameters
@@ -112,10 +111,10 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
 
     Takes under two minutes. Says what it made and how to look at it.
     """
+    from octoreplay.config.team_file import load_team_file
     from octoreplay.io.robots import discover
     from octoreplay.report import export, plots, tables
     from octoreplay.result import open_result
-    from octoreplay.team_file import load_team_file
 
     out, err = tables.terminal(), tables.terminal(stderr=True)
     result_path, ply, csv, figures = (folder / n for n in ("result.mcap", "map.ply", "metrics.csv", "figures"))

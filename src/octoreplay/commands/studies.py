@@ -11,7 +11,7 @@ import click
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import SectionedCommand, existing_path, with_parameters
 from octoreplay.commands.progress import progress_bar, warn
-from octoreplay.config import PRESETS
+from octoreplay.config.presets import PRESETS
 
 if TYPE_CHECKING:
     from octoreplay.study.sweep import Sweep, SweepProgress

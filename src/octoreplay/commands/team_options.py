@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from octoreplay.commands.progress import warn
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.io.text_files import write_whole
 
@@ -25,9 +25,9 @@ def is_team_file(inputs: Sequence[Path]) -> bool:
 
 def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console) -> RunConfig:
     """The configuration before any option: of a stored result, of a team file, or found in logs."""
+    from octoreplay.config.team_file import load_team_file
     from octoreplay.io.results.result_reader import ResultReader
     from octoreplay.io.robots import discover
-    from octoreplay.team_file import load_team_file
 
     if config_from is not None:
         if inputs:
@@ -50,7 +50,7 @@ def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console
 
 def with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:
     """The configuration with one-way links and a schedule, where they are given."""
-    from octoreplay.team_file import load_schedule
+    from octoreplay.config.team_file import load_schedule
 
     changes: dict[str, Any] = {}
     if one_way is not None:
@@ -70,7 +70,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 def save_team_file(config: RunConfig, path: Path) -> None:
     """Write a team file whose log paths hold from its own folder."""
-    from octoreplay.team_file import dump_team
+    from octoreplay.config.team_file import dump_team
 
     robots = tuple(robot.with_absolute_paths() for robot in config.robots)
     write_whole(path, dump_team(dataclasses.replace(config, robots=robots), path.parent.resolve()))

@@ -16,12 +16,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from octoreplay.config import CENTRAL, PARAMETERS, RunConfig
+from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate.runs import CommonRuns, bounding_box, common_runs
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys
-from octoreplay.records import BoolArray, Float64Array, Int64Array
+from octoreplay.records import CENTRAL, BoolArray, Float64Array, Int64Array
 from octoreplay.result import Result, StoredMap, open_result
 
 Point: TypeAlias = tuple[float, float, float]
@@ -208,7 +209,7 @@ def _taken(values: Any, leaves: Int64Array) -> Float64Array:
 
 def _labels(stored: StoredMap, spans: LeafSpans, leaves: Int64Array) -> Int64Array:
     """Each run's label (S,) in a map: class_id + 1, 1 for free, 0 for unknown."""
-    of_leaf = posterior.labels(spans.deviations + np.float32(stored.prior)).astype(np.int64) + 1
+    of_leaf = best_labels(spans.deviations + np.float32(stored.prior)).astype(np.int64) + 1
     labels = np.zeros(leaves.size, np.int64)
     labels[leaves >= 0] = of_leaf[leaves[leaves >= 0]]
     return labels

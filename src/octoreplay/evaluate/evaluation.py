@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.config import CENTRAL
 from octoreplay.errors import InputError
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
 from octoreplay.evaluate.runs import Region
@@ -18,7 +17,7 @@ from octoreplay.evaluate.scores import TruthScores, agreement, no_truth_scores, 
 from octoreplay.evaluate.truth import WORLD_FILE, Truth, load_truth
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
-from octoreplay.records import BoolArray, TickMetrics
+from octoreplay.records import CENTRAL, BoolArray, TickMetrics
 from octoreplay.result import Result, StoredMap, open_result
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from octoreplay.config import CENTRAL
+from octoreplay.records import CENTRAL
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.evaluate.truth import Truth
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels
 from octoreplay.records import NO_CLASS
 from octoreplay.result import StoredMap
 
@@ -33,7 +33,7 @@ def repairs(own: StoredMap, after: StoredMap, truth: Truth) -> Repairs:
     """
     own_spans, after_spans = own.octree.spans(), after.octree.spans()
     own_labels, after_labels = (
-        posterior.labels(spans.deviations + np.float32(stored.prior))
+        best_labels(spans.deviations + np.float32(stored.prior))
         for spans, stored in ((own_spans, own), (after_spans, after))
     )
     # Everywhere else all three say free.
@@ -48,7 +48,7 @@ def repairs(own: StoredMap, after: StoredMap, truth: Truth) -> Repairs:
     is_known[is_surface] = true[is_surface] != NO_CLASS
     codes, true, is_surface = codes[is_known], true[is_known], is_surface[is_known]
     before, now = (
-        posterior.labels(spans.deviations_at(codes) + np.float32(stored.prior))
+        best_labels(spans.deviations_at(codes) + np.float32(stored.prior))
         for spans, stored in ((own_spans, own), (after_spans, after))
     )
     was_right, is_right = before == true, now == true

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from octoreplay.evaluate.runs import Region, common_runs
 from octoreplay.evaluate.truth import Truth
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels, team_log_odds
 from octoreplay.mapping.octree import LeafSpans
 from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 
@@ -53,7 +53,7 @@ def truth_scores(
     num_classes = spans.deviations.shape[1]
     surface = _surface_in_leaves(spans, truth)
     log_odds = spans.deviations + np.float32(prior)
-    labels = posterior.labels(log_odds)
+    labels = best_labels(log_odds)
     confusion = of_team = _confusion(labels, surface, truth.class_ids, spans.num_cells, num_classes)
     # At the end of a run it often is the same.
     if not region.is_same(Region([spans])):
@@ -65,8 +65,8 @@ def truth_scores(
     by_class = np.ascontiguousarray(log_odds.T)
     errors = team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
     if num_robots > 1:
-        by_class = posterior.team_posterior(by_class, prior, num_robots).astype(np.float32, copy=False)
-        labels = labels if prior == 0 else posterior.labels(by_class.T)
+        by_class = team_log_odds(by_class, prior, num_robots).astype(np.float32, copy=False)
+        labels = labels if prior == 0 else best_labels(by_class.T)
         team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
     return TruthScores(
         tuple(iou.tolist()),
@@ -91,12 +91,12 @@ def agreement(
     runs = common_runs(spans, reference)
     both = (runs.leaves_a >= 0) & (runs.leaves_b >= 0)
     leaf, other = runs.leaves_a[both], runs.leaves_b[both]
-    labels = posterior.labels(spans.deviations + np.float32(prior))[leaf]
+    labels = best_labels(spans.deviations + np.float32(prior))[leaf]
     values = reference.deviations + np.float32(reference_prior)
     best = np.maximum(values.max(axis=1, initial=0.0), 0.0)[other]
     of_label = np.where(labels > 0, values[other, np.maximum(labels, 1) - 1], 0.0)
     agrees = of_label >= best - np.float32(TIE)
-    is_occupied = posterior.labels(values) > 0
+    is_occupied = best_labels(values) > 0
     weights = runs.num_cells[both] * agrees
     parts = weights.sum(), weights[is_occupied[other]].sum()
     wholes = num_cells, reference.num_cells[is_occupied].sum()

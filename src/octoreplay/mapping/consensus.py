@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.config import ConsensusConfig
+from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.kernels.consensus import FIRST_NEIGHBOUR, OWN

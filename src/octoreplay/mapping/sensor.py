@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import casting, ends, evidence, storage
 from octoreplay.mapping.octree import SemanticOctree

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from octoreplay.config import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.kernels import compiler
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams, leaf_list

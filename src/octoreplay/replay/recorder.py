@@ -7,11 +7,11 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from octoreplay.config import CENTRAL, RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics
+from octoreplay.records import CENTRAL, FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12

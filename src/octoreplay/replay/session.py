@@ -14,7 +14,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from octoreplay.config import PacketConfig, RunConfig, TimeConfig
+from octoreplay.config.packets import PacketConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
@@ -37,16 +39,17 @@ from octoreplay.records import (
     RunSummary,
     TickMetrics,
 )
-from octoreplay.replay.consensus_robot import ConsensusRobot
-from octoreplay.replay.exchange import Acknowledgement, Content, PacketEncoder, Receipt
-from octoreplay.replay.flood_robot import FloodRobot
-from octoreplay.replay.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
+from octoreplay.replay.exchange.public_map import least_budget
 from octoreplay.replay.interrupt import deferred_interrupts
-from octoreplay.replay.links import LinkCounts, Links
-from octoreplay.replay.public_map import least_budget
-from octoreplay.replay.ratio_robot import RatioRobot
+from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
+from octoreplay.replay.network.links import LinkCounts, Links
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.robot import MapSizes, Publication, Robot, Turn
+from octoreplay.replay.robots.consensus import ConsensusRobot
+from octoreplay.replay.robots.flood import FloodRobot
+from octoreplay.replay.robots.ratio import RatioRobot
+from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Turn
 from octoreplay.replay.settling import num_quiet_ticks, num_settle_ticks
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.timeline import Bodies, FrameSource, Timeline

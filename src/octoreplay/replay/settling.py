@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from octoreplay.config import LinkConfig, RunConfig
-from octoreplay.replay.graph import STEP_SIZE_RULES, CommunicationGraph, settle_ticks_max, step_size
+from octoreplay.config.network import LinkConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.replay.network.graph import STEP_SIZE_RULES, CommunicationGraph, settle_ticks_max, step_size
 
 QUIET_PROB = 1e-3
 """A link may be silent by chance for as long as settling has to be quiet with this probability."""

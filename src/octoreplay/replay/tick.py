@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import RobotPose, TickMetrics
-from octoreplay.replay.graph import CommunicationGraph
-from octoreplay.replay.robot import Publication
+from octoreplay.replay.network.graph import CommunicationGraph
+from octoreplay.replay.robots.robot import Publication
 
 
 @dataclass(frozen=True, eq=False)

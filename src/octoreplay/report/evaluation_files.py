@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from octoreplay.config import CENTRAL
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
 from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.records import CENTRAL
 
 SCORES = tuple(item.name for item in dataclasses.fields(MapScores) if item.name not in ("robot_id", "is_active", "iou"))
 """The numbers of MapScores, but for those of single classes."""

@@ -9,8 +9,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.config import CENTRAL
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import OVER_ROBOTS
 from octoreplay.report.tables import number, share, styled_table
 

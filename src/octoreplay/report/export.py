@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay.config import PALETTE
+from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError
-from octoreplay.io.results import ply, posterior
+from octoreplay.io.results import ply
+from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import BoolArray, ClassTable, Float64Array, FloatArray, LeafTable, UInt8Array
 from octoreplay.result import Result, StoredMap, open_result
 
@@ -72,7 +73,7 @@ def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTabl
         keep[:] = False
         keep[first] = True
     if not free:
-        keep &= posterior.labels(log_odds) > 0
+        keep &= best_labels(log_odds) > 0
     return LeafTable(centers[keep], sizes[keep], log_odds[keep])
 
 
@@ -84,7 +85,7 @@ def _colors(
         return _label_colors(result.class_table, leaves), "the classes' own"
     if color == "probability":
         least = 1.0 / (result.class_table.num_classes + 1)
-        values = (posterior.label_probabilities(leaves.log_odds) - least) / (1.0 - least)
+        values = (label_probabilities(leaves.log_odds) - least) / (1.0 - least)
         return _ramp(values), f"dark {least:.3f}, yellow 1"
     ids = {stored.robot_id: stored for stored in shown}
     maps = [ids.get(robot_id) or result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
@@ -98,7 +99,7 @@ def _colors(
 
 def _label_colors(class_table: ClassTable, leaves: LeafTable) -> UInt8Array:
     palette = np.concatenate([np.array([FREE_COLOR], dtype=np.uint8), class_table.colors])
-    return palette.take(posterior.labels(leaves.log_odds), axis=0)
+    return palette.take(best_labels(leaves.log_odds), axis=0)
 
 
 def _robot_color(index: int) -> tuple[int, int, int]:

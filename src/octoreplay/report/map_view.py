@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import codes_to_keys
 from octoreplay.records import Float64Array, Int64Array, UInt8Array, UInt64Array
 from octoreplay.result import StoredMap
@@ -131,7 +131,7 @@ def overlay(maps: Sequence[StoredMap]) -> Overlay:
     codes = np.unique(np.concatenate([span.cells_in(rows) for span, rows in zip(spans, chosen, strict=True)]))
     values = np.stack([span.deviations_at(codes) for span in spans])
     mean = values.mean(axis=0) + prior
-    labels = posterior.labels(mean)
+    labels = best_labels(mean)
     occupied = labels > 0
     values = values[:, occupied].astype(np.float64)
     largest = np.zeros(int(occupied.sum()))

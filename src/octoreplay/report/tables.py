@@ -16,8 +16,9 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.config import RobotConfig, RunConfig
-from octoreplay.io.results import posterior
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
@@ -126,8 +127,8 @@ def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, flo
 
 def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
     """How much of each of ``names`` (free, then the classes) a table of leaves holds."""
-    labels, volumes = posterior.labels(leaves.log_odds), leaves.sizes**3
-    sure = posterior.label_probabilities(leaves.log_odds)
+    labels, volumes = best_labels(leaves.log_odds), leaves.sizes**3
+    sure = label_probabilities(leaves.log_odds)
     table = styled_table("")
     table.add_column("what", no_wrap=True)
     for heading in ("leaves", "volume", "how sure, mean"):

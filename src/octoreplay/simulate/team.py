@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay.config import MapConfig, RobotConfig, RunConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.sensor import MapConfig
+from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
 from octoreplay.records import CameraModel, ClassTable, Float64Array
@@ -23,7 +26,6 @@ from octoreplay.simulate.world import (
     write_ground_truth,
     write_mesh,
 )
-from octoreplay.team_file import dump_team
 
 START_NS = 1_700_000_000_000_000_000
 """Stamp of a simulation's first message: fixed, so that the same options give the same bytes."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from octoreplay import __version__
+from octoreplay._version import __version__
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.study.process import RunProcess
 from octoreplay.study.task import Row, Task, failed

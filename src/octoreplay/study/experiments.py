@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from octoreplay.class_tables.edits import Merges
+from octoreplay.config.class_tables.edits import Merges
+from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
 from octoreplay.replay.session import replay_team
@@ -18,7 +19,6 @@ from octoreplay.study.folder import table_csv
 from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep
 from octoreplay.study.task import Row
 from octoreplay.study.teams import simulated_team
-from octoreplay.team_file import dump_team, load_team_file
 
 TRUTH = "world.npz"
 """Where a simulated team's ground truth is, beside its team file."""

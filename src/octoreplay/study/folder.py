@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from octoreplay import __version__
+from octoreplay._version import __version__
 from octoreplay.errors import OutputError
 from octoreplay.io.text_files import json_text, write_whole
 from octoreplay.study.task import Row, from_json, to_json

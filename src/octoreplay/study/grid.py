@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from octoreplay.config import PARAMETERS, PRESETS, RunConfig
+from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.presets import PRESETS, with_options
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.settings import with_options
 
 BASE = "-"
 """Stands for what the team file, the options and the defaults say."""

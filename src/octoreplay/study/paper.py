@@ -15,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from octoreplay import __version__
-from octoreplay.config import RunConfig
+from octoreplay._version import __version__
+from octoreplay.config.presets import with_options
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.text_files import json_text, write_whole
 from octoreplay.records import TickMetrics, UInt8Array
@@ -24,11 +26,9 @@ from octoreplay.replay.session import Progress
 from octoreplay.report import map_view, paper_plots, plots
 from octoreplay.report.figures import save_figures
 from octoreplay.result import Result, StoredMap, open_result
-from octoreplay.settings import with_options
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.simulate.world import World, make_village
 from octoreplay.study.teams import replayed_team, simulated_team
-from octoreplay.team_file import load_team_file
 
 TEAM, RESULT, FIGURES, NUMBERS = "team", "paper.mcap", "figures", "numbers.json"
 """What the experiment's folder holds."""

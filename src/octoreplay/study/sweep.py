@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from octoreplay import __version__
-from octoreplay.config import RunConfig
+from octoreplay._version import __version__
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint, log_files
 from octoreplay.report.sweep_plots import write_sweep_figures
@@ -24,7 +25,6 @@ from octoreplay.study.grid import Combination, Variation, check_variations, comb
 from octoreplay.study.local import run_local
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 from octoreplay.study.task import DATA_LOST, FAILED, Row, Task
-from octoreplay.team_file import dump_team, load_team_file
 
 _TABLE_SECONDS = 2.0
 """The table is written at most this often while runs finish; a table of very many runs takes its time."""

@@ -74,10 +74,10 @@ def run_task(task: Task) -> Row:
 
 
 def _run(task: Task) -> Row:
+    from octoreplay.config.team_file import parse_team
     from octoreplay.replay.session import replay_team
     from octoreplay.result import open_result
     from octoreplay.study.numbers import run_numbers, truth_numbers
-    from octoreplay.team_file import parse_team
 
     _compile_first()
     unfinished = Path(task.unfinished)

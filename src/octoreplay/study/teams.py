@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from octoreplay import __version__
-from octoreplay.config import RunConfig
+from octoreplay._version import __version__
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import OutputError
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import partial_path

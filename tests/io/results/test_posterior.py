@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels, class_probabilities, label_probabilities, team_log_odds
 
 tables = st.tuples(st.integers(1, 6), st.integers(1, 5)).flatmap(
     lambda shape: arrays(np.float64, shape, elements=st.floats(-800, 800))
@@ -12,7 +12,7 @@ tables = st.tuples(st.integers(1, 6), st.integers(1, 5)).flatmap(
 
 @given(tables)
 def test_probabilities_sum_to_one_and_have_the_log_odds(log_odds: np.ndarray) -> None:
-    prob = posterior.posterior(log_odds)
+    prob = class_probabilities(log_odds)
     np.testing.assert_allclose(prob.sum(axis=1), 1.0, rtol=1e-12)
     likely = (prob[:, 1:] > 1e-200) & (prob[:, :1] > 1e-200)
     ratio = np.log(np.where(likely, prob[:, 1:], 1.0)) - np.log(np.where(likely, prob[:, :1], 1.0))
@@ -22,24 +22,24 @@ def test_probabilities_sum_to_one_and_have_the_log_odds(log_odds: np.ndarray) ->
 @given(tables)
 def test_labels_and_their_probabilities_are_the_posteriors_largest(log_odds: np.ndarray) -> None:
     full = np.concatenate([np.zeros((len(log_odds), 1)), log_odds], axis=1)
-    labels = posterior.labels(log_odds)
+    labels = best_labels(log_odds)
     assert labels.tolist() == [row.tolist().index(max(row)) for row in full]
-    largest = posterior.posterior(log_odds).max(axis=1)
-    np.testing.assert_allclose(posterior.label_probabilities(log_odds), largest, rtol=1e-12)
+    largest = class_probabilities(log_odds).max(axis=1)
+    np.testing.assert_allclose(label_probabilities(log_odds), largest, rtol=1e-12)
 
 
 def test_free_wins_a_tie() -> None:
-    assert posterior.labels(np.array([[0.0, 0.0], [-1.0, 0.0], [0.5, 0.5]])).tolist() == [0, 0, 1]
+    assert best_labels(np.array([[0.0, 0.0], [-1.0, 0.0], [0.5, 0.5]])).tolist() == [0, 0, 1]
 
 
 def test_the_team_posterior_adds_up_what_consensus_averaged() -> None:
     prior, evidence = -0.75, np.array([[1.0, -2.0], [0.5, 0.25], [3.0, 3.0]])
     mean = prior + evidence.mean(axis=0, keepdims=True)
-    np.testing.assert_allclose(posterior.team_posterior(mean, prior, 3), prior + evidence.sum(axis=0, keepdims=True))
+    np.testing.assert_allclose(team_log_odds(mean, prior, 3), prior + evidence.sum(axis=0, keepdims=True))
 
 
 def test_precision_is_kept() -> None:
     log_odds = np.zeros((2, 3), dtype=np.float32)
-    assert posterior.posterior(log_odds).dtype == np.float32
-    assert posterior.label_probabilities(log_odds).dtype == np.float32
-    assert posterior.team_posterior(log_odds, 0.5, 6).dtype == np.float32
+    assert class_probabilities(log_odds).dtype == np.float32
+    assert label_probabilities(log_odds).dtype == np.float32
+    assert team_log_odds(log_odds, 0.5, 6).dtype == np.float32

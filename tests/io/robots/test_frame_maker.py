@@ -17,7 +17,7 @@ from log_factory import (
     ros2,
     ros_row,
 )
-from octoreplay.config import RobotConfig
+from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import RawMessage
 from octoreplay.io.messages.decoders import DamagedMessageError

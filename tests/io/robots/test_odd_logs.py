@@ -20,7 +20,9 @@ from log_factory import (
     write_mcap,
     write_rows,
 )  # fmt: skip
-from octoreplay.config import RobotConfig, RunConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.pose_source import PoseSource

@@ -22,7 +22,7 @@ from log_factory import (
     ros_row,
     write_rows,
 )
-from octoreplay.config import RobotConfig
+from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from log_factory import NAMES, robot_entries, write_mcap
-from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog

@@ -29,7 +29,8 @@ from log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.robots.frame_maker import DepthFrameMaker
 from octoreplay.io.robots.robot_log import RobotLog

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from log_factory import SECOND, robot_entries, write_mcap
-from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.team_bodies import TeamBodies
 
 START = 100 * SECOND

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.config import TimeConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.thinning import Thinning
 
 SECOND = 1_000_000_000

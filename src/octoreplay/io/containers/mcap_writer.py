@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from mcap.writer import CompressionType, Writer
 
-from octoreplay import __version__
+from octoreplay._version import __version__
 from octoreplay.errors import OutputError
 from octoreplay.io.messages.ros_types import typestore
 

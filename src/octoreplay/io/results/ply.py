@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from octoreplay.errors import OutputError
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import LeafTable, UInt8Array
 
 VERTEX_DTYPE = np.dtype(
@@ -58,8 +58,8 @@ def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
         vertices[name] = positions[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = colors[:, channel]
-    vertices["label"] = posterior.labels(leaves.log_odds)
-    vertices["probability"] = posterior.label_probabilities(leaves.log_odds)
+    vertices["label"] = best_labels(leaves.log_odds)
+    vertices["probability"] = label_probabilities(leaves.log_odds)
     vertices["size"] = leaves.sizes
     return vertices
 

@@ -17,12 +17,14 @@ from mcap.reader import SeekingReader
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
-from octoreplay.config import CENTRAL, RunConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import parse_team
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
 from octoreplay.io.results.result_writer import FORMAT_VERSION, METRICS_TOPIC, map_state_topic, pose_topic
 from octoreplay.records import (
+    CENTRAL,
     ClassTable,
     Float64Array,
     FrameCounts,
@@ -33,7 +35,6 @@ from octoreplay.records import (
     RunSummary,
     TickMetrics,
 )
-from octoreplay.team_file import parse_team
 
 
 class ResultReader:

@@ -12,15 +12,16 @@ from typing import Any, Self
 
 import numpy as np
 
-from octoreplay import __version__
-from octoreplay.config import RobotConfig, RunConfig
+from octoreplay._version import __version__
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team
 from octoreplay.errors import OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
-from octoreplay.io.results import posterior
+from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
-from octoreplay.team_file import dump_team
 from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
@@ -301,7 +302,7 @@ class ResultWriter:
 
     def _view_points(self, leaves: LeafTable) -> Any:
         """The occupied leaves as an array of VIEW_DTYPE."""
-        label = posterior.labels(leaves.log_odds)
+        label = best_labels(leaves.log_odds)
         occupied = np.flatnonzero(label)
         label = label[occupied]
         points = np.zeros(len(occupied), dtype=VIEW_DTYPE)
@@ -311,7 +312,7 @@ class ResultWriter:
         points["rgb"] = (color[:, 0] << 16) | (color[:, 1] << 8) | color[:, 2]
         points["label"] = label
         points["size"] = leaves.sizes[occupied]
-        points["probability"] = posterior.label_probabilities(leaves.log_odds[occupied])
+        points["probability"] = label_probabilities(leaves.log_odds[occupied])
         return points
 
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from octoreplay.class_tables.edits import edited
-from octoreplay.config import RobotConfig, RunConfig, TimeConfig
+from octoreplay.config.class_tables.edits import edited
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, suggestion
 from octoreplay.io.containers.log_reader import TopicInfo, first_whole_message
 from octoreplay.io.containers.logs import open_log

@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from typing import Any
 
-from octoreplay.config import RobotConfig
+from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import RawMessage
 from octoreplay.io.messages.decoders import DamagedMessageError

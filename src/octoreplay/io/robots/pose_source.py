@@ -9,7 +9,7 @@ from typing import Self, TypeAlias
 
 import numpy as np
 
-from octoreplay.config import RobotConfig
+from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
 from octoreplay.io.messages.decoders import DamagedMessageError

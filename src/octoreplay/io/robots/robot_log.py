@@ -13,7 +13,8 @@ from typing import Self
 
 import numpy as np
 
-from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, first_whole_message
 from octoreplay.io.containers.logs import open_log

@@ -9,7 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from octoreplay.config import RobotConfig, TimeConfig
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import BodyBox, Float64Array
 from octoreplay.transforms import inverse

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from octoreplay.config import TimeConfig
+from octoreplay.config.time import TimeConfig
 
 
 class Thinning:

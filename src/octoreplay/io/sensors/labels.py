@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.class_tables.label_rows import UNLABELLED_NAMES
-from octoreplay.config import PALETTE
+from octoreplay.config.class_tables.label_rows import UNLABELLED_NAMES
+from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.sensors.images import LabelImage
 from octoreplay.records import NO_CLASS, ClassTable, Color, Int64Array, SemanticClass, UInt8Array

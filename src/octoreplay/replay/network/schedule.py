@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from octoreplay.config import ScheduleEntry
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.errors import ConfigError
 from octoreplay.records import BoolArray
 

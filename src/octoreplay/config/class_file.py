@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from octoreplay.class_tables.edits import Merges, edited
-from octoreplay.class_tables.label_rows import BUILT_IN, built_in_rows, hydra_rows, kimera_rows, table_of_rows
-from octoreplay.config import PALETTE, RunConfig, is_number
+from octoreplay.config.class_tables.edits import Merges, edited
+from octoreplay.config.class_tables.label_rows import BUILT_IN, built_in_rows, hydra_rows, kimera_rows, table_of_rows
+from octoreplay.config.class_tables.palette import PALETTE
+from octoreplay.config.fields import is_number
+from octoreplay.config.run import RunConfig
+from octoreplay.config.yaml_file import load_yaml, read_text
 from octoreplay.errors import ConfigError, suggestion
 from octoreplay.records import ClassTable, Color, SemanticClass
-from octoreplay.yaml_file import load_yaml, read_text
 
 CLASSES_KEYS = ("classes", "ignored_raw_labels", "ignored_raw_colors", "merge_classes", "ignore_hits")
 _CLASS_KEYS = ("name", "color", "raw_labels", "raw_colors")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoreplay.config import PacketConfig, RunConfig
+from octoreplay.config.packets import PacketConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
@@ -12,7 +13,8 @@ from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
 from octoreplay.records import Int64Array
-from octoreplay.replay.exchange import HeldMap, PacketEncoder, Source
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import HeldMap, Source
 
 FIT_TRIES = 6
 """Packets that are encoded at most to find one that fits the budget."""

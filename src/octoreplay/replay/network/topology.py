@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from octoreplay.config import NetworkConfig
+from octoreplay.config.network import NetworkConfig
 from octoreplay.records import BoolArray, Float64Array
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from octoreplay.config import LinkConfig, RunConfig
+from octoreplay.config.network import LinkConfig
+from octoreplay.config.run import RunConfig
 
 
 class Transmission(Protocol):

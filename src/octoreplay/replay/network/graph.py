@@ -17,11 +17,12 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config import ConsensusConfig, NetworkConfig
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.network import NetworkConfig
 from octoreplay.errors import ConfigError
 from octoreplay.records import BoolArray, Float64Array
-from octoreplay.replay.schedule import Availability, Schedule
-from octoreplay.replay.topology import POSITION_TOPOLOGIES, Topology
+from octoreplay.replay.network.schedule import Availability, Schedule
+from octoreplay.replay.network.topology import POSITION_TOPOLOGIES, Topology
 
 Link: TypeAlias = tuple[int, int]
 

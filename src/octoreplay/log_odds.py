@@ -7,7 +7,7 @@ import numpy as np
 from octoreplay.records import FloatArray, UInt8Array
 
 
-def posterior(log_odds: FloatArray) -> FloatArray:
+def class_probabilities(log_odds: FloatArray) -> FloatArray:
     """Probabilities of free and the classes 1..C: (P, C + 1) in the precision of ``log_odds`` (P, C).
 
     The softmax of [0, log_odds], shifted by the row's maximum so that nothing overflows.
@@ -20,7 +20,7 @@ def posterior(log_odds: FloatArray) -> FloatArray:
     return full
 
 
-def labels(log_odds: FloatArray) -> UInt8Array:
+def best_labels(log_odds: FloatArray) -> UInt8Array:
     """The most probable class_id per row, 0 for free: (P,) uint8 from (P, C). A tie goes to the lower id."""
     if log_odds.shape[1] == 0:
         return np.zeros(len(log_odds), dtype=np.uint8)
@@ -36,6 +36,6 @@ def label_probabilities(log_odds: FloatArray) -> FloatArray:
     return 1.0 / total
 
 
-def team_posterior(log_odds: FloatArray, prior: float, num_robots: int) -> FloatArray:
+def team_log_odds(log_odds: FloatArray, prior: float, num_robots: int) -> FloatArray:
     """h_0 + N (h - h_0): the evidence of N robots from the mean that consensus leaves at each, same shape and dtype."""
     return prior + num_robots * (log_odds - prior)

@@ -9,22 +9,16 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from octoreplay.class_file import CLASSES_KEYS, class_settings, class_to_mapping
-from octoreplay.config import (
-    PARAMETERS,
-    SECTIONS,
-    LinkConfig,
-    RobotConfig,
-    RunConfig,
-    ScheduleEntry,
-    as_number,
-    coerced,
-    is_number,
-)
+from octoreplay.config.class_file import CLASSES_KEYS, class_settings, class_to_mapping
+from octoreplay.config.fields import as_number, is_number
+from octoreplay.config.network import LinkConfig, ScheduleEntry
+from octoreplay.config.parameters import PARAMETERS, SECTIONS, coerced
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.yaml_file import load_yaml, read_text
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.yaml_file import load_yaml, read_text
 
 _ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
 _SCHEDULE_KEYS = {"from": "start", "to": "end", **{f.name: f.name for f in dataclasses.fields(ScheduleEntry)[2:]}}
@@ -68,12 +62,11 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
         schedule=schedule(content.get("schedule") or ()),
     )
     # All at once: what one parameter may be depends on others.
-    defaults = {item.name: item.default for item in dataclasses.fields(RunConfig)}
     return RunConfig(
         robots=robots,
         **class_settings(content, folder),
         link_overrides=_link_overrides(content.get("links") or ()),
-        **{name: dataclasses.replace(cast("Any", defaults[name]), **fields) for name, fields in changes.items()},
+        **{name: SECTIONS[name].config_type(**fields) for name, fields in changes.items()},
     )
 
 
@@ -328,7 +321,7 @@ def team_template(config: RunConfig, missing: Mapping[str, Sequence[str]], folde
     for name, parameter in PARAMETERS.items():
         if parameter.section != section:
             section = parameter.section
-            lines += ["", f"# {SECTIONS[section]}", *_example_lines(content, section)]
+            lines += ["", f"# {SECTIONS[section].title}", *_example_lines(content, section)]
         comment = parameter.help + (f": {', '.join(parameter.choices)}" if parameter.choices else "")
         value = getattr(getattr(config, section), name)
         lines.append(_line(name, value, comment, is_set=name in content))

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Self
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder, Source
-from octoreplay.replay.robot import Arrival, Robot, Turn
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.robots.robot import Arrival, Robot, Turn
 
 REST = 8.0
 """Units by which a map may be off: rounding moves masses by up to six in every tick for ever."""

@@ -13,12 +13,13 @@ from typing import Self
 
 import numpy as np
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange import HeldMap, MapMessage, PacketEncoder, Source
-from octoreplay.replay.public_map import PublicMap
-from octoreplay.replay.robot import Arrival, Robot, Turn
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.public_map import PublicMap
+from octoreplay.replay.robots.robot import Arrival, Robot, Turn
 
 
 class FloodRobot(Robot):

@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from octoreplay.config import RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Evidence, Step, sum_of_evidence, team_step
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams
@@ -22,7 +22,9 @@ from octoreplay.mapping.sensor import (
     unclamped_increments,
 )
 from octoreplay.records import Float64Array, Frame, Int64Array
-from octoreplay.replay.exchange import Acknowledgement, Exchange, HeldMap, MapMessage, PacketEncoder, Receipt, Source
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
+from octoreplay.replay.exchange.neighbours import Exchange
 
 
 class Arrival(NamedTuple):

@@ -4,10 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
-from octoreplay.config import PRESETS, RunConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
+
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "paper": MappingProxyType(
+            {
+                "rule": "gradient", "evidence": "time-average", "mode": "on-arrival", "gamma_per_arrival": "full",
+                "topology": "complete", "publish_period": 1.0, "weights": "degree", "settle": 0, "gamma": 1.0,
+            }
+        )
+    }
+)  # fmt: skip
+"""Named sets of parameters. 'paper' is the literal reading of the paper."""
 
 
 def with_options(base: RunConfig, preset: str | None, edges: str | None, given: Mapping[str, Any]) -> RunConfig:

@@ -11,159 +11,20 @@ A robot that forgot everything starts another life (``epoch``), whose maps are o
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from octoreplay.config import PacketConfig
+from octoreplay.config.packets import PacketConfig
 from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
-from octoreplay.mapping.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
-from octoreplay.mapping.codec import MapVersion, PacketFormat
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
-from octoreplay.records import Int64Array
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.replay.exchange.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
+from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, MapPart, Receipt, Source
 
 NOTHING = 0
 """The base of a delta that builds on nothing; versions are greater."""
-
-
-class Source(NamedTuple):
-    """Whose map: a robot's index, and which of its lives."""
-
-    origin: int
-    epoch: int
-
-
-@dataclass(frozen=True, eq=False)
-class HeldMap:
-    """A state of a robot's map, at the robot itself or at another; never changed once it is here.
-
-    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio',
-    ``streams`` are those of the octree where they are there already.
-    """
-
-    octree: SemanticOctree
-    version: int
-    weight: int = 0
-    streams: TreeStreams | None = None
-
-
-def _with_flipped_bit(data: bytes, place: int) -> bytes:
-    """A copy with the lowest bit of one byte flipped."""
-    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
-
-
-@dataclass(frozen=True, eq=False)
-class MapPart:
-    """One packet of a message, and what a receiver that can use it has afterwards, decoded once for all receivers.
-
-    Without ``held`` the receiver decodes the packet itself.
-    """
-
-    data: bytes
-    source: Source
-    base: int | None
-    held: HeldMap | None
-
-
-@dataclass(frozen=True, eq=False)
-class MapMessage:
-    """Packets of one or more robots' maps that travel together."""
-
-    parts: tuple[MapPart, ...]
-
-    waits = True
-
-    @property
-    def num_bytes(self) -> int:
-        """Length of its packets [bytes]."""
-        return sum(len(part.data) for part in self.parts)
-
-    def damaged(self, share: float) -> MapMessage:
-        """The same message with one bit flipped, ``share`` in [0, 1) of the way through."""
-        place = int(share * self.num_bytes)
-        parts = list(self.parts)
-        for index, part in enumerate(parts):
-            if place < len(part.data):
-                parts[index] = dataclasses.replace(part, data=_with_flipped_bit(part.data, place), held=None)
-                break
-            place -= len(part.data)
-        return MapMessage(tuple(parts))
-
-
-@dataclass(frozen=True)
-class Acknowledgement:
-    """What a robot has of some maps after a message."""
-
-    data: bytes
-
-    waits = False
-
-    @property
-    def num_bytes(self) -> int:
-        """Length of the packet [bytes]."""
-        return len(self.data)
-
-    def damaged(self, share: float) -> Acknowledgement:
-        """The same with one bit flipped, ``share`` in [0, 1) of the way through."""
-        return Acknowledgement(_with_flipped_bit(self.data, int(share * len(self.data))))
-
-
-Content: TypeAlias = MapMessage | Acknowledgement
-
-
-@dataclass
-class Receipt:
-    """What became of a message's packets at its receiver, and the maps that it brought anything new of."""
-
-    fresh: list[Source] = dataclasses.field(default_factory=list)
-    num_stale: int = 0
-    num_gaps: int = 0
-    num_damaged: int = 0
-
-    def add(self, other: Receipt) -> None:
-        """Count another message's packets too."""
-        self.fresh += other.fresh
-        self.num_stale += other.num_stale
-        self.num_gaps += other.num_gaps
-        self.num_damaged += other.num_damaged
-
-
-class PacketEncoder:
-    """The team's packets: each is made once, however many robots send it to however many others."""
-
-    def __init__(self, config: PacketConfig) -> None:
-        self._format = PacketFormat(
-            content=config.content,
-            step=config.int8_step,
-            zstd_level=config.zstd_level if config.packet_compression == "zstd" else None,
-        )
-        # By the octree's identity, version and base; the octree is kept so that no other takes its place.
-        self._packets: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
-        self._older: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
-
-    def packet(self, source: Source, held: HeldMap, base: int | None) -> bytes:
-        """A whole map, or what changed in it after version ``base``."""
-        key = (id(held.octree), held.version, base)
-        entry = self._packets.get(key) or self._older.get(key) or (held.octree, self.encode(source, held, base))
-        self._packets[key] = entry
-        return entry[1]
-
-    def encode(self, source: Source, held: HeldMap, base: int | None, indices: Int64Array | None = None) -> bytes:
-        """A packet made anew; with ``indices`` (n,) it holds those bricks in place of all that changed."""
-        version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
-        if base is None:
-            return codec.pack(held.octree, held.streams or held.octree.streams(), codec.FULL, self._format, version)
-        if indices is None:
-            indices = np.flatnonzero(held.octree.revisions >= base)
-        return codec.encode_delta(held.octree, indices, packet_format=self._format, map_version=version)
-
-    def end_tick(self) -> None:
-        """Forget the packets that nobody sent in this tick."""
-        self._older, self._packets = self._packets, {}
 
 
 class Exchange:

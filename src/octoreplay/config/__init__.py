@@ -1,0 +1,1 @@
+"""Configuration: everything that a user can set, from files, presets and options."""

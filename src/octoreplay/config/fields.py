@@ -1,0 +1,71 @@
+"""Fields of configuration dataclasses: help texts, ranges and the checks against them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Any
+
+from octoreplay.errors import ConfigError
+
+LARGEST, SMALLEST = 1e12, 1e-15
+"""No number of a configuration is larger, nor smaller where it must be above 0: what times become still has room."""
+
+
+def parameter(
+    default: Any,
+    help_text: str,
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """A dataclass field that carries its help text and the range that it is checked against."""
+    return field(
+        default=default,
+        metadata={"help": help_text, "minimum": minimum, "maximum": maximum, "above": above, "choices": choices},
+    )
+
+
+def help_text(text: str) -> Mapping[str, str]:
+    """What a key of a robot is for, as a team file's comments say it."""
+    return {"help": text}
+
+
+def check_ranges(config: Any) -> None:
+    """Check every parameter of one section against its type and range."""
+    for item in dataclasses.fields(config):
+        value, meta = getattr(config, item.name), item.metadata
+        if value is None or not meta:
+            continue
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{item.name}: {value} is not a finite number")
+        if isinstance(value, float) and abs(value) > LARGEST:
+            raise ConfigError(f"{item.name}: {value:g} is above the largest value {LARGEST:g}")
+        if meta["choices"] is not None and value not in meta["choices"]:
+            raise ConfigError(f"{item.name}: '{value}' is not one of {', '.join(meta['choices'])}")
+        if meta["minimum"] is not None and value < meta["minimum"]:
+            raise ConfigError(f"{item.name}: {value} is below the least value {meta['minimum']:g}")
+        if meta["maximum"] is not None and value > meta["maximum"]:
+            raise ConfigError(f"{item.name}: {value} is above the largest value {meta['maximum']:g}")
+        if meta["above"] is not None and value <= meta["above"]:
+            raise ConfigError(f"{item.name}: {value} must be greater than {meta['above']:g}")
+        if isinstance(value, float) and meta["above"] == 0.0 and value < SMALLEST:
+            raise ConfigError(f"{item.name}: {value:g} is below the least value {SMALLEST:g}")
+
+
+def is_number(value: Any) -> bool:
+    """True for int and float, not for bool."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_number(value: Any) -> float:
+    """A float from a number or its text."""
+    if isinstance(value, str):
+        return float(value)
+    if not is_number(value):
+        raise TypeError
+    return float(value)

@@ -1,0 +1,150 @@
+"""Configuration of one robot: logs, topics, clock and frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from octoreplay.config.fields import LARGEST, help_text
+from octoreplay.errors import ConfigError
+from octoreplay.records import CENTRAL
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """One robot: its log files, topics, clock and frames. Topics and frames that are None are found in the log.
+
+    ``depth_topic``, ``label_topic`` and ``confidence_topic`` are images; ``cloud_topic`` is a point cloud or a laser
+    scan, with its labels in ``label_field`` and how sure they are in ``confidence_field``. ``pose_file`` takes the
+    place of a pose topic: a trajectory in TUM's or KITTI's format, the latter with ``pose_times``, a time in each line,
+    or else with a pose for every message of the sensor.
+    ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo; ``rectified`` says whether CameraInfo's P
+    holds (None: where the topic's name says 'rect') or K and the distortion. Transforms are (x, y, z, qx, qy, qz, qw):
+    ``T_team_map`` from the robot's map frame to the team's, ``T_body_sensor`` from the sensor's frame to the frame
+    whose pose the pose topic gives, in place of TF. ``body_box`` is (xmin, ymin, zmin, xmax, ymax, zmax) of the robot
+    itself [m] in ``body_frame``, the frame whose pose the pose topic gives unless named: what the sensor sees in it is
+    left out. ``clock_offset`` [s] is added to the robot's stamps. The robot publishes every ``publish_period`` [s], the
+    team's unless given, ``publish_phase`` [s] after the ticks that are multiples of it.
+    """
+
+    robot_id: str
+    logs: tuple[Path, ...]
+    depth_topic: str | None = field(default=None, metadata=help_text("depth images, raw or compressed"))
+    label_topic: str | None = field(
+        default=None, metadata=help_text("label images, ids or colours; '' to map without labels")
+    )
+    confidence_topic: str | None = field(default=None, metadata=help_text("images that say how sure the labels are"))
+    camera_info_topic: str | None = field(default=None, metadata=help_text("CameraInfo of the depth images"))
+    cloud_topic: str | None = field(
+        default=None, metadata=help_text("point clouds or laser scans, in place of depth_topic")
+    )
+    label_field: str | None = field(
+        default=None, metadata=help_text("field of the points that holds their labels, such as rgb")
+    )
+    confidence_field: str | None = field(
+        default=None, metadata=help_text("field of the points that says how sure the labels are")
+    )
+    pose_topic: str | None = field(default=None, metadata=help_text("odometry, stamped poses, a path or TF"))
+    pose_file: Path | None = field(
+        default=None, metadata=help_text("a trajectory in place of pose_topic: TUM or KITTI format")
+    )
+    pose_times: Path | None = field(
+        default=None, metadata=help_text("times of a KITTI trajectory, one in each line [s]")
+    )
+    label_info_topic: str | None = field(default=None, metadata=help_text("LabelInfo that names the labels"))
+    map_frame: str | None = field(default=None, metadata=help_text("the frame that the poses are in"))
+    sensor_frame: str | None = field(
+        default=None, metadata=help_text("the sensor's frame, if not the one that its messages name")
+    )
+    intrinsics: tuple[float, ...] | None = field(
+        default=None, metadata=help_text("[fx, fy, cx, cy] in place of CameraInfo [pixels]")
+    )
+    rectified: bool | None = field(
+        default=None, metadata=help_text("true: CameraInfo's P holds; false: K and the distortion")
+    )
+    depth_unit: float | None = field(
+        default=None, metadata=help_text("metres per depth value, in place of the encoding's")
+    )
+    clock_offset: float = field(default=0.0, metadata=help_text("added to this robot's stamps [s]"))
+    T_team_map: tuple[float, ...] = field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        metadata=help_text("its map frame in the team's: x y z [m], quaternion x y z w"),
+    )
+    T_body_sensor: tuple[float, ...] | None = field(
+        default=None, metadata=help_text("the sensor in the frame that the poses are of, in place of TF")
+    )
+    body_frame: str | None = field(
+        default=None, metadata=help_text("the frame of body_box, if not the one that the poses are of")
+    )
+    body_box: tuple[float, ...] | None = field(
+        default=None, metadata=help_text("the robot itself: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
+    )
+    publish_period: float | None = field(
+        default=None, metadata=help_text("publishes its map every so often, in place of the team's [s]")
+    )
+    publish_phase: float = field(
+        default=0.0, metadata=help_text("and so much after the ticks that are multiples of it [s]")
+    )
+
+    def __post_init__(self) -> None:
+        if not self.robot_id or "/" in self.robot_id:
+            raise ConfigError(f"robot id '{self.robot_id}': every robot needs an id, without '/' in it")
+        if self.robot_id == CENTRAL:
+            raise ConfigError(f"robot id '{CENTRAL}': is the name of the centralised map; give the robot another")
+        for problem in (*self._wrong_sources(), *self._wrong_geometry(), *self._wrong_numbers()):
+            raise ConfigError(f"robot '{self.robot_id}': {problem}")
+
+    def _wrong_sources(self) -> Iterator[str]:
+        """What does not go together in the files and topics."""
+        if not self.logs:
+            yield "needs a log"
+        if self.depth_topic and self.cloud_topic:
+            yield "give depth_topic or cloud_topic, not both"
+        if self.pose_topic and self.pose_file:
+            yield "give pose_topic or pose_file, not both"
+        if self.pose_times and not self.pose_file:
+            yield "pose_times goes with pose_file"
+
+    def _wrong_geometry(self) -> Iterator[str]:
+        """What is no transform, no camera or no box."""
+        for name in ("T_team_map", "T_body_sensor"):
+            value = getattr(self, name)
+            if value is not None and len(value) != 7:
+                yield f"{name} expects 7 numbers x, y, z, qx, qy, qz, qw"
+            elif value is not None and abs(math.hypot(*value[3:]) - 1.0) > 1e-3:
+                yield f"{name}'s quaternion must have length 1"
+        if self.intrinsics is not None and (len(self.intrinsics) != 4 or min(self.intrinsics[:2]) <= 0):
+            yield "intrinsics expects 4 numbers fx, fy, cx, cy"
+        box = self.body_box
+        if box is not None and (len(box) != 6 or not all(low < high for low, high in zip(box, box[3:], strict=False))):
+            yield "body_box expects 6 numbers XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX, every minimum below its maximum"
+
+    def _wrong_numbers(self) -> Iterator[str]:
+        """What is out of range."""
+        if self.depth_unit is not None and self.depth_unit <= 0:
+            yield "depth_unit must be greater than 0"
+        if self.publish_period is not None and not 0 < self.publish_period < math.inf:
+            yield "publish_period must be greater than 0"
+        if not 0 <= self.publish_phase < math.inf:
+            yield "publish_phase must not be negative"
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            numbers = [n for n in (value if isinstance(value, tuple) else (value,)) if isinstance(n, float)]
+            if not all(math.isfinite(number) for number in numbers):
+                yield f"{item.name} must be finite, not {value}"
+            if any(abs(number) > LARGEST for number in numbers):
+                yield f"{item.name} must not hold numbers above {LARGEST:g}"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files and folders that the robot's data come from."""
+        return (*self.logs, *(path for path in (self.pose_file, self.pose_times) if path is not None))
+
+    def with_absolute_paths(self) -> RobotConfig:
+        """This robot with paths that hold from everywhere."""
+        logs = tuple(log.resolve() for log in self.logs)
+        pose_file, pose_times = (None if path is None else path.resolve() for path in (self.pose_file, self.pose_times))
+        return dataclasses.replace(self, logs=logs, pose_file=pose_file, pose_times=pose_times)

@@ -1,0 +1,125 @@
+"""Configuration of a run.
+
+Every parameter has one name: in the team file (a flat key), on the command line (``--name-with-dashes``) and here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from octoreplay.config.class_tables.edits import Merges
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.network import LinkConfig, NetworkConfig
+from octoreplay.config.output import OutputConfig
+from octoreplay.config.packets import PacketConfig
+from octoreplay.config.parameters import coerced
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import ConfigError
+from octoreplay.records import ClassTable
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that a run depends on.
+
+    ``classes`` is None where the logs bring their own class table; ``merge_classes`` and ``ignore_hits`` are what to
+    make of that (``edited``). ``link_overrides`` are (sender, receiver, values): what differs from ``link`` in one
+    direction of a link.
+    """
+
+    robots: tuple[RobotConfig, ...]
+    classes: ClassTable | None = None
+    merge_classes: Merges = ()
+    ignore_hits: tuple[str, ...] = ()
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    link: LinkConfig = field(default_factory=LinkConfig)
+    packet: PacketConfig = field(default_factory=PacketConfig)
+    link_overrides: tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...] = ()
+    time: TimeConfig = field(default_factory=TimeConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+
+    def __post_init__(self) -> None:
+        if not self.robots:
+            raise ConfigError("robots: a team needs at least one robot")
+        seen: set[str] = set()
+        for robot in self.robots:
+            if robot.robot_id in seen:
+                raise ConfigError(f"robots: '{robot.robot_id}' is listed twice")
+            seen.add(robot.robot_id)
+        for sender, receiver, weight in self.network.edges:
+            for robot_id in (sender, receiver):
+                if robot_id not in seen:
+                    raise ConfigError(f"edges: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+            if sender == receiver:
+                raise ConfigError(f"edges: '{sender}' cannot have a link to itself")
+            if weight is not None and not 0 <= weight < math.inf:
+                raise ConfigError(f"edges: the weight of {sender} - {receiver} must be a finite number from 0 on")
+        for key, robot_id in _named_robots(self):
+            if robot_id not in seen:
+                raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+        for sender, receiver, _ in self.link_overrides:
+            if sender == receiver:
+                raise ConfigError(f"links: '{sender}' cannot have a link to itself")
+            try:
+                self.link_config(sender, receiver)
+            except ConfigError as error:
+                raise ConfigError(f"links: {sender} -> {receiver}: {error}") from error
+        for robot in self.robots:
+            for name, value in (("publish_period", robot.publish_period), ("publish_phase", robot.publish_phase)):
+                ticks = (value or 0.0) / self.network.publish_period
+                if abs(ticks - round(ticks)) > 1e-6 or (value and round(ticks) == 0):
+                    raise ConfigError(
+                        f"robot '{robot.robot_id}': {name} {value:g} s is not a multiple of the team's publish_period"
+                        f" {self.network.publish_period:g} s, the length of a tick"
+                    )
+        if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
+            raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
+        _check_rule(self)
+
+    def link_config(self, sender: str, receiver: str) -> LinkConfig:
+        """What happens to a packet from one robot to another."""
+        values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
+        return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
+
+    def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
+        """This configuration with flat parameters replaced.
+
+        Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.
+        """
+        changes = coerced(values)
+        sections = {name: dataclasses.replace(getattr(self, name), **fields) for name, fields in changes.items()}
+        return dataclasses.replace(self, **sections)
+
+
+def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
+    """Every robot that the network's parameters name, with the parameter; edges are checked with their weights."""
+    for pair in config.network.one_way:
+        yield from (("one_way", robot_id) for robot_id in pair)
+    for entry in config.network.schedule:
+        for group in (*entry.groups, *entry.links_down, *entry.links_up, entry.robots_off, entry.robots_silent):
+            yield from (("schedule", robot_id) for robot_id in group)
+    for sender, receiver, _ in config.link_overrides:
+        yield from (("links", robot_id) for robot_id in (sender, receiver))
+
+
+def _check_rule(config: RunConfig) -> None:
+    """Refuse what a rule cannot do."""
+    rule, packet = config.consensus.rule, config.packet
+    if rule in ("ratio", "flood") and config.consensus.mode != "sync":
+        raise ConfigError(f"mode: rule '{rule}' adds up what arrived once in a tick; use mode 'sync'")
+    if rule == "ratio":
+        is_exact = packet.is_exact and config.map.prune_tolerance == 0
+        if not is_exact or packet.packets != "full":
+            raise ConfigError(
+                "rule: 'ratio' sends running sums, all of which change in every tick and must be exact; use packets"
+                " 'full', content 'float32' and prune_tolerance 0, without budget and top_classes"
+            )

@@ -1,0 +1,82 @@
+"""Configuration of the inverse sensor model and of the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from octoreplay.config.fields import check_ranges, parameter
+from octoreplay.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The inverse sensor model: log-odds increments, clamping and ranges."""
+
+    hit: float = parameter(1.0, "log-odds added to a hit cell's class (psi)", above=0.0)
+    miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray passes (phi)", maximum=0.0)
+    hit_other: float | None = parameter(None, "log-odds added to a hit cell's other classes (default: miss)")
+    clamp_min: float = parameter(-5.0, "least log-odds of a class", maximum=0.0)
+    clamp_max: float = parameter(5.0, "largest log-odds of a class", minimum=0.0)
+    min_range: float = parameter(0.0, "points nearer than this carry no information [m]", minimum=0.0)
+    max_range: float = parameter(10.0, "rays are cut here [m]", above=0.0)
+    rays: str = parameter("cells", "one ray per distinct end cell, or per measured point", choices=("cells", "all"))
+    hide_robots: bool = parameter(False, "points in another robot's body_box free their ray and hit nothing")
+    invalid_depth: tuple[float, ...] = parameter((), "raw depth values that carry no information")
+    no_return_depth: tuple[float, ...] = parameter(
+        (), "raw depth values that mean 'no return' and free their ray up to max_range"
+    )
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if self.clamp_min >= self.clamp_max:
+            raise ConfigError("clamp_min: must be below clamp_max")
+        if self.min_range >= self.max_range:
+            raise ConfigError("min_range: must be below max_range")
+
+    @property
+    def clamp(self) -> tuple[float, float]:
+        """The least and the largest log-odds of a class."""
+        return self.clamp_min, self.clamp_max
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """The map's geometry and prior."""
+
+    resolution: float = parameter(0.2, "edge of the finest leaf [m]", above=0.0)
+    bounds: tuple[float, ...] = parameter(
+        (), "mapped region: ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m]"
+    )
+    prob_free: float | None = parameter(
+        None, "prior probability of free space (default: uniform over all classes)", above=0.0, maximum=0.999999
+    )
+    prune_tolerance: float = parameter(
+        0.0, "siblings whose log-odds differ by at most this are one leaf when published (0: lossless)", minimum=0.0
+    )
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if not all(math.isfinite(number) for number in self.bounds):
+            raise ConfigError("bounds: expects finite numbers")
+        if len(self.bounds) not in (0, 2, 6):
+            raise ConfigError(f"bounds: expects 2 or 6 numbers, got {len(self.bounds)}")
+        half = len(self.bounds) // 2
+        if any(self.bounds[i] >= self.bounds[half + i] for i in range(half)):
+            raise ConfigError("bounds: every minimum must be below its maximum")
+
+    @property
+    def box(self) -> tuple[float, float, float, float, float, float]:
+        """The mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres; infinite where it is not limited."""
+        infinity = math.inf
+        if len(self.bounds) == 2:
+            return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
+        if len(self.bounds) == 6:
+            return self.bounds
+        return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
+
+    def prior(self, num_classes: int) -> float:
+        """h_0: the log-odds of each occupied class in an unobserved cell."""
+        if self.prob_free is None:
+            return 0.0
+        return math.log((1.0 - self.prob_free) / num_classes / self.prob_free)

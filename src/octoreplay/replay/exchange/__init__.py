@@ -1,0 +1,1 @@
+"""The exchange of maps: messages, packets, and the versions that robots hold."""

@@ -1,0 +1,111 @@
+"""Messages between robots: packets of maps, and acknowledgements."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+
+
+class Source(NamedTuple):
+    """Whose map: a robot's index, and which of its lives."""
+
+    origin: int
+    epoch: int
+
+
+@dataclass(frozen=True, eq=False)
+class HeldMap:
+    """A state of a robot's map, at the robot itself or at another; never changed once it is here.
+
+    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio',
+    ``streams`` are those of the octree where they are there already.
+    """
+
+    octree: SemanticOctree
+    version: int
+    weight: int = 0
+    streams: TreeStreams | None = None
+
+
+def _with_flipped_bit(data: bytes, place: int) -> bytes:
+    """A copy with the lowest bit of one byte flipped."""
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+@dataclass(frozen=True, eq=False)
+class MapPart:
+    """One packet of a message, and what a receiver that can use it has afterwards, decoded once for all receivers.
+
+    Without ``held`` the receiver decodes the packet itself.
+    """
+
+    data: bytes
+    source: Source
+    base: int | None
+    held: HeldMap | None
+
+
+@dataclass(frozen=True, eq=False)
+class MapMessage:
+    """Packets of one or more robots' maps that travel together."""
+
+    parts: tuple[MapPart, ...]
+
+    waits = True
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of its packets [bytes]."""
+        return sum(len(part.data) for part in self.parts)
+
+    def damaged(self, share: float) -> MapMessage:
+        """The same message with one bit flipped, ``share`` in [0, 1) of the way through."""
+        place = int(share * self.num_bytes)
+        parts = list(self.parts)
+        for index, part in enumerate(parts):
+            if place < len(part.data):
+                parts[index] = dataclasses.replace(part, data=_with_flipped_bit(part.data, place), held=None)
+                break
+            place -= len(part.data)
+        return MapMessage(tuple(parts))
+
+
+@dataclass(frozen=True)
+class Acknowledgement:
+    """What a robot has of some maps after a message."""
+
+    data: bytes
+
+    waits = False
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of the packet [bytes]."""
+        return len(self.data)
+
+    def damaged(self, share: float) -> Acknowledgement:
+        """The same with one bit flipped, ``share`` in [0, 1) of the way through."""
+        return Acknowledgement(_with_flipped_bit(self.data, int(share * len(self.data))))
+
+
+Content: TypeAlias = MapMessage | Acknowledgement
+
+
+@dataclass
+class Receipt:
+    """What became of a message's packets at its receiver, and the maps that it brought anything new of."""
+
+    fresh: list[Source] = dataclasses.field(default_factory=list)
+    num_stale: int = 0
+    num_gaps: int = 0
+    num_damaged: int = 0
+
+    def add(self, other: Receipt) -> None:
+        """Count another message's packets too."""
+        self.fresh += other.fresh
+        self.num_stale += other.num_stale
+        self.num_gaps += other.num_gaps
+        self.num_damaged += other.num_damaged

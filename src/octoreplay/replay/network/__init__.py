@@ -1,0 +1,1 @@
+"""The simulated communication network: graph, topology, schedule and links."""

@@ -1,0 +1,1 @@
+"""Robots of a team: one module for each family of rules."""
