@@ -33,7 +33,7 @@ from octoreplay.io.robots.discover import describe, discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import ClassTable, SemanticClass
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from scan_maps import MAP, SENSOR, octree_of
 
 FIXTURES = Path(__file__).parent / "fixtures"

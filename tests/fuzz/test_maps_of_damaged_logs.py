@@ -21,7 +21,7 @@ from hostile_logs import (
 from log_factory import write_rows
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 
 CASES = 12
 
