@@ -16,7 +16,7 @@ from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknow
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
-from octree_factory import octree_of
+from support.octree_factory import octree_of
 
 NUM_BRICKS = 6
 
