@@ -8,8 +8,8 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from octoreplay.config import ConfigError
 from octoreplay.config.packets import PacketConfig
+from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknowledgement
