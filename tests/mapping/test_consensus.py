@@ -16,10 +16,10 @@ from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.records import CONVERGED
 from octoreplay.replay.session import Session
-from octree_factory import cells_of, cube, octree_of
 from reference import rules
 from reference.hand_made import team_config
 from reference.scenarios import TeamShape, make_scenario
+from support.octree_factory import cells_of, cube, octree_of
 
 NUM_CLASSES = 3
 RULES = ("gradient", "natural", "bayes", "local")

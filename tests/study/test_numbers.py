@@ -22,7 +22,7 @@ from octoreplay.study.numbers import (
     run_numbers,
     truth_numbers,
 )
-from result_factory import tick_metrics
+from support.result_factory import tick_metrics
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 

@@ -570,6 +570,6 @@ def test_a_partition_leaves_the_parts_of_the_graph_that_lie_within_groups(tick):
 
 
 def test_importing_the_module_leaves_networkx_out():
-    code = "import sys, octoreplay.replay.graph; print('networkx' in sys.modules)"
+    code = "import sys, octoreplay.replay.network.graph; print('networkx' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
