@@ -306,7 +306,7 @@ class FrameList:
 def _session(shape=SHAPE, **parameters):
     scenario = _scenario(shape)
     sources = [FrameList(tuple(f for f in scenario.frames if f.robot_id == robot)) for robot in scenario.robot_ids]
-    return Session(scenario.config(**parameters), sources, num_threads=1)
+    return Session(scenario.config(**parameters), sources, ThreadPoolExecutor(1))
 
 
 @functools.lru_cache(maxsize=1)
@@ -331,7 +331,7 @@ def test_bayes_keeps_the_mean_and_ends_at_the_oracle(mode, topology):
         if tick.settling and tick.number % 10:
             continue
         mean = np.mean([_values(octree) for octree in tick.maps], axis=0)
-        evidence = np.mean([_values(robot.evidence.octree) for robot in session._robots], axis=0)
+        evidence = np.mean([_values(robot.evidence.octree) for robot in session.team.robots], axis=0)
         np.testing.assert_allclose(mean, evidence, atol=1e-5)
     for octree in tick.maps:
         np.testing.assert_allclose(num_robots * _values(octree), _values(tick.oracle), atol=1e-4)
