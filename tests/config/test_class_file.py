@@ -27,12 +27,12 @@ LIST = "classes: [{name: road, raw_labels: 1}, {name: car, raw_labels: [2, 5]}, 
 
 
 def _parsed(text, folder=Path("/team")):
-    return parse_team(ROBOTS + text, source="team.yaml", folder=folder)
+    return parse_team(ROBOTS + text, name="team.yaml", folder=folder)
 
 
 def _there_and_back(config):
     text = dump_team(config, Path("/team"))
-    again = parse_team(text, source="again", folder=Path("/team"))
+    again = parse_team(text, name="again", folder=Path("/team"))
     assert again == config
     assert dump_team(again, Path("/team")) == text
     return text

@@ -87,7 +87,7 @@ def test_what_was_found_survives_a_team_file(tmp_path):
     path = write_mcap(tmp_path / "rover.mcap", robot_entries())
     config = resolve(run_of(*discover([path])))
     text = dump_team(config, tmp_path)
-    assert parse_team(text, source="team", folder=tmp_path) == config
+    assert parse_team(text, name="team", folder=tmp_path) == config
     assert resolve(config) == config
 
 
