@@ -1,12 +1,14 @@
 """The experiments' tables: means, missing values, and the figures that go with them."""
 
+import io
 import itertools
 import math
 
 import pytest
 
+from octoreplay.report import tables
 from octoreplay.report.experiment_plots import figures
-from octoreplay.report.experiment_tables import NOISES, answer_tables, groups, mean, of_noise, variant
+from octoreplay.report.experiment_tables import NOISES, answer_tables, groups, mean, of_noise, paper_table, variant
 
 NUMBERS = {
     "total_distance_all_log_end": 12345678.0, "total_distance_all": 0.0, "agreement_mean": 0.91234,
@@ -110,3 +112,18 @@ def test_rules_are_named_with_what_matters_to_them() -> None:
     row = {"rule": "natural", "evidence": "sum", "gamma": "1", "gamma_power": "1"}
     assert variant(row) == "natural, sum, γ 1/k"
     assert variant({**row, "rule": "flood"}) == "flood"
+
+
+def test_the_paper_table_has_one_column_per_moment() -> None:
+    moment = {
+        "seconds": 60.0, "total_distance": 123.4, "relative_distance": 0.5, "num_known_cells": 12_345,
+        "label_disagreement": 0.25, "agreement": 0.9, "agreement_occupied": 0.8, "grid_bytes": 2e6,
+        "octree_bytes": 5e5, "ratio": 4.0,
+    }  # fmt: skip
+    text = io.StringIO()
+    tables.show(tables.terminal(file=text, width=100), paper_table([moment, {**moment, "seconds": 300.0}]))
+    lines = [line.strip() for line in text.getvalue().splitlines() if line.strip()]
+    assert lines[1].split() == ["60", "s", "300", "s"]
+    assert [line.split("  ")[-1].strip() for line in lines[3:]] == [
+        "123", "50.00 %", "12,345", "25.00 %", "90.00 %", "80.00 %", "2 MB", "500 kB", "4.00",
+    ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The experiments' answers as tables in Markdown, from the rows of their sweeps (docs/experiments.md)."""
+"""Results of the experiments as tables: Markdown from the rows of sweeps, and the paper's numbers for the terminal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from octoreplay.report import tables
 
 Row = Mapping[str, Any]
 Tables = Mapping[str, Sequence[Row]]
@@ -28,6 +32,28 @@ def answer_tables(name: str, found: Tables) -> str:
     """An experiment's answer as Markdown."""
     makers = {"rules": _rules, "steps": _steps, "scale": _scale, "noise": _noise, "choose": _choose}
     return "\n".join(makers[name](found)) + "\n"
+
+
+def paper_table(moments: Sequence[Row]) -> Table:
+    """Table of the paper's experiment: one column per moment, given by the fields of ``study.paper.Moment``."""
+    table = tables.styled_table("The paper's experiment")
+    table.add_column("")
+    for moment in moments:
+        table.add_column(f"{moment['seconds']:.0f} s", justify="right")
+    rows: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+        ("total distance Φ", "total_distance", tables.number),
+        ("Φ per pair / squared norm of a map", "relative_distance", tables.share),
+        ("known cells", "num_known_cells", "{:,}".format),
+        ("cells with different labels", "label_disagreement", tables.share),
+        ("agreement, worst robot, all cells", "agreement", tables.share),
+        ("agreement, worst robot, occupied cells", "agreement_occupied", tables.share),
+        ("map as uniform grid", "grid_bytes", tables.size),
+        ("map as octree", "octree_bytes", tables.size),
+        ("uniform grid / octree", "ratio", "{:.2f}".format),
+    )
+    for heading, name, text in rows:
+        table.add_row(heading, *(text(moment[name]) for moment in moments))
+    return table
 
 
 def groups(rows: Sequence[Row], *names: str) -> dict[Key, list[Row]]:
