@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from octoreplay.config.fields import check_ranges, parameter
-from octoreplay.config.rules import RULES
+from octoreplay.config.rules import RULES, Rule
 
 EVIDENCES = ("sum", "time-average", "cell-average")
-
-
 MODES = ("sync", "on-arrival")
 
 
@@ -17,7 +15,7 @@ MODES = ("sync", "on-arrival")
 class ConsensusConfig:
     """The consensus rule and its steps (docs/algorithm.md)."""
 
-    rule: str = parameter("gradient", "consensus rule", choices=RULES)
+    rule: str = parameter("gradient", "consensus rule", choices=tuple(RULES))
     evidence: str = parameter("sum", "reading of log q_i", choices=EVIDENCES)
     mode: str = parameter("sync", "one iteration per tick, or one per arriving map", choices=MODES)
     epsilon: float | None = parameter(
@@ -37,3 +35,8 @@ class ConsensusConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+    @property
+    def traits(self) -> Rule:
+        """Traits of the rule."""
+        return RULES[self.rule]

@@ -112,14 +112,15 @@ def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 
 def _check_rule(config: RunConfig) -> None:
-    """Refuse what a rule cannot do."""
-    rule, packet = config.consensus.rule, config.packet
-    if rule in ("ratio", "flood") and config.consensus.mode != "sync":
-        raise ConfigError(f"mode: rule '{rule}' adds up what arrived once in a tick; use mode 'sync'")
-    if rule == "ratio":
-        is_exact = packet.is_exact and config.map.prune_tolerance == 0
-        if not is_exact or packet.packets != "full":
-            raise ConfigError(
-                "rule: 'ratio' sends running sums, all of which change in every tick and must be exact; use packets"
-                " 'full', content 'float32' and prune_tolerance 0, without budget and top_classes"
-            )
+    """Raise ConfigError where the rule does not support the mode or the packets."""
+    rule, packet = config.consensus.traits, config.packet
+    if config.consensus.mode not in rule.modes:
+        raise ConfigError(
+            f"mode: rule '{rule.name}' does not support '{config.consensus.mode}'; use {' or '.join(map(repr, rule.modes))}"
+        )
+    is_exact = packet.is_exact and config.map.prune_tolerance == 0
+    if packet.packets not in rule.packets or (rule.needs_exact_packets and not is_exact):
+        raise ConfigError(
+            f"rule: '{rule.name}' sends {rule.exchanges.value}, which receivers need whole and exact; use packets"
+            f" '{rule.packets[0]}', content 'float32' and prune_tolerance 0, without budget and top_classes"
+        )
