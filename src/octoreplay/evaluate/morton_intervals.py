@@ -90,7 +90,7 @@ def common_intervals(a: LeafSpans, b: LeafSpans) -> MortonIntervals:
 
 
 def bounding_box(codes: Int64Array, num_cells: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Return the smallest and the largest key (3,) of the cells in S > 0 intervals with first cells and lengths (S,)."""
+    """Return the smallest and largest key (3,) of the cells in intervals with first cells and lengths (S,), S > 0."""
     lows, highs = [], []
     while codes.size:
         # The largest cube that starts at the interval's first cell and ends in the interval.
