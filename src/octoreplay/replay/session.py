@@ -11,8 +11,8 @@ from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.records import Frame, RobotPose
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import check_budget
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
@@ -81,8 +81,8 @@ class Session:
         self._timeline = Timeline(sources)
         self._bodies = bodies
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
-        self._encoder = PacketEncoder(config.packet)
-        self.team = make_team(config, config.classes.num_classes, self._encoder)
+        self._packet_codec = PacketCodec(config.packet)
+        self.team = make_team(config, config.classes.num_classes, self._packet_codec)
         self._links: Links[Content] = Links(config)
         self._measurer = TickMeasurer(config, config.classes.num_classes, threads)
         self._period_ns = round(config.network.publish_period * 1e9)
@@ -125,7 +125,7 @@ class Session:
         max_change = self._iterate(graph, gamma_factor, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
         metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
-        self._encoder.end_tick()
+        self._packet_codec.end_tick()
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots), self._measurer.oracle,
             tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in robots if r.T_team_sensor is not None), metrics,

@@ -12,8 +12,8 @@ from octoreplay.config.run import RunConfig
 from octoreplay.mapping.consensus import Step, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
@@ -21,10 +21,12 @@ from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 class ConsensusRobot(Robot):
     """A robot that publishes h_i, and iterates on the h_j that arrive from its neighbours."""
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
+        super().__init__(index, config, num_classes, packet_codec, epoch)
         self._rule = config.consensus.traits
-        self._public = PublicMap(config, encoder, self.source)
+        self._public = PublicMap(config, packet_codec, self.source)
         self._published: HeldMap | None = None
         self._has_budget = config.packet.budget is not None
         self._used: dict[Source, int] = {}
@@ -124,7 +126,7 @@ class ConsensusTeam(Team[ConsensusRobot]):
     """Robots that mix maps."""
 
     def _new_robot(self, index: int, epoch: int) -> ConsensusRobot:
-        return ConsensusRobot(index, self._config, self._num_classes, self._encoder, epoch)
+        return ConsensusRobot(index, self._config, self._num_classes, self._packet_codec, epoch)
 
     def iterate(
         self, turns: Sequence[Turn[ConsensusRobot]], gamma_factor: float, tick: int, threads: Executor

@@ -10,8 +10,8 @@ from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 REST = 8.0
@@ -28,8 +28,10 @@ class RatioRobot(Robot):
     stands still, and goes on from there when the link is back.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
+        super().__init__(index, config, num_classes, packet_codec, epoch)
         self.mass = SemanticOctree(config.map.resolution, num_classes)
         self._weight = running_sums.WHOLE_WEIGHT
         self._total = SemanticOctree(config.map.resolution, num_classes)
@@ -119,12 +121,12 @@ class RatioRobot(Robot):
 class RatioTeam(Team[RatioRobot]):
     """Robots that exchange running sums."""
 
-    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+    def __init__(self, config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> None:
         _check_range(config)
-        super().__init__(config, num_classes, encoder)
+        super().__init__(config, num_classes, packet_codec)
 
     def _new_robot(self, index: int, epoch: int) -> RatioRobot:
-        return RatioRobot(index, self._config, self._num_classes, self._encoder, epoch)
+        return RatioRobot(index, self._config, self._num_classes, self._packet_codec, epoch)
 
     def iterate(
         self, turns: Sequence[Turn[RatioRobot]], gamma_factor: float, tick: int, threads: Executor

@@ -22,9 +22,9 @@ from octoreplay.mapping.sensor import (
     unclamped_increments,
 )
 from octoreplay.records import Float64Array, Frame, Int64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 
 
 class Arrival(NamedTuple):
@@ -81,14 +81,16 @@ class Robot(ABC):
     ``tick`` numbers, which grow, mark what changed when. Methods of different robots may run in parallel threads.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
         self.robot_id = config.robots[index].robot_id
         self.index = index
         self.source = Source(index, epoch)
         self.num_scans = 0
         self.num_iterations = 0
         self.T_team_sensor: Float64Array | None = None
-        self.exchange = Exchange(config.packet, encoder)
+        self.exchange = Exchange(config.packet, packet_codec)
         self._config = config
         self._caster = ScanCaster(config.sensor, config.map, num_classes)
         self._increments = clamped_increments(config.sensor)
@@ -211,10 +213,10 @@ class Team(ABC, Generic[RobotT]):
     ``robots`` are in the order of ``config.robots``.
     """
 
-    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+    def __init__(self, config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> None:
         self._config = config
         self._num_classes = num_classes
-        self._encoder = encoder
+        self._packet_codec = packet_codec
         self._past_evidence: list[Evidence] = []
         self.robots = [self._new_robot(index, 0) for index in range(len(config.robots))]
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from octoreplay.config.run import RunConfig
-from octoreplay.replay.exchange.encoder import PacketEncoder
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.robots.consensus import ConsensusTeam
 from octoreplay.replay.robots.flood import FloodTeam
 from octoreplay.replay.robots.ratio import RatioTeam
@@ -27,9 +27,9 @@ TEAMS: Mapping[str, type[Team[Any]]] = MappingProxyType(
 """Team class of every rule in ``config.rules.RULES``."""
 
 
-def make_team(config: RunConfig, num_classes: int, encoder: PacketEncoder) -> Team[Robot]:
+def make_team(config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> Team[Robot]:
     """The robots of a run, without evidence.
 
     Raises ConfigError where the rule cannot hold the log-odds of the sensor model.
     """
-    return TEAMS[config.consensus.rule](config, num_classes, encoder)
+    return TEAMS[config.consensus.rule](config, num_classes, packet_codec)
