@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.mapping.consensus import Evidence, Step, gamma_at, sum_of_evidence, team_step
+from octoreplay.mapping.consensus import Evidence, Step, Update, gamma_at, sum_of_evidence, team_step
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.replay.session import CONVERGED, Session
@@ -21,14 +21,14 @@ from reference.hand_made import team_config
 from reference.scenarios import TeamShape, make_scenario
 
 NUM_CLASSES = 3
-RULES = ("gradient", "natural", "bayes", "local")
+UPDATES = (Update.GRADIENT, Update.NATURAL, Update.BAYES, Update.COPY)
 TOPOLOGIES = ("complete", "ring", "line", "star")
 
 
-def consensus_step(own, neighbours, step_weights, log_likelihood, *, rule, gamma, revision, **others):
+def consensus_step(own, neighbours, step_weights, log_likelihood, *, update, gamma, revision, **others):
     """One robot's iteration."""
     step = Step(own, neighbours, step_weights, log_likelihood, gamma, **others)
-    return team_step([step], rule=rule, revision=revision)[0]
+    return team_step([step], update=update, revision=revision)[0]
 
 
 # --- one iteration ---------------------------------------------------------------------------------------------------
@@ -54,40 +54,40 @@ def _dense(keys, cells):
     return dense
 
 
-def _expected(rule, own, base, neighbours, weights, log_q, last, gamma):
+def _expected(update, own, base, neighbours, weights, log_q, last, gamma):
     """The reference's step; weights are 2 epsilon A_ij, so epsilon is a half."""
     mixed = rules.mix(own, [(w, other - base) for w, other in zip(weights, neighbours, strict=True)], 0.5)
-    if rule == "gradient":
+    if update is Update.GRADIENT:
         return rules.gradient_step(mixed, log_q, gamma)
-    if rule == "natural":
+    if update is Update.NATURAL:
         return rules.natural_step(mixed, log_q, gamma)
-    return rules.bayes_step(mixed, log_q, last) if rule == "bayes" else log_q
+    return rules.bayes_step(mixed, log_q, last) if update is Update.BAYES else log_q
 
 
 @settings(max_examples=50, deadline=None)
 @given(
     seed=st.integers(0, 100_000),
-    rule=st.sampled_from(RULES),
+    update=st.sampled_from(UPDATES),
     gamma=st.sampled_from([0.0, 0.5, 1.0]),
     with_base=st.booleans(),
 )
-def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, rule, gamma, with_base):
+def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, update, gamma, with_base):
     """All cells, the ones that only some of the maps hold included, in bricks of any kind."""
     rng = np.random.default_rng(seed)
     own, base, log_q, last = (_random_cells(rng) for _ in range(4))
     neighbours = [_random_cells(rng) for _ in range(rng.integers(0, 4))]
-    neighbours = [] if rule == "local" else neighbours
+    neighbours = [] if update is Update.COPY else neighbours
     weights = rng.uniform(0.0, 0.5, len(neighbours)).astype(np.float32)
     keys = sorted(set().union(own, base, log_q, last, *neighbours))
     dense_own = _dense(keys, own)
     expected = _expected(
-        rule, dense_own, _dense(keys, base) if with_base else dense_own, [_dense(keys, n) for n in neighbours], weights,
-        _dense(keys, log_q), _dense(keys, last), gamma,
+        update, dense_own, _dense(keys, base) if with_base else dense_own, [_dense(keys, n) for n in neighbours],
+        weights, _dense(keys, log_q), _dense(keys, last), gamma,
     )  # fmt: skip
     octree = _octree(own)
     change = consensus_step(
-        octree, [_octree(n) for n in neighbours], weights.tolist(), _octree(log_q), rule=rule, gamma=gamma, revision=4,
-        base=_octree(base) if with_base else None, last_log_likelihood=_octree(last),
+        octree, [_octree(n) for n in neighbours], weights.tolist(), _octree(log_q), update=update, gamma=gamma,
+        revision=4, base=_octree(base) if with_base else None, last_log_likelihood=_octree(last),
     )  # fmt: skip
     found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
     keys_known = set(keys) if with_base else set().union(own, log_q, last, *neighbours)
@@ -106,11 +106,11 @@ def _octree(cells):
     return octree_of(cells, num_classes=NUM_CLASSES)
 
 
-def _step(own, log_q, rule="gradient", gamma=1.0, neighbours=(), weights=(), num_classes=2, **others):
+def _step(own, log_q, update=Update.GRADIENT, gamma=1.0, neighbours=(), weights=(), num_classes=2, **others):
     octree = octree_of({(0, 0, 0): own}, num_classes=num_classes)
     evidence = octree_of({(0, 0, 0): log_q}, num_classes=num_classes)
     maps = [octree_of({(0, 0, 0): values}, num_classes=num_classes) for values in neighbours]
-    consensus_step(octree, maps, weights, evidence, rule=rule, gamma=gamma, revision=1, **others)
+    consensus_step(octree, maps, weights, evidence, update=update, gamma=gamma, revision=1, **others)
     return np.frombuffer(cells_of(octree)[0, 0, 0], np.float32)
 
 
@@ -120,7 +120,9 @@ def test_the_gradient_by_hand():
 
 
 def test_the_mixture_by_hand():
-    found = _step([1.0, 0.0], [0.0, 0.0], "natural", 0.0, neighbours=[[3.0, -1.0], [0.0, 2.0]], weights=[0.25, 0.5])
+    found = _step(
+        [1.0, 0.0], [0.0, 0.0], Update.NATURAL, 0.0, neighbours=[[3.0, -1.0], [0.0, 2.0]], weights=[0.25, 0.5]
+    )
     np.testing.assert_allclose(found, [1.0 + 0.25 * 2.0 - 0.5, -0.25 + 1.0])
 
 
@@ -130,11 +132,11 @@ def test_log_odds_of_any_magnitude_stay_numbers(magnitude, num_classes):
     rng = np.random.default_rng(0)
     for _ in range(5):
         own, log_q, other = (rng.choice([-1.0, 0.0, 0.5, 1.0], num_classes) * magnitude for _ in range(3))
-        for rule in RULES:
-            found = _step(own, log_q, rule, 0.5, [other], [0.5], num_classes)
+        for update in UPDATES:
+            found = _step(own, log_q, update, 0.5, [other], [0.5], num_classes)
             assert np.isfinite(found).all()
             mixed = np.append(0.0, 0.5 * own + 0.5 * other)[None].astype(np.float32).astype(np.float64)
-            if rule == "gradient":
+            if update is Update.GRADIENT:
                 expected = rules.gradient_step(mixed, np.append(0.0, log_q)[None], 0.5)[0, 1:]
                 np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * max(magnitude, 1e-3))
 
@@ -143,27 +145,30 @@ def test_a_step_without_change_marks_nothing():
     octree = octree_of(cube((0, 0, 0), 3, [1.0, 2.0]))
     before = octree.revisions.copy()
     same = octree.copy()
-    assert consensus_step(octree, [same], [0.5], same, rule="natural", gamma=0.5, revision=9) == 0.0
+    assert consensus_step(octree, [same], [0.5], same, update=Update.NATURAL, gamma=0.5, revision=9) == 0.0
     assert (octree.revisions == before).all()
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES))
-def test_maps_that_agree_do_not_change_by_a_bit(seed, rule):
+@given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES))
+def test_maps_that_agree_do_not_change_by_a_bit(seed, update):
     """With any weights, in bricks of all tiers; log-odds of any size."""
     rng = np.random.default_rng(seed)
     cells = _random_cells(rng, scale=10.0 ** rng.integers(-3, 8))
     weights = rng.uniform(0.0, 0.5, rng.integers(0, 4)).tolist()
     octree, same = _octree(cells), _octree(cells)
-    last = {"last_log_likelihood": same} if rule == "bayes" else {}
-    assert consensus_step(octree, [same] * len(weights), weights, same, rule=rule, gamma=0.5, revision=4, **last) == 0.0
+    last = {"last_log_likelihood": same} if update is Update.BAYES else {}
+    assert (
+        consensus_step(octree, [same] * len(weights), weights, same, update=update, gamma=0.5, revision=4, **last)
+        == 0.0
+    )
     assert cells_of(octree) == cells_of(same)
     assert (octree.revisions < 4).all()
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES))
-def test_skipping_bricks_at_rest_changes_nothing(seed, rule):
+@given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES))
+def test_skipping_bricks_at_rest_changes_nothing(seed, update):
     """Steps that only look at what changed since the step before, beside steps that look at everything."""
     rng = np.random.default_rng(seed)
     common = _random_cells(rng)
@@ -173,7 +178,7 @@ def test_skipping_bricks_at_rest_changes_nothing(seed, rule):
     full = skipping.copy()
     for revision in range(5, 11):
         maps = (log_q, *neighbours)
-        arguments = {"rule": rule, "gamma": 0.5, "revision": revision, "last_log_likelihood": last}
+        arguments = {"update": update, "gamma": 0.5, "revision": revision, "last_log_likelihood": last}
         since = revision - 1 if revision > 5 else None
         changes = [
             consensus_step(full, neighbours, [0.3, 0.4], log_q, **arguments),
@@ -190,7 +195,7 @@ def test_skipping_bricks_at_rest_changes_nothing(seed, rule):
 def test_only_bricks_that_changed_are_looked_at():
     """A map that changes without a revision is not noticed: nothing else says that a brick is awake."""
     own, other = octree_of(cube((0, 0, 0), 4, [1.0, 2.0])), octree_of(cube((0, 0, 0), 4, [3.0, 2.0]))
-    arguments = {"rule": "natural", "gamma": 0.0, "revision": 9}
+    arguments = {"update": Update.NATURAL, "gamma": 0.0, "revision": 9}
     assert consensus_step(own, [other], [0.5], own.copy(), since=7, **arguments) == 0.0
     assert consensus_step(own, [other], [0.5], own.copy(), since=1, **arguments) == 1.0
 
@@ -205,14 +210,14 @@ def test_the_exponential_of_what_is_at_most_zero():
 
 def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():
     octree, other = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({(1, 1, 1): [0.0, 0.0], (40, 0, 0): [0.0, 0.0]})
-    assert consensus_step(octree, [other], [0.0], octree.copy(), rule="natural", gamma=0.5, revision=9) == 0.0
+    assert consensus_step(octree, [other], [0.0], octree.copy(), update=Update.NATURAL, gamma=0.5, revision=9) == 0.0
     assert set(cells_of(octree)) == {(0, 0, 0), (1, 1, 1), (40, 0, 0)}
     assert (octree.revisions == 9).all()
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 100_000), rule=st.sampled_from(RULES), with_threads=st.booleans())
-def test_a_team_steps_as_its_robots_do_one_by_one(seed, rule, with_threads):
+@given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES), with_threads=st.booleans())
+def test_a_team_steps_as_its_robots_do_one_by_one(seed, update, with_threads):
     """Robots with other cells, neighbours, weights and gammas each, all awake or most bricks at rest."""
     rng = np.random.default_rng(seed)
     common = _random_cells(rng)
@@ -232,9 +237,9 @@ def test_a_team_steps_as_its_robots_do_one_by_one(seed, rule, with_threads):
             )
         )  # fmt: skip
     alone = [dataclasses.replace(step, own=step.own.copy()) for step in steps]
-    expected = [team_step([step], rule=rule, revision=7)[0] for step in alone]
+    expected = [team_step([step], update=update, revision=7)[0] for step in alone]
     with ThreadPoolExecutor(3) as threads:
-        found = team_step(steps, rule=rule, revision=7, threads=threads if with_threads else None)
+        found = team_step(steps, update=update, revision=7, threads=threads if with_threads else None)
     assert found == expected
     for step, other in zip(steps, alone, strict=True):
         assert cells_of(step.own) == cells_of(other.own)
@@ -245,15 +250,15 @@ def test_a_team_steps_as_its_robots_do_one_by_one(seed, rule, with_threads):
 def test_neighbours_and_evidence_are_not_changed():
     own, other, log_q, last = (octree_of(cube((i, 0, 0), 9, [i - 1.0, -i])) for i in range(4))
     before = [cells_of(octree) for octree in (other, log_q, last)]
-    for rule in RULES:
-        consensus_step(own, [other], [0.5], log_q, rule=rule, gamma=0.5, revision=1, last_log_likelihood=last)
+    for update in UPDATES:
+        consensus_step(own, [other], [0.5], log_q, update=update, gamma=0.5, revision=1, last_log_likelihood=last)
     assert [cells_of(octree) for octree in (other, log_q, last)] == before
 
 
 def test_uniform_free_space_stays_uniform():
     own, other = (octree_of(cube((0, 0, 0), 16, [value, value])) for value in (-5.0, -3.0))
-    for rule in ("gradient", "natural", "bayes"):
-        consensus_step(own, [other], [0.5], own.copy(), rule=rule, gamma=0.5, revision=1)
+    for update in (Update.GRADIENT, Update.NATURAL, Update.BAYES):
+        consensus_step(own, [other], [0.5], own.copy(), update=update, gamma=0.5, revision=1)
         assert (own.bricks.blocks[: own.num_bricks] == -1).all()
         assert len(own.leaves()) == 1
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -17,13 +18,15 @@ from octoreplay.mapping.kernels.storage import BrickTable
 from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
-_RULES = {
-    "gradient": consensus_kernels.GRADIENT,
-    "natural": consensus_kernels.NATURAL,
-    "bayes": consensus_kernels.BAYES,
-    "merge": consensus_kernels.MERGE,
-    "local": consensus_kernels.LOCAL,
-}
+
+class Update(IntEnum):
+    """Update of a map from the mixed map h~ and the evidence log q; ``team_step`` gives the equations."""
+
+    GRADIENT = consensus_kernels.GRADIENT
+    NATURAL = consensus_kernels.NATURAL
+    BAYES = consensus_kernels.BAYES
+    MERGE = consensus_kernels.MERGE
+    COPY = consensus_kernels.LOCAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class Step:
     is the robot's own published map (default: ``own`` itself), ``log_likelihood`` log q_i, and ``last_log_likelihood``
     the same at the last iteration.
 
-    With ``since``, the revision of an earlier step with the same rule, gamma, weights and neighbours, the bricks at
+    With ``since``, the revision of an earlier step with the same update, gamma, weights and neighbours, the bricks at
     rest are skipped: those that no map has given a revision from ``since`` on. That step changed nothing in them, so
     this one would not either. All maps' revisions must then be right, the decoded ones' included.
     """
@@ -70,7 +73,7 @@ NUM_PARTS = 16
 def team_step(
     steps: Sequence[Step],
     *,
-    rule: str,
+    update: Update,
     revision: int,
     clamp: tuple[float, float] = (-math.inf, math.inf),
     threads: Executor | None = None,
@@ -79,12 +82,12 @@ def team_step(
 
     h~ = h_i + sum_j w_ij (h_j - b_i) over the neighbours. Then
 
-    - ``gradient`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
+    - ``GRADIENT`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
       sigma = softmax(h~);
-    - ``natural``: h_i = h~ + gamma (log q_i - h~);
-    - ``bayes``: h_i = h~ + log q_i - log q_i at the last iteration;
-    - ``merge``: as ``bayes``, then clamped; with an empty ``base`` it adds w_ij h_j, again at every arrival;
-    - ``local``: h_i = log q_i.
+    - ``NATURAL``: h_i = h~ + gamma (log q_i - h~);
+    - ``BAYES``: h_i = h~ + log q_i - log q_i at the last iteration;
+    - ``MERGE``: as ``BAYES``, then clamped; with an empty ``base`` it adds w_ij h_j, again at every arrival;
+    - ``COPY``: h_i = log q_i.
 
     h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same steps done cell by cell, robot
     by robot, and does not depend on ``threads``; no robot's ``own`` may be a neighbour's map of another.
@@ -121,7 +124,7 @@ def team_step(
 
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
-            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, _RULES[rule], num_classes,
+            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, int(update), num_classes,
             np.float32(clamp[0]), np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(), is_awake,
             *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip

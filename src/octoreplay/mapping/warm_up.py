@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from octoreplay.config.sensor import MapConfig, SensorConfig
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.kernels import compiler
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams, leaf_list
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
@@ -49,7 +49,7 @@ def compile_kernels() -> None:
     received, own, evidence = (SemanticOctree(map_config.resolution, 1) for _ in range(3))
     received.find_or_add(cells.codes)
     received.known[:] = 1
-    team_step([Step(own, [received], [0.5], evidence, 0.5)], rule="gradient", revision=0)
+    team_step([Step(own, [received], [0.5], evidence, 0.5)], update=Update.GRADIENT, revision=0)
     add_scan(evidence, cells, clamped_increments(sensor), 0)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from octoreplay.config.packets import PacketConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
@@ -70,7 +70,7 @@ class PublicMap:
         public = self._octree.copy()
         if self._packet.budget is None:
             # What did not change keeps its revision, so that no delta holds it.
-            team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
+            team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
         else:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(public, target, version, max(self._packet.budget // num_shares, least))

@@ -10,13 +10,21 @@ from typing import Self
 import numpy as np
 
 from octoreplay.config.run import RunConfig
-from octoreplay.mapping.consensus import Step, gamma_at, team_step
+from octoreplay.mapping.consensus import Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+
+_UPDATES = {
+    "gradient": Update.GRADIENT,
+    "natural": Update.NATURAL,
+    "bayes": Update.BAYES,
+    "merge": Update.MERGE,
+    "local": Update.COPY,
+}
 
 
 class ConsensusRobot(Robot):
@@ -50,7 +58,7 @@ class ConsensusRobot(Robot):
         alone = [turn for turn in turns if not is_sync and turn.arrived]
         steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, factor, tick), together))
         changes = team_step(
-            steps, rule=config.consensus.rule, revision=tick, clamp=config.sensor.clamp, threads=threads
+            steps, update=_UPDATES[config.consensus.rule], revision=tick, clamp=config.sensor.clamp, threads=threads
         )
         list(threads.map(lambda turn: turn.robot.end_step(tick), together))
         return changes + list(
@@ -90,7 +98,7 @@ class ConsensusRobot(Robot):
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], rule=self._rule, revision=tick, clamp=self._config.sensor.clamp)
+            team_step([step], update=_UPDATES[self._rule], revision=tick, clamp=self._config.sensor.clamp)
             self._finish_step(tick)
         self._update_streams()
         # What one arrival changes another may undo; what counts is the change over the tick.

@@ -9,7 +9,7 @@ from typing import Self
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
@@ -94,7 +94,7 @@ class RatioRobot(Robot):
         else:
             # Most of the mass is under way: what is left shows its rounding. New evidence is added to the last map.
             step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
-            (change,) = team_step([step], rule="bayes", revision=tick)
+            (change,) = team_step([step], update=Update.BAYES, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
         self._update_streams()

@@ -12,7 +12,7 @@ import numpy as np
 
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Evidence, Step, sum_of_evidence, team_step
+from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence, team_step
 from octoreplay.mapping.octree import SemanticOctree, TreeStreams
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
@@ -193,7 +193,7 @@ class Robot(ABC):
 
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """The largest change of a log-odds since ``before``, which is overwritten."""
-        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
+        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
 
     def _update_streams(self) -> None:
         """The map's streams, with its leaves merged."""
