@@ -15,8 +15,9 @@ from octoreplay.mapping import codec
 from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.kernels import packets, storage
-from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, quantised
+from octoreplay.mapping.streams import leaf_list, leaf_values
 from octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
@@ -184,7 +185,7 @@ def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
     octree.find_or_add(np.arange(64))
     masks = np.repeat([0, 0x0001_0507_0203_0004, 0], [22, 21, 21]).astype(np.uint64)[:, None]
     has_block = np.repeat([True, False], [43, 21])
-    octree.raise_bricks(np.arange(64), masks, np.full(64, storage.ALL_CELLS), has_block)
+    octree.expand_bricks(np.arange(64), masks, np.full(64, storage.ALL_CELLS), has_block)
     for array in (octree.bricks.values, octree.bricks.rows):
         array[:] = value
     streams = octree.streams(tolerance=tolerance)

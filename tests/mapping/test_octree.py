@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, leaf_list, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, octree_from_streams
+from octoreplay.mapping.streams import leaf_list
 from octoreplay.records import LeafTable
 from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
@@ -251,8 +252,8 @@ def test_a_block_grows_with_the_cells_that_become_known(needs_block):
     octree = octree_of({(3, 0, 0): [1.0, 2.0], (3, 3, 3): [0.5, 0.5]})
     before = cells_of(octree)
     masks = np.zeros((1, 1), np.uint64)
-    gains = octree.raise_bricks(np.array([0]), masks, np.array([storage.ALL_CELLS]), np.array([needs_block]))
-    assert gains.tolist() == [True]
+    has_new_cells = octree.expand_bricks(np.array([0]), masks, np.array([storage.ALL_CELLS]), np.array([needs_block]))
+    assert has_new_cells.tolist() == [True]
     after = cells_of(octree)
     assert len(after) == storage.BRICK_CELLS
     assert {key: after[key] for key in before} == before

@@ -22,11 +22,11 @@ from octoreplay.mapping.running_sums import (
     WHOLE_WEIGHT,
     add_evidence,
     difference,
-    recovered,
+    receive,
+    receive_team,
+    recover_map,
     share_out,
     share_weight,
-    take_in,
-    team_take_in,
 )
 from octree_factory import cells_of, cube, octree_of
 from reference import ratio
@@ -143,7 +143,7 @@ def test_taking_in_is_that_of_the_twin(seed, num_senders):
         new |= _random_cells(rng)
         arrivals.append((_mass(new), _mass(old) if rng.random() < 0.7 else None))
         terms += [(1, new), (-1, old if arrivals[-1][1] else {})]
-    take_in(mass, arrivals, 7)
+    receive(mass, arrivals, 7)
     _assert_equal(_units(mass), _sum(*terms))
     assert _revised(mass, 7) >= _changed_bricks(masses, _units(mass))
     assert _revised(mass, 7) <= {code for new, _ in arrivals for code in new.codes.tolist()}
@@ -157,15 +157,15 @@ def test_a_team_takes_in_what_its_robots_do_one_by_one(seed, with_threads):
     old = [_mass(_random_cells(rng)) for _ in range(4)]
     new = [octree.copy() for octree in old]
     for octree in new:
-        take_in(octree, [(_mass(_random_cells(rng)), None)], 5)
+        receive(octree, [(_mass(_random_cells(rng)), None)], 5)
     arrivals = [
         [(new[j], old[j] if rng.random() < 0.7 else None) for j in range(4) if rng.random() < 0.6] for _ in range(4)
     ]
     alone = [mass.copy() for mass in masses]
     for mass, heard in zip(alone, arrivals, strict=True):
-        take_in(mass, heard, 7)
+        receive(mass, heard, 7)
     with ThreadPoolExecutor(3) as threads:
-        team_take_in(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
+        receive_team(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
     for mass, other in zip(masses, alone, strict=True):
         assert cells_of(mass) == cells_of(other)
         assert _revised(mass, 7) == _revised(other, 7)
@@ -184,9 +184,9 @@ def test_maps_of_any_number_of_classes(num_classes):
         for values in (new, old)
     ]
     mass, total, octree = (octree_of({}, num_classes=num_classes) for _ in range(3))
-    take_in(mass, [(octrees[0], octrees[1]), (octrees[0], None)], 1)
+    receive(mass, [(octrees[0], octrees[1]), (octrees[0], None)], 1)
     share_out(mass, total, 3, 1)
-    recovered(mass, WHOLE_WEIGHT, octree, 1)
+    recover_map(mass, WHOLE_WEIGHT, octree, 1)
     masses = 2 * new - old
     shares = ratio.share_of(masses, 3)
     for found, expected in ((mass, masses - 3 * shares), (total, shares)):
@@ -197,7 +197,7 @@ def test_maps_of_any_number_of_classes(num_classes):
 
 
 def test_a_team_of_nobody_takes_nothing_in():
-    team_take_in([], 1)
+    receive_team([], 1)
 
 
 @settings(max_examples=40, deadline=None)
@@ -230,7 +230,7 @@ def test_a_difference_added_again_gives_the_sum(seed):
     grown = difference(_mass(new), _mass(old))
     _assert_equal(_units(grown), _sum((1, new), (-1, old)))
     total = _mass(old)
-    take_in(total, [(grown, None)], 2)
+    receive(total, [(grown, None)], 2)
     assert cells_of(total) == cells_of(_mass(new))
 
 
@@ -253,9 +253,9 @@ def test_the_map_is_the_mass_over_the_weight(seed, weight, tolerance):
     before, after = _random_cells(rng), _random_cells(rng)
     after = before | {key: value for key, value in after.items() if rng.random() < 0.7}
     octree = _octree({})
-    recovered(_mass(before), weight, octree, 3, tolerance)
+    recover_map(_mass(before), weight, octree, 3, tolerance)
     old = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
-    change = recovered(_mass(after), weight, octree, 7, tolerance)
+    change = recover_map(_mass(after), weight, octree, 7, tolerance)
     found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
     expected = {key: (value * UNIT / (weight / WHOLE_WEIGHT)).astype(np.float32) for key, value in after.items()}
     assert found.keys() == expected.keys()
@@ -270,27 +270,27 @@ def test_the_map_is_the_mass_over_the_weight(seed, weight, tolerance):
 def test_a_map_of_one_value_is_pruned():
     mass = _mass(cube((0, 0, 0), 8, np.full(NUM_CLASSES, 5 << 17)) | {(1, 1, 1): np.full(NUM_CLASSES, 9 << 17)})
     octree = _octree({})
-    assert recovered(mass, WHOLE_WEIGHT, octree, 1) == 9.0
+    assert recover_map(mass, WHOLE_WEIGHT, octree, 1) == 9.0
     assert len(octree.leaves()) == 7 + 7 + 8
     grown = _mass({(1, 1, 1): np.full(NUM_CLASSES, -4 << 17)})
-    take_in(mass, [(grown, None)], 2)
-    assert recovered(mass, 2 * WHOLE_WEIGHT, octree, 2) == 9.0 - 2.5
+    receive(mass, [(grown, None)], 2)
+    assert recover_map(mass, 2 * WHOLE_WEIGHT, octree, 2) == 9.0 - 2.5
     assert len(octree.leaves()) == 1
     assert (octree.bricks.blocks[: octree.num_bricks] == -1).all()
-    assert recovered(mass, 2 * WHOLE_WEIGHT, octree, 3) == 0.0
+    assert recover_map(mass, 2 * WHOLE_WEIGHT, octree, 3) == 0.0
     assert (octree.revisions == 2).all()
 
 
 def test_a_map_within_the_tolerance_rests():
     cells = cube((0, 0, 0), 3, np.array([1, 2, 3]) << 17)
     octree = _octree({})
-    recovered(_mass(cells), WHOLE_WEIGHT, octree, 1)
+    recover_map(_mass(cells), WHOLE_WEIGHT, octree, 1)
     before = cells_of(octree)
     moved = {key: value + np.array([2, -2, 0]) for key, value in cells.items()}
-    assert recovered(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=2 * UNIT) == 0.0
+    assert recover_map(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=2 * UNIT) == 0.0
     assert cells_of(octree) == before
     assert (octree.revisions == 1).all()
-    assert recovered(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=UNIT) == pytest.approx(2 * UNIT, rel=0.1)
+    assert recover_map(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=UNIT) == pytest.approx(2 * UNIT, rel=0.1)
 
 
 # --- masses as bits of floats -----------------------------------------------------------------------------------------
@@ -315,7 +315,7 @@ def test_a_brick_of_two_denormals_is_not_one_value():
     cells = cube((0, 0, 0), 4, np.full(NUM_CLASSES, 1)) | {(3, 3, 3): np.full(NUM_CLASSES, 2)}
     mass = _mass(cells)
     assert mass.bricks.blocks[0] >= 0
-    storage.collapse(mass.bricks, 0)
+    storage.prune_brick(mass.bricks, 0)
     assert mass.bricks.blocks[0] >= 0
     assert len(mass.leaves()) == 7 + 8
 
@@ -366,15 +366,15 @@ class Robot:
         """A link comes up: what was summed up before is not for this receiver."""
         self.heard[sender], self.twin.heard[sender] = sums[:2], sums[2:]
 
-    def take_in(self, sender, sums):
+    def receive(self, sender, sums):
         old, old_weight = self.heard.get(sender, (None, 0))
-        take_in(self.mass, [(sums[0], old)], 0)
+        receive(self.mass, [(sums[0], old)], 0)
         self.weight += sums[1] - old_weight
         self.heard[sender] = sums[:2]
-        self.twin.take_in(sender, *sums[2:])
+        self.twin.receive(sender, *sums[2:])
 
     def recover(self):
-        recovered(self.mass, self.weight, self.map, 0)
+        recover_map(self.mass, self.weight, self.map, 0)
         return _map(self.map)
 
 
@@ -400,7 +400,7 @@ def _tick(robots, receivers, rng=None, loss=0.0):
     for sender, others in enumerate(receivers):
         for other in others:
             if rng is None or rng.random() >= loss:
-                robots[other].take_in(sender, robots[sender].sums())
+                robots[other].receive(sender, robots[sender].sums())
 
 
 def _ring(size):
@@ -428,7 +428,7 @@ def test_nothing_is_lost_over_links_that_lose_delay_repeat_and_reorder(seed):
         for due, sent, sender, receiver, sums in packets:
             if due == tick and sent > newest.get((sender, receiver), -1):
                 newest[sender, receiver] = sent
-                robots[receiver].take_in(sender, sums)
+                robots[receiver].receive(sender, sums)
         packets = [packet for packet in packets if packet[0] > tick]
         masses, weight = sum(_dense(robot.mass) for robot in robots), sum(robot.weight for robot in robots)
         for sender, robot in enumerate(robots):
@@ -496,14 +496,14 @@ def test_a_day_of_ticks_drifts_by_nothing():
             twin.share_out(1)
         for i in np.flatnonzero(arrives):
             sender = twins[i - 1]
-            twins[i].take_in(i - 1, sender.total, sender.total_weight)
+            twins[i].receive(i - 1, sender.total, sender.total_weight)
         if octrees is None:
             continue
         for mass, total in octrees:
             share_out(mass, total, 1, tick)
         for i in np.flatnonzero(arrives):
             sums = octrees[i - 1][1].copy()
-            take_in(octrees[i][0], [(sums, heard[i])], tick)
+            receive(octrees[i][0], [(sums, heard[i])], tick)
             heard[i] = sums
         if tick in (39, 43_039, 86_399):
             for twin, (mass, total) in zip(twins, octrees, strict=True):

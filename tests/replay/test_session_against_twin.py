@@ -533,8 +533,8 @@ def _half_a_step(monkeypatch):
 def _neighbours_cells_are_not_taken(monkeypatch):
     right = consensus_kernels.join_columns
 
-    def wrong(table, columns, is_awake, known, has_block, layout):
-        right(table, columns, is_awake, known, has_block, layout)
+    def wrong(table, columns, needs_update, known, has_block, layout):
+        right(table, columns, needs_update, known, has_block, layout)
         known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
 
     monkeypatch.setattr(consensus_kernels, "join_columns", wrong)

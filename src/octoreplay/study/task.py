@@ -97,12 +97,10 @@ def _run(task: Task) -> Row:
 
 
 def _compile_first() -> None:
-    """Compile where there are no compiled kernels yet, so that the run's time is the run's."""
-    from octoreplay.mapping.kernels import compiler
-    from octoreplay.mapping.warm_up import compile_kernels
+    """Compile the kernels if needed, so that the run's time does not include compilation."""
+    from octoreplay.mapping.warm_up import compile_if_needed
 
-    if compiler.cache_is_empty():
-        compile_kernels()
+    compile_if_needed()
 
 
 def _loss(counts: FrameCounts) -> str:

@@ -8,10 +8,10 @@ from octoreplay.config.packets import PacketConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, Update, team_step
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
+from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.mapping.streams import TreeStreams, mask_bytes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, Source

@@ -67,7 +67,7 @@ class RatioRobot(Robot):
         """Every robot takes in what the sums that arrived grew by, and its own new evidence."""
         del factor, config
         masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
-        running_sums.team_take_in(masses, tick, threads)
+        running_sums.receive_team(masses, tick, threads)
         return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
 
     def growths(self, arrived: Sequence[Arrival]) -> list[running_sums.Arrival]:
@@ -90,7 +90,7 @@ class RatioRobot(Robot):
             self.mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
         )
         if self._weight >= running_sums.LEAST_WEIGHT:
-            change = running_sums.recovered(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
+            change = running_sums.recover_map(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
         else:
             # Most of the mass is under way: what is left shows its rounding. New evidence is added to the last map.
             step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)

@@ -13,7 +13,7 @@ import numpy as np
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence, team_step
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -21,6 +21,7 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
+from octoreplay.mapping.streams import TreeStreams
 from octoreplay.records import Float64Array, Frame, Int64Array
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
