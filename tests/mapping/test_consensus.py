@@ -1,4 +1,4 @@
-"""One iteration against the reference's rules, and what whole runs must keep and reach."""
+"""One iteration against the reference's rules, and invariants and results of whole runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def consensus_step(own, neighbours, step_weights, log_likelihood, *, update, gam
 
 
 def _random_cells(rng, scale=3.0):
-    """Cubes with one value for all classes, cubes with one per class, and single cells, overlapping now and then."""
+    """Cubes with one value for all classes, cubes with one value for each class, and single cells; some overlap."""
     cells = {}
     for _ in range(rng.integers(0, 4)):
         edge = int(rng.choice([1, 3, 8]))
@@ -46,7 +46,7 @@ def _random_cells(rng, scale=3.0):
 
 
 def _dense(keys, cells):
-    """(M, K) float64 of a map, 0 where it knows nothing, the column of free space included."""
+    """(M, K) float64 of a map including the column of free space; 0 where it is unknown."""
     dense = np.zeros((len(keys), NUM_CLASSES + 1))
     for row, key in enumerate(keys):
         if key in cells:
@@ -71,8 +71,8 @@ def _expected(update, own, base, neighbours, weights, log_q, last, gamma):
     gamma=st.sampled_from([0.0, 0.5, 1.0]),
     with_base=st.booleans(),
 )
-def test_a_step_on_octrees_is_the_step_cell_by_cell(seed, update, gamma, with_base):
-    """All cells, the ones that only some of the maps hold included, in bricks of any kind."""
+def test_step_on_octrees_equals_the_step_cell_by_cell(seed, update, gamma, with_base):
+    """All cells, including those known in some of the maps only, in bricks of any layout."""
     rng = np.random.default_rng(seed)
     own, base, log_q, last = (_random_cells(rng) for _ in range(4))
     neighbours = [_random_cells(rng) for _ in range(rng.integers(0, 4))]
@@ -114,12 +114,12 @@ def _step(own, log_q, update=Update.GRADIENT, gamma=1.0, neighbours=(), weights=
     return np.frombuffer(cells_of(octree)[0, 0, 0], np.float32)
 
 
-def test_the_gradient_by_hand():
+def test_gradient_by_hand():
     """sigma = 1/3 each, D = (0, -3, 0): g_1 = 1/3 (-1 + 3) and g_2 = 1/3 (-1 - 0)."""
     np.testing.assert_allclose(_step([0.0, 0.0], [3.0, 0.0]), [2 / 3, -1 / 3], rtol=1e-6)
 
 
-def test_the_mixture_by_hand():
+def test_mixing_by_hand():
     found = _step(
         [1.0, 0.0], [0.0, 0.0], Update.NATURAL, 0.0, neighbours=[[3.0, -1.0], [0.0, 2.0]], weights=[0.25, 0.5]
     )
@@ -128,7 +128,7 @@ def test_the_mixture_by_hand():
 
 @pytest.mark.parametrize("num_classes", [1, 2, 254])
 @pytest.mark.parametrize("magnitude", [0.0, 1e-38, 1.0, 88.0, 104.0, 1e3, 1e10, 1e18])
-def test_log_odds_of_any_magnitude_stay_numbers(magnitude, num_classes):
+def test_log_odds_of_any_magnitude_stay_finite(magnitude, num_classes):
     rng = np.random.default_rng(0)
     for _ in range(5):
         own, log_q, other = (rng.choice([-1.0, 0.0, 0.5, 1.0], num_classes) * magnitude for _ in range(3))
@@ -141,7 +141,7 @@ def test_log_odds_of_any_magnitude_stay_numbers(magnitude, num_classes):
                 np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * max(magnitude, 1e-3))
 
 
-def test_a_step_without_change_marks_nothing():
+def test_step_without_change_keeps_revisions():
     octree = octree_of(cube((0, 0, 0), 3, [1.0, 2.0]))
     before = octree.revisions.copy()
     same = octree.copy()
@@ -151,8 +151,8 @@ def test_a_step_without_change_marks_nothing():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES))
-def test_maps_that_agree_do_not_change_by_a_bit(seed, update):
-    """With any weights, in bricks of all tiers; log-odds of any size."""
+def test_equal_maps_do_not_change_by_a_bit(seed, update):
+    """With any weights, bricks of any layout and log-odds of any size."""
     rng = np.random.default_rng(seed)
     cells = _random_cells(rng, scale=10.0 ** rng.integers(-3, 8))
     weights = rng.uniform(0.0, 0.5, rng.integers(0, 4)).tolist()
@@ -168,8 +168,8 @@ def test_maps_that_agree_do_not_change_by_a_bit(seed, update):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES))
-def test_skipping_bricks_at_rest_changes_nothing(seed, update):
-    """Steps that only look at what changed since the step before, beside steps that look at everything."""
+def test_skipping_unchanged_bricks_does_not_change_the_result(seed, update):
+    """Steps on the bricks that changed since the last step, against steps on all bricks."""
     rng = np.random.default_rng(seed)
     common = _random_cells(rng)
     skipping, log_q, last, *neighbours = (
@@ -192,15 +192,15 @@ def test_skipping_bricks_at_rest_changes_nothing(seed, update):
             maps[rng.integers(3)].overwrite(source, np.arange(source.num_bricks), revision)
 
 
-def test_only_bricks_that_changed_are_looked_at():
-    """A map that changes without a revision is not noticed: nothing else says that a brick is awake."""
+def test_only_changed_bricks_are_updated():
+    """A change without a revision is not noticed: only revisions mark changed bricks."""
     own, other = octree_of(cube((0, 0, 0), 4, [1.0, 2.0])), octree_of(cube((0, 0, 0), 4, [3.0, 2.0]))
     arguments = {"update": Update.NATURAL, "gamma": 0.0, "revision": 9}
     assert consensus_step(own, [other], [0.5], own.copy(), since=7, **arguments) == 0.0
     assert consensus_step(own, [other], [0.5], own.copy(), since=1, **arguments) == 1.0
 
 
-def test_the_exponential_of_what_is_at_most_zero():
+def test_exp_negative():
     x = np.concatenate([np.linspace(-86.0, 0.0, 100_001), -np.logspace(-40, 1.9, 1000), [-0.0]]).astype(np.float32)
     found = np.array([consensus_kernels.exp_negative(value) for value in x])
     np.testing.assert_allclose(found, np.exp(x.astype(np.float64)), rtol=5e-7)
@@ -208,7 +208,7 @@ def test_the_exponential_of_what_is_at_most_zero():
         assert 0.0 <= consensus_kernels.exp_negative(np.float32(value)) < 1e-37
 
 
-def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():
+def test_cells_of_a_neighbour_become_known_even_with_the_prior_value():
     octree, other = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({(1, 1, 1): [0.0, 0.0], (40, 0, 0): [0.0, 0.0]})
     assert consensus_step(octree, [other], [0.0], octree.copy(), update=Update.NATURAL, gamma=0.5, revision=9) == 0.0
     assert set(cells_of(octree)) == {(0, 0, 0), (1, 1, 1), (40, 0, 0)}
@@ -217,8 +217,8 @@ def test_a_neighbours_cells_are_taken_even_where_they_hold_the_prior():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES), with_threads=st.booleans())
-def test_a_team_steps_as_its_robots_do_one_by_one(seed, update, with_threads):
-    """Robots with other cells, neighbours, weights and gammas each, all awake or most bricks at rest."""
+def test_team_step_equals_steps_robot_by_robot(seed, update, with_threads):
+    """Robots with different cells, neighbours, weights and gammas; all bricks or only changed ones are updated."""
     rng = np.random.default_rng(seed)
     common = _random_cells(rng)
     maps, published, evidence, last = (
@@ -266,13 +266,13 @@ def test_uniform_free_space_stays_uniform():
 @pytest.mark.parametrize(
     ("power", "decay", "expected"), [(0.0, 1.0, 0.8), (1.0, 1.0, 0.8 / 5), (0.5, 2.0, 0.8 / 3**0.5)]
 )
-def test_the_schedule_of_gamma(power, decay, expected):
+def test_gamma_schedule(power, decay, expected):
     consensus = team_config("a", gamma=0.8, gamma_power=power, gamma_decay=decay).consensus
     assert gamma_at(consensus, 4) == pytest.approx(expected)
     assert gamma_at(consensus, 0) == 0.8
 
 
-def test_the_sum_of_evidence():
+def test_sum_of_evidence():
     a, b = cube((0, 0, 0), 2, [1.0, -2.0]), cube((1, 0, 0), 8, [4.0, 4.0])
     counts = {key: [2.0] for key in b}
     codes = np.unique(np.concatenate([octree_of(a).codes, octree_of(b).codes]))
@@ -315,7 +315,7 @@ def _session(shape=SHAPE, **parameters):
 
 @functools.lru_cache(maxsize=1)
 def _every_cell():
-    """Centres (M, 3) of all cells that the team sees."""
+    """Centres (M, 3) of all cells in the team's scans."""
     *_, tick = _session(rule="local", settle=0).ticks()
     keys = np.array(sorted(set().union(*(cells_of(octree) for octree in tick.maps))))
     return (keys + 0.5) * SHAPE.resolution
@@ -328,7 +328,7 @@ def _values(octree):
 
 @pytest.mark.parametrize("topology", TOPOLOGIES)
 @pytest.mark.parametrize("mode", ["sync", "on-arrival"])
-def test_bayes_keeps_the_mean_and_ends_at_the_oracle(mode, topology):
+def test_bayes_conserves_the_mean_and_converges_to_the_oracle(mode, topology):
     session = _session(rule="bayes", mode=mode, topology=topology)
     num_robots = len(_scenario().robot_ids)
     for tick in session.ticks():
@@ -344,7 +344,7 @@ def test_bayes_keeps_the_mean_and_ends_at_the_oracle(mode, topology):
 
 @pytest.mark.parametrize("topology", TOPOLOGIES)
 @pytest.mark.parametrize("rule", ["gradient", "natural", "bayes"])
-def test_settling_ends_the_disagreement(rule, topology):
+def test_settling_removes_the_disagreement(rule, topology):
     session = _session(rule=rule, topology=topology)
     peak = 0.0
     for tick in session.ticks():
@@ -355,8 +355,8 @@ def test_settling_ends_the_disagreement(rule, topology):
     assert min(robot.agreement_occupied for robot in tick.metrics.robots) >= 0.995
 
 
-def test_the_gradients_labels_are_the_oracles():
-    """Cells that the oracle calls free by little are slow: classes that were hit once fade at gamma's pace."""
+def test_labels_of_gradient_are_those_of_the_oracle():
+    """Cells that are barely free in the oracle converge slowly: classes hit once decrease at a rate of gamma."""
     session = _session(dataclasses.replace(SHAPE, num_ticks=120), rule="gradient", settle=100)
     *_, tick = session.ticks()
     assert min(robot.agreement for robot in tick.metrics.robots) >= 0.995
