@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.streams import TreeStreams
 
 
 class Source(NamedTuple):

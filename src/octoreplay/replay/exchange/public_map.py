@@ -8,11 +8,11 @@ from octoreplay.config.packets import PacketConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Step, team_step
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
+from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.mapping.streams import TreeStreams, mask_bytes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
@@ -81,7 +81,7 @@ class PublicMap:
         public = self._octree.copy()
         if self._packet.budget is None:
             # What did not change keeps its revision, so that no delta holds it.
-            team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
+            team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
         else:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(public, target, version, max(self._packet.budget // num_shares, least))

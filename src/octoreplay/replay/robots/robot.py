@@ -12,8 +12,8 @@ import numpy as np
 
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Evidence, Step, sum_of_evidence, team_step
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence, team_step
+from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -21,6 +21,7 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
+from octoreplay.mapping.streams import TreeStreams
 from octoreplay.records import Float64Array, Frame, Int64Array
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
@@ -200,7 +201,7 @@ class Robot(ABC):
 
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """The largest change of a log-odds since ``before``, which is overwritten."""
-        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
+        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
 
     def _update_streams(self) -> None:
         """The map's streams, with its leaves merged."""
