@@ -240,7 +240,7 @@ class Session:
         """A robot's frame with the boxes of the other robots in it."""
         if self._bodies is None:
             return frame
-        return dataclasses.replace(frame, boxes=(*frame.boxes, *self._bodies.seen_by(index, frame.stamp_ns)))
+        return self._bodies.add_to(index, frame)
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Every active robot that is due hands its packets to its links."""
@@ -404,7 +404,6 @@ def replay_team(
     """
     started = time.monotonic()
     config = resolve(config)
-    assert config.classes is not None
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
         reach = sensor_reach(config.sensor, config.map)
@@ -419,7 +418,7 @@ def replay_team(
         threads = stack.enter_context(ThreadPoolExecutor(session.num_threads))
         writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
         recorder = Recorder(config, writer, threads)
-        total_ns = _total_ns(logs, config.time)
+        total_ns = config.total_ns
         _check_num_ticks(config, total_ns)
         with deferred_interrupts() as deliver_interrupts:
             try:
@@ -439,16 +438,6 @@ def replay_team(
             if writer is not None:
                 writer.complete(summary)
         return summary
-
-
-def _total_ns(logs: Sequence[RobotLog], time: TimeConfig) -> int | None:
-    """Length of the part of the logs that is replayed, where they say it."""
-    starts = [log.start_ns for log in logs if log.start_ns is not None]
-    ends = [log.end_ns for log in logs if log.end_ns is not None]
-    if not starts or not ends:
-        return None
-    whole = max(ends) - min(starts) - round(time.start * 1e9)
-    return max(whole, 0) if time.duration is None else max(min(whole, round(time.duration * 1e9)), 0)
 
 
 def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
@@ -512,7 +501,7 @@ def _warnings(logs: Sequence[RobotLog], recorder: Recorder) -> tuple[str, ...]:
             other = sensors.setdefault(source, log.robot_id)
             if other != log.robot_id:
                 sentences.append(f"{other} and {log.robot_id} map the same messages of {source[0]}, which count twice")
-    spans = [(log.start_ns, log.end_ns, log.robot_id) for log in logs]
+    spans = [(log.robot.start_ns, log.robot.end_ns, log.robot_id) for log in logs]
     for start, _, robot_id in spans:
         others = [(a, b) for a, b, other in spans if other != robot_id]
         if start is not None and others and all(b is not None and b < start for _, b in others):

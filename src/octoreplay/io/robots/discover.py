@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from octoreplay.config.class_tables.edits import edited
+from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, suggestion
 from octoreplay.io.containers.log_reader import TopicInfo, first_whole_message
-from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import ENCODINGS, DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Kind, LabelNames, Transforms, kind_of
 from octoreplay.io.robots.pose_source import (
@@ -28,7 +29,7 @@ from octoreplay.io.robots.pose_source import (
 )
 from octoreplay.io.robots.poses import FrameTree, frame_name
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.robots.survey import CLOUDS, IMAGES, Look, Survey, survey_log
+from octoreplay.io.robots.survey import CLOUDS, IMAGES, LogSurveys, Look, Survey
 from octoreplay.io.sensors.labels import OCCUPIED, class_table_from_names
 from octoreplay.records import ClassTable
 
@@ -119,48 +120,45 @@ class _Group:
 # --- public ----------------------------------------------------------------------------------------------------------
 
 
-def discover(logs: Sequence[Path]) -> tuple[RobotConfig, ...]:
+def discover(logs: Sequence[Path], surveys: LogSurveys | None = None) -> tuple[ResolvedRobot, ...]:
     """The robots in some logs, with their topics and frames, in the order of the logs.
 
     A log holds one robot, named by its file; or several, named by the first part of their topics, where at least two
     such namespaces hold a sensor and a pose each. Raises ConfigError where several topics could be meant (its text
-    lists them as lines of a team file), InputError where a log has no depth image, point cloud or pose.
+    lists them as lines of a team file), InputError where a log has no depth image, point cloud or pose. ``surveys``
+    holds the logs that are surveyed already.
     """
-    with ExitStack() as stack:
-        surveys = [survey_log(stack.enter_context(open_log(path))) for path in logs]
-        return tuple(_find(_blank(group), group) for group in _groups(surveys))
+    with _shared(surveys) as known:
+        return tuple(_resolved(_blank(group), group) for group in _groups([known.of(path) for path in logs]))
 
 
-def resolve(config: RunConfig) -> RunConfig:
+def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun:
     """The configuration with every topic and frame that a robot leaves out, and the class table, filled from the logs.
 
     The class table is the configured one; else that of the logs' LabelInfo, united by name over the robots, merged and
     ignored as configured; else, where no robot has labels, the single class 'occupied'. Raises InputError where a named
     topic is missing or of another type, ConfigError as ``discover`` does, and where there are labels without a class
-    table or for some robots only.
+    table or for some robots only. A configuration that is resolved already is returned as it is. ``surveys`` holds the
+    logs that are surveyed already.
     """
-    with ExitStack() as stack:
-        paths = dict.fromkeys(itertools.chain(*(robot.logs for robot in config.robots)))
-        surveys = {path: survey_log(stack.enter_context(open_log(path))) for path in paths}
-        groups = [_group_of(robot, tuple(surveys[path] for path in robot.logs)) for robot in config.robots]
-        robots = [_find(robot, group) for robot, group in zip(config.robots, groups, strict=True)]
+    if isinstance(config, ResolvedRun):
+        return config
+    with _shared(surveys) as known:
+        groups = [_group_of(robot, tuple(known.of(path) for path in robot.logs)) for robot in config.robots]
+        robots = [_resolved(robot, group) for robot, group in zip(config.robots, groups, strict=True)]
         labelled = [_has_labels(robot, group) for robot, group in zip(robots, groups, strict=True)]
         classes = config.classes
         if classes is None:
             classes = edited(_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
     _check_labelled(classes, robots, labelled)
-    return dataclasses.replace(config, robots=tuple(robots), classes=classes, merge_classes=(), ignore_hits=())
+    return ResolvedRun.from_config(config, robots, classes)
 
 
 def describe(logs: Sequence[Path]) -> LogDescription:
     """What is in some logs, and what they lack for a run; a log that cannot be opened says why in its summary."""
-    with ExitStack() as stack:
+    with LogSurveys() as known:
         errors: dict[Path, list[str]] = {path: [] for path in logs}
-
-        def look(path: Path) -> Survey:
-            return survey_log(stack.enter_context(open_log(path)))
-
-        found = {path: _attempt(functools.partial(look, path), errors[path]) for path in logs}
+        found = {path: _attempt(functools.partial(known.of, path), errors[path]) for path in logs}
         surveys = [survey for survey in found.values() if survey is not None]
         missing: list[str] = []
         groups = (_attempt(lambda: _groups(surveys), missing) or []) if surveys else []
@@ -186,6 +184,11 @@ def describe(logs: Sequence[Path]) -> LogDescription:
     )
 
 
+def _shared(surveys: LogSurveys | None) -> AbstractContextManager[LogSurveys]:
+    """The given surveys, which stay open, or new ones."""
+    return LogSurveys() if surveys is None else contextlib.nullcontext(surveys)
+
+
 # --- what is there ---------------------------------------------------------------------------------------------------
 
 
@@ -206,10 +209,16 @@ def _robot_summary(group: _Group) -> RobotSummary:
     missing: list[str] = []
     robot = _find(_blank(group), group, missing)
     if not missing:
-        _attempt(lambda: RobotLog(robot, TimeConfig(), None, logs=[survey.log for survey in group.surveys]), missing)
-    starts = [s.start_ns for s in group.surveys if s.start_ns is not None]
-    ends = [s.end_ns for s in group.surveys if s.end_ns is not None]
-    return RobotSummary(robot, min(starts, default=None), max(ends, default=None), tuple(missing))
+        _attempt(functools.partial(_check_readable, robot, group), missing)
+    start_ns, end_ns = _log_span(group) or (None, None)
+    return RobotSummary(robot, start_ns, end_ns, tuple(missing))
+
+
+def _check_readable(robot: RobotConfig, group: _Group) -> None:
+    """Raise InputError where the robot's log has no usable intrinsics, frames or poses."""
+    RobotLog(
+        ResolvedRobot.from_config(robot, _log_span(group)), TimeConfig(), None, logs=[s.log for s in group.surveys]
+    )
 
 
 def _attempt(step: Callable[[], T], problems: list[str] | None) -> T | None:
@@ -291,6 +300,18 @@ def _find(robot: RobotConfig, group: _Group, problems: list[str] | None = None) 
     if found.pose_topic is not None and (found.depth_topic or found.cloud_topic) is not None:
         found = _fill(found, _attempt(lambda: _find_frames(found, group), problems))
     return found
+
+
+def _resolved(robot: RobotConfig, group: _Group) -> ResolvedRobot:
+    """The robot with its missing topics and frames filled and its logs' span."""
+    return ResolvedRobot.from_config(_find(robot, group), _log_span(group))
+
+
+def _log_span(group: _Group) -> tuple[int, int] | None:
+    """Log times of the first and the last message in a robot's logs; None where they hold no messages."""
+    starts = [survey.start_ns for survey in group.surveys if survey.start_ns is not None]
+    ends = [survey.end_ns for survey in group.surveys if survey.end_ns is not None]
+    return (min(starts), max(ends)) if starts and ends else None
 
 
 def _fill(robot: RobotConfig, found: Mapping[str, str | None] | None) -> RobotConfig:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, TopicInfo, first_whole_message
+from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import ENCODINGS
 from octoreplay.io.messages.sensor_messages import (
     Cloud,
@@ -96,7 +100,7 @@ class Look:
         return max(name.rfind(hint) + len(hint) if hint in name else -1 for hint in hints)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Survey:
     """One open log's topics, and what its sensor topics look like by name.
 
@@ -122,6 +126,28 @@ class Survey:
         """The robots that share the log, in the order of their sensors' topics; empty where it holds one."""
         sensors = (topic for topic, look in self.looks.items() if look.is_sensor)
         return tuple(dict.fromkeys(self.owners[topic] for topic in sensors if topic in self.owners))
+
+
+class LogSurveys:
+    """Surveys of logs, each of which is opened and surveyed once; a context manager that closes the logs."""
+
+    def __init__(self) -> None:
+        self._surveys: dict[Path, Survey] = {}
+        self._closing = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.close()
+
+    def of(self, path: Path) -> Survey:
+        """Return the survey of a log, opened at the first call. Raises InputError where it cannot be opened."""
+        if path not in self._surveys:
+            self._surveys[path] = survey_log(self._closing.enter_context(open_log(path)))
+        return self._surveys[path]
 
 
 def survey_log(log: LogReader) -> Survey:
