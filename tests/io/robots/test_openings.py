@@ -13,7 +13,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.io.containers import logs
 from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.survey import LogSurveys
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.study.teams import is_replayed, replayed_team
 
 PAIR = Path(__file__).parents[2] / "fixtures" / "pair"

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log_factory import SECOND, robot_entries, write_mcap
 from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.records import BodyBox, CloudFrame
+from support.log_factory import SECOND, robot_entries, write_mcap
 
 START = 100 * SECOND
 BOX = (-0.5, -0.4, 0.0, 0.5, 0.4, 0.6)

@@ -8,15 +8,15 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from octoreplay.config import ConfigError
 from octoreplay.config.packets import PacketConfig
+from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknowledgement
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
-from octree_factory import octree_of
+from support.octree_factory import octree_of
 
 NUM_BRICKS = 6
 
