@@ -71,7 +71,7 @@ def replay_team(
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
         threads = stack.enter_context(ThreadPoolExecutor(num_threads))
         session = Session(config, sources, threads, bodies=bodies)
-        writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
+        writer = stack.enter_context(ResultWriter(output, config)) if output else None
         recorder = Recorder(config, writer, threads)
         total_ns = config.total_ns
         _check_num_ticks(config, total_ns)
