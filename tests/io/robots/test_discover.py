@@ -15,7 +15,8 @@ from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError, OctoreplayError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
-from octoreplay.io.robots.discover import LogDescription, describe, discover, resolve
+from octoreplay.io.robots.describe import LogDescription, describe
+from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from support.log_factory import (
     FOXGLOVE_ENCODINGS,
