@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import TypeVar
 
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
-from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.records import Frame, RobotPose
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
@@ -35,8 +34,8 @@ class Session:
 
     Parameters
     ----------
-    config : RunConfig
-        Resolved configuration with a class table.
+    config : ResolvedRun
+        Resolved configuration.
     sources : sequence of FrameSource
         Frames of each robot, in the order of ``config.robots``.
     threads : Executor
@@ -63,14 +62,12 @@ class Session:
 
     def __init__(
         self,
-        config: RunConfig,
+        config: ResolvedRun,
         sources: Sequence[FrameSource],
         threads: Executor,
         *,
         bodies: Bodies | None = None,
     ) -> None:
-        if config.classes is None:
-            raise InputError("a session needs a class table")
         self.config = config
         self.stop_reason = ""
         self.is_symmetric = True
@@ -160,7 +157,7 @@ class Session:
         """A robot's frame with the boxes of the other robots."""
         if self._bodies is None:
             return frame
-        return dataclasses.replace(frame, boxes=(*frame.boxes, *self._bodies.seen_by(index, frame.stamp_ns)))
+        return self._bodies.add_to(index, frame)
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Publication of each robot that is active and due in this tick; its packets are handed to the links."""
