@@ -118,6 +118,9 @@ def _take_info(index: Index, head: RecordHead, data: bytes, end: int) -> bool:
     for channel_id, count in counts.items():
         index.tally.add(channel_id, start_ns, count, end_ns)
     if counts:
-        block = Block(position, end - position, start_ns, frozenset(counts), num_messages=sum(counts.values()))
-        index.blocks.append(block)
+        num_messages = sum(counts.values())
+        last_ns = end_ns if end_ns >= start_ns else None
+        index.blocks.append(
+            Block(position, end - position, start_ns, last_ns, frozenset(counts), num_messages=num_messages)
+        )
     return True

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import heapq
 import io
+import math
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TypeAlias
@@ -29,9 +30,18 @@ class Block:
     offset: int
     length: int
     start_ns: int
+    end_ns: int | None
     channel_ids: frozenset[int] | None
     form: str = ""
     num_messages: int | None = None
+
+    def can_hold(self, channel_ids: Set[int], start_ns: float, stop_ns: float) -> bool:
+        """True where the block may hold messages of some channels with ``start_ns <= log time < stop_ns``."""
+        return (
+            self.start_ns < stop_ns
+            and (self.end_ns is None or self.end_ns >= start_ns)
+            and (self.channel_ids is None or not channel_ids.isdisjoint(self.channel_ids))
+        )
 
 
 class Tally:
@@ -77,6 +87,7 @@ class BlockBuilder:
     def __init__(self, tally: Tally) -> None:
         self._tally = tally
         self._start_ns: int | None = None
+        self._end_ns: int | None = None
         self._channel_ids: set[int] = set()
         self.num_messages = 0
 
@@ -84,6 +95,7 @@ class BlockBuilder:
         """Take one message."""
         self._tally.add(channel_id, log_time_ns)
         self._start_ns = log_time_ns if self._start_ns is None else min(self._start_ns, log_time_ns)
+        self._end_ns = log_time_ns if self._end_ns is None else max(self._end_ns, log_time_ns)
         self._channel_ids.add(channel_id)
         self.num_messages += 1
 
@@ -91,7 +103,8 @@ class BlockBuilder:
         """The block; none where it holds no message."""
         if self._start_ns is None:
             return []
-        return [Block(offset, length, self._start_ns, frozenset(self._channel_ids), form, self.num_messages)]
+        channel_ids = frozenset(self._channel_ids)
+        return [Block(offset, length, self._start_ns, self._end_ns, channel_ids, form, self.num_messages)]
 
 
 @dataclass
@@ -153,20 +166,26 @@ class BlockLog(LogReader):
         """Close the file; a second call does nothing."""
         self._file.close()
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the file.
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the file.
 
-        Only blocks that hold such messages are read. A damaged block is left out and noted in ``damage``.
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. Only blocks that
+        can hold such messages are read. A damaged one of these is left out and noted in ``damage``.
         """
         wanted = {i: channel for i, channel in self._index.channels.items() if channel.topic in topics}
-        blocks = [b for b in self._index.blocks if b.channel_ids is None or not wanted.keys().isdisjoint(b.channel_ids)]
+        first = -math.inf if start_ns is None else start_ns
+        stop = math.inf if stop_ns is None else stop_ns
+        blocks = [block for block in self._index.blocks if block.can_hold(wanted.keys(), first, stop)]
         blocks.sort(key=lambda block: (block.start_ns, block.offset))
         pending: list[Entry] = []
         for block in blocks:
             while pending and pending[0][:2] < (block.start_ns, block.offset):
                 yield self._message(heapq.heappop(pending))
             for entry in self._read_block(block, wanted):
-                heapq.heappush(pending, entry)
+                if first <= entry[0] < stop:
+                    heapq.heappush(pending, entry)
         while pending:
             yield self._message(heapq.heappop(pending))
 

@@ -98,15 +98,27 @@ class Db3Log(LogReader):
         if self._rows is not None:
             self._rows.close()
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the file."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the file.
+
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. The database
+        finds them by its index of times.
+        """
+        first_ns, end_ns = self._span
+        if (start_ns is not None and start_ns > end_ns) or (stop_ns is not None and stop_ns <= first_ns):
+            return
         if not any(c.topic in topics and c.msgcount for c in self._connections):
             return
+        # A bound outside the log is left out: SQLite takes no integers of more than 64 bits.
+        start_ns = None if start_ns is None or start_ns <= first_ns else start_ns
+        stop_ns = None if stop_ns is None or stop_ns > end_ns else stop_ns
         # How many messages of which topic were given at the last log time, for going on by another way.
-        last_ns, given = -(1 << 63), dict[str, int]()
+        last_ns, given = start_ns, dict[str, int]()
         with self._reader_of_this_thread() as reader:
             wanted = [c for c in reader.connections if c.topic in topics and c.msgcount]
-            iterator = reader.messages(connections=wanted)
+            iterator = reader.messages(wanted, start_ns, stop_ns)
             while True:
                 try:
                     connection, log_time_ns, data = next(iterator)
@@ -122,7 +134,7 @@ class Db3Log(LogReader):
                     given.clear()
                 given[connection.topic] = given.get(connection.topic, 0) + 1
                 yield RawMessage(self.path, self._channels[connection.id], log_time_ns, data)
-        yield from self._rest(topics, last_ns, given)
+        yield from self._rest(topics, last_ns, stop_ns, given)
 
     @contextmanager
     def _reader_of_this_thread(self) -> Iterator[Any]:
@@ -139,7 +151,9 @@ class Db3Log(LogReader):
             with suppress(sqlite3.ProgrammingError):
                 reader.close()
 
-    def _rest(self, topics: Collection[str], last_ns: int, given: dict[str, int]) -> Iterator[RawMessage]:
+    def _rest(
+        self, topics: Collection[str], last_ns: int | None, stop_ns: int | None, given: dict[str, int]
+    ) -> Iterator[RawMessage]:
         """The messages from a log time on, without those of that very time that were given already."""
         if self._rows is None:
             try:
@@ -148,9 +162,7 @@ class Db3Log(LogReader):
                 self._damage.note("cut or damaged beyond repair")
                 return
             self._rows.path = self.path
-        for message in self._rows.messages(topics):
-            if message.log_time_ns < last_ns:
-                continue
+        for message in self._rows.messages(topics, last_ns, stop_ns):
             if message.log_time_ns == last_ns and given.get(message.topic):
                 given[message.topic] -= 1
                 continue

@@ -126,10 +126,16 @@ class FolderLog(LogReader):
         if self._scratch is not None:
             self._scratch.cleanup()
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the files."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the files.
+
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. Files without
+        messages in this range are not read.
+        """
         bad: Counter[str] = Counter()
-        for message in self._merged(topics):
+        for message in self._merged(topics, start_ns, stop_ns):
             if not self._compressed_messages:
                 yield message
                 continue
@@ -140,7 +146,7 @@ class FolderLog(LogReader):
             else:
                 yield RawMessage(message.log, message.channel, message.log_time_ns, bytearray(data))
 
-    def _merged(self, topics: Collection[str]) -> Iterator[RawMessage]:
+    def _merged(self, topics: Collection[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
         """The messages of all files; a file is read from when its first message is due, so that few are at a time."""
         waiting = sorted(
             ((log.start_ns, i) for i, log in enumerate(self._logs) if log.start_ns is not None), reverse=True
@@ -149,7 +155,7 @@ class FolderLog(LogReader):
         while waiting or heads:
             while waiting and (not heads or waiting[-1][0] <= heads[0][0]):
                 _, index = waiting.pop()
-                _push(heads, index, self._logs[index].messages(topics))
+                _push(heads, index, self._logs[index].messages(topics, start_ns, stop_ns))
             if len(heads) == 1 and not waiting:
                 _, _, message, iterator = heads[0]
                 yield message

@@ -174,8 +174,14 @@ class LogReader(ABC):
         """Messages of all topics."""
 
     @abstractmethod
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the file."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the file.
+
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. Parts of the log
+        that the index places outside this range are not read, and ``damage`` does not cover them.
+        """
 
     @abstractmethod
     def close(self) -> None:

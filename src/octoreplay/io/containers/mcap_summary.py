@@ -132,6 +132,10 @@ def _index(statistics: Statistics, chunks: list[ChunkIndex], definitions: Defini
     for chunk in chunks:
         # Without message offsets a chunk may hold any channel.
         channel_ids = frozenset(chunk.message_index_offsets) or None
-        start = chunk.chunk_start_offset + head
-        index.blocks.append(Block(start, chunk.chunk_length - head, chunk.message_start_time, channel_ids, CHUNK))
+        start, start_ns, end_ns = chunk.chunk_start_offset + head, chunk.message_start_time, chunk.message_end_time
+        # Not every recorder fills in the times of a chunk.
+        is_timed = end_ns >= max(start_ns, statistics.message_start_time)
+        index.blocks.append(
+            Block(start, chunk.chunk_length - head, start_ns, end_ns if is_timed else None, channel_ids, CHUNK)
+        )
     return index
