@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
@@ -11,6 +11,7 @@ import numpy as np
 
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
+from octoreplay.io.containers.log_reader import RawMessage
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import BodyBox, Float64Array
 from octoreplay.transforms import inverse
@@ -25,7 +26,8 @@ class BodyTrack:
     def __init__(self, robot: RobotConfig, time: TimeConfig) -> None:
         self._log = RobotLog(robot, time, None)
         self._poses = self._log.pose_source()
-        self._messages = self._log.pose_messages(self._poses)
+        self._messages: Iterator[RawMessage] | None = None
+        self._pose_gap_ns = round(time.pose_gap * 1e9)
         self._offset_ns = round(robot.clock_offset * 1e9)
         self._corners = np.array(robot.body_box, np.float64).reshape(2, 3)
 
@@ -41,6 +43,8 @@ class BodyTrack:
         """Make the poses from a stamp to another known, as far as the log has them, and drop the ones before."""
         start_ns, end_ns = start_ns - self._offset_ns, end_ns - self._offset_ns
         self._poses.forget_before(start_ns)
+        if self._messages is None:
+            self._messages = self._log.pose_messages(self._poses, start_ns - self._pose_gap_ns)
         while not self._poses.is_known(end_ns):
             message = next(self._messages, None)
             if message is None:
