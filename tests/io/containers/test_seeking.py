@@ -302,8 +302,9 @@ def test_a_database_is_asked_for_the_range(tmp_path, monkeypatch):
     with open_log(path) as log:
         assert isinstance(log, Db3Log)
         asked = []
-        original = log._reader.messages
-        monkeypatch.setattr(log._reader, "messages", lambda *args: asked.append(args[1:]) or original(*args))
+        (reader,) = log._readers.values()
+        original = reader.messages
+        monkeypatch.setattr(reader, "messages", lambda *args: asked.append(args[1:]) or original(*args))
         for start, stop in ((10, 20), (None, 20), (10, None), (-(10**30), 10**30), (10**30, None), (None, -(10**30))):
             messages_of(log, TOPICS, start, stop)
         assert asked == [(10, 20), (None, 20), (10, None), (None, None)]

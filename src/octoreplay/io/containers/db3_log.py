@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +43,15 @@ class Db3Log(LogReader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._file = path
-        self._reader: Any = None
-        self._thread = threading.get_ident()
+        # SQLite's connections belong to the thread that opens them, so each thread has a reader of its own.
+        self._readers: dict[int, Any] = {}
         self._rows: DamagedDb3Log | None = None
         try:
-            self._reader = Reader(path)
-            self._reader.open()
-            self._connections: list[Connection] = list(self._reader.connections)
+            reader = self._reader_of_this_thread()
+            self._connections: list[Connection] = list(reader.connections)
             self._channels = {c.id: _channel(c) for c in self._connections}
             self._is_used = any(c.msgcount for c in self._connections)
-            self._span = int(self._reader.start_time), int(self._reader.end_time) - 1
+            self._span = int(reader.start_time), int(reader.end_time) - 1
         except Exception as error:
             # On a damaged database rosbags lets whatever its parsers raise through, bare AssertionErrors included.
             self.close()
@@ -92,9 +91,11 @@ class Db3Log(LogReader):
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
-        reader, self._reader = self._reader, None
-        if reader is not None and reader.is_open:
-            reader.close()
+        while self._readers:
+            _, reader = self._readers.popitem()
+            # Where the readers' connections are bound to threads, those of ended threads close with them.
+            with suppress(sqlite3.ProgrammingError):
+                reader.close()
         if self._rows is not None:
             self._rows.close()
 
@@ -116,40 +117,34 @@ class Db3Log(LogReader):
         stop_ns = None if stop_ns is None or stop_ns > end_ns else stop_ns
         # How many messages of which topic were given at the last log time, for going on by another way.
         last_ns, given = start_ns, dict[str, int]()
-        with self._reader_of_this_thread() as reader:
-            wanted = [c for c in reader.connections if c.topic in topics and c.msgcount]
-            iterator = reader.messages(wanted, start_ns, stop_ns)
-            while True:
-                try:
-                    connection, log_time_ns, data = next(iterator)
-                except StopIteration:
-                    return
-                except Exception:
-                    # As at opening, a damaged page can raise anything.
-                    break
-                if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
-                    break
-                if log_time_ns != last_ns:
-                    last_ns = log_time_ns
-                    given.clear()
-                given[connection.topic] = given.get(connection.topic, 0) + 1
-                yield RawMessage(self.path, self._channels[connection.id], log_time_ns, data)
+        reader = self._reader_of_this_thread()
+        wanted = [c for c in reader.connections if c.topic in topics and c.msgcount]
+        iterator = reader.messages(wanted, start_ns, stop_ns)
+        while True:
+            try:
+                connection, log_time_ns, data = next(iterator)
+            except StopIteration:
+                return
+            except Exception:
+                # As at opening, a damaged page can raise anything.
+                break
+            if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
+                break
+            if log_time_ns != last_ns:
+                last_ns = log_time_ns
+                given.clear()
+            given[connection.topic] = given.get(connection.topic, 0) + 1
+            yield RawMessage(self.path, self._channels[connection.id], log_time_ns, data)
         yield from self._rest(topics, last_ns, stop_ns, given)
 
-    @contextmanager
-    def _reader_of_this_thread(self) -> Iterator[Any]:
-        """Rosbags' reader, another one in another thread: SQLite's connections belong to the thread that opens them."""
-        if threading.get_ident() == self._thread:
-            yield self._reader
-            return
-        reader = Reader(self._file)
-        reader.open()
-        try:
-            yield reader
-        finally:
-            # Left by a generator that nobody reads on, perhaps in yet another thread.
-            with suppress(sqlite3.ProgrammingError):
-                reader.close()
+    def _reader_of_this_thread(self) -> Any:
+        """The open rosbags reader of this thread."""
+        thread = threading.get_ident()
+        if thread not in self._readers:
+            reader = Reader(self._file)
+            reader.open()
+            self._readers[thread] = reader
+        return self._readers[thread]
 
     def _rest(
         self, topics: Collection[str], last_ns: int | None, stop_ns: int | None, given: dict[str, int]

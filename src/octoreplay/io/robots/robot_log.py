@@ -129,13 +129,13 @@ class RobotLog:
     ) -> Iterator[Frame]:
         """The robot's frames in order of stamp, decoded as they are taken; ``counts`` says what became of the rest.
 
-        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. With ``start``
-        the logs are read from some seconds before it on; late, duplicate, undecodable and damaged messages before that
-        are not counted. All is read where the delays of the messages show that the sensor's clock and the log's run
-        apart, or where transforms hold from one message on. Reading ends
-        when ``is_wanted`` says no, which it is asked for every message. Every call starts from the beginning, with
-        fresh counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for
-        images whose sizes differ, and for frames that TF never joins.
+        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. With a
+        ``start``, reading begins some seconds before it, and late, duplicate, undecodable and damaged messages before
+        that are not counted. The logs are read from their beginning where the delay between stamps and log times
+        changes by more than 10 s, or where Foxglove's transforms, which hold from their first message on, are needed.
+        Reading ends when ``is_wanted`` returns False, which is checked for every message. Every call starts with fresh
+        counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for images
+        whose sizes differ, and for frames that TF never joins.
         """
         self.counts = FrameCounts(truncated_files=self._damage())
         if self._labels is not None:
