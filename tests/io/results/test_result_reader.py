@@ -11,6 +11,23 @@ from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
 from result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
 
+
+class CountedFile:
+    """A file that counts the bytes read."""
+
+    def __init__(self, file) -> None:
+        self._file = file
+        self.num_bytes = 0
+
+    def read(self, *size: int) -> bytes:
+        data = self._file.read(*size)
+        self.num_bytes += len(data)
+        return data
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
+
+
 METRICS = [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
 
 
@@ -59,6 +76,40 @@ def test_states_lead_from_the_last_key_frame(tmp_path: Path) -> None:
         assert reader.state_times("alpha") == [(tick, START + tick * SECOND) for tick in (1, 2, 3, 4, 6)]
         with pytest.raises(InputError, match="no map of robot 'alpha' is stored up to the time asked for"):
             reader.states("alpha", START)
+
+
+def test_one_tick_or_time_is_read_without_the_rest(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def fill(writer: ResultWriter) -> None:
+        # Random bytes that cannot be compressed: each chunk holds a few states. Every tenth is a key frame.
+        for tick in range(1, 101):
+            data = rng.bytes(300_000)
+            writer.write_state(state("alpha", tick, tick, data, key=tick % 10 == 1))
+
+    path = write_result(tmp_path, fill)
+    for tick, num_chunks in ((5, 8), (50, 14), (100, 14)):
+        with ResultReader(path) as reader:
+            stamp = reader.state_stamp("alpha", tick)
+            assert stamp == START + tick * SECOND
+            assert [entry.tick for entry in reader.states("alpha", stamp)] == list(
+                range((tick - 1) // 10 * 10 + 1, tick + 1)
+            )
+        with ResultReader(path) as reader:
+            reader._reader._stream = counted = CountedFile(reader._reader._stream)
+            reader.states("alpha", reader.state_stamp("alpha", tick))
+            assert counted.num_bytes < num_chunks * 1_500_000 < path.stat().st_size
+
+
+def test_stamps_of_ticks_that_are_not_evenly_spaced(tmp_path: Path) -> None:
+    states = [state("alpha", 0, 1, b"a", key=True), state("alpha", 1, 3, b"b"), state("alpha", 2, 7, b"c")]
+    moved = [dataclasses.replace(s, stamp_ns=s.stamp_ns + i * SECOND // 3) for i, s in enumerate(states)]
+    with ResultReader(write_result(tmp_path, lambda writer: [writer.write_state(s) for s in moved] and None)) as reader:
+        assert [reader.state_stamp("alpha", s.tick) for s in moved] == [s.stamp_ns for s in moved]
+        assert reader.state_stamp("alpha", 2) is None
+        assert reader.state_stamp("beta", 1) is None
+        with pytest.raises(InputError, match="robot 'gamma' not found"):
+            reader.state_stamp("gamma", 1)
 
 
 def test_a_delta_may_build_on_an_older_state(tmp_path: Path) -> None:

@@ -134,6 +134,19 @@ class ResultReader:
             for _, value in self._messages(map_state_topic(self._known(robot_id)))
         ]
 
+    def state_stamp(self, robot_id: str, tick: int) -> int | None:
+        """Stamp [ns] of a robot's map stored at a tick; None where none is stored. Raises InputError as ``states``."""
+        topic = map_state_topic(self._known(robot_id))
+        for first_ns, first in self._messages(topic):
+            # Ticks are one publish period apart, so only the chunks at the tick's time need be read.
+            period_ns = round(self.config.network.publish_period * 1e9)
+            expected_ns = first_ns + (tick - int(first.tick)) * period_ns
+            for stamp_ns, value in self._messages(topic, start_ns=expected_ns, end_ns=expected_ns + 1):
+                if value.tick == tick:
+                    return stamp_ns
+            break
+        return dict(self.state_times(robot_id)).get(tick)
+
     def states(self, robot_id: str, until_ns: int | None = None) -> list[MapState]:
         """The states that make up a robot's last map with stamp <= ``until_ns`` (None: the last of all).
 
@@ -217,10 +230,14 @@ class ResultReader:
             raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
         return robot_id
 
-    def _messages(self, *topics: str, end_ns: int | None = None, reverse: bool = False) -> Iterator[tuple[int, Any]]:
-        """(log time, message) on some topics, before ``end_ns``, in log-time order or the reverse of it."""
+    def _messages(
+        self, *topics: str, start_ns: int | None = None, end_ns: int | None = None, reverse: bool = False
+    ) -> Iterator[tuple[int, Any]]:
+        """(log time, message) on some topics from ``start_ns`` on and before ``end_ns``, by log time or in reverse."""
         try:
-            for schema, _, record in self._reader.iter_messages(topics, ending_before=end_ns, reverse=reverse):
+            for schema, _, record in self._reader.iter_messages(
+                topics, starting_at=start_ns, ending_before=end_ns, reverse=reverse
+            ):
                 name = schema.name if schema is not None else ""
                 yield record.log_time, typestore().deserialize_cdr(record.data, name)
         except _DAMAGE as error:
