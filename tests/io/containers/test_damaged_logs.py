@@ -356,7 +356,7 @@ def test_a_database_whose_pages_do_not_fit_together_is_never_taken_for_whole(tmp
     assert read_all(path).damage is not None
     # The table of messages is lost with its line in the schema.
     path.write_bytes(data.replace(b"tablemessagesmessages", b"tablemess\xffgesmessages"))
-    assert read_all(path).refusal == f"{path}: cannot be read: no rosbag2 recording, or a damaged one"
+    assert read_all(path).refusal == f"{path}: cannot be read: not a rosbag2 recording, or a damaged one"
 
 
 def test_a_database_of_an_odd_name_is_read(tmp_path):
@@ -403,7 +403,7 @@ def test_a_file_that_the_metadata_name_and_that_is_missing_is_named(tmp_path):
     for clause in (
         "bag_1.mcap: no such file",
         "bag_2.mcap: the file is empty",
-        "a folder, where",
+        "a folder, but",
         "everything else is used",
     ):
         assert clause in outcome.damage
@@ -474,15 +474,15 @@ def test_the_sentence_counts_what_was_skipped():
         return damage_sentence(Path("x.bag"), damage.clauses)
 
     assert sentence() is None
-    damage.lose("/a", 0)
+    damage.skip_messages("/a", 0)
     assert sentence() is None
-    damage.skip("chunk", 7, 100)
+    damage.skip_part("chunk", 7, 100)
     assert sentence() == "x.bag: 1 damaged chunk with 100 messages was skipped; everything else is used"
-    damage.skip("chunk", 7, 100)
-    damage.skip("chunk", 9, 18)
+    damage.skip_part("chunk", 7, 100)
+    damage.skip_part("chunk", 9, 18)
     assert sentence() == "x.bag: 2 damaged chunks with 118 messages were skipped; everything else is used"
-    damage.skip("part", 9, None)
-    damage.lose("/a", 1)
+    damage.skip_part("part", 9, None)
+    damage.skip_messages("/a", 1)
     damage.note("cut before its end")
     assert sentence() == (
         "x.bag: cut before its end, and 3 damaged parts with at least 118 messages were skipped, "

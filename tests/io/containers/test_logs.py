@@ -362,7 +362,7 @@ def test_what_is_no_log_gets_one_sentence(tmp_path):
     assert "cannot be read" in refused("a.db3", b"SQLite format 3\0" + b"\0" * 100)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "x.mcap").touch()
-    assert "without metadata.yaml is no rosbag2 recording; name the files in it; it holds x.mcap" in refused(
+    assert "without metadata.yaml is not a rosbag2 recording; name the files in it; it holds x.mcap" in refused(
         "folder", None
     )
     (tmp_path / "folder" / "metadata.yaml").write_text("a: [")

@@ -1,4 +1,4 @@
-"""Logs that are read block by block by means of an index: what MCAP files, ROS 1 bags and cut databases share."""
+"""Common part of the log readers that use an index of blocks: MCAP files, ROS 1 bags and damaged databases."""
 
 from __future__ import annotations
 
@@ -16,15 +16,20 @@ from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, 
 from octoreplay.io.messages.decoders import Bytes
 
 Entry: TypeAlias = tuple[int, int, int, int, int, Bytes]
-"""(log time, block's offset, start, end, channel id, bytes that start and end count in) of one message."""
+"""One message: log time [ns], offset of its block, start, end, channel id, buffer; its bytes are buffer[start:end]."""
+
+CUT_CHUNK = "cut chunk"
+"""Form of a block that is the beginning of a chunk; the file ends within the chunk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A part of a log that is read at once: where it is, when it starts, whose messages it holds (None: any).
+    """A part of a log that is read at once, such as a chunk.
 
-    ``form`` says what kind of part it is, in the words of the log that made it; ``num_messages`` is None where the
-    index does not say.
+    ``offset`` and ``length`` are in bytes of the file (in rows for databases). ``start_ns`` and ``end_ns`` are the
+    least and greatest log times of its messages; ``end_ns`` is None where the index does not give it.
+    ``channel_ids`` is None where the block may hold any channel. ``form`` distinguishes kinds of blocks of one
+    container. ``num_messages`` is None where the index does not give it.
     """
 
     offset: int
@@ -36,7 +41,7 @@ class Block:
     num_messages: int | None = None
 
     def can_hold(self, channel_ids: Set[int], start_ns: float, stop_ns: float) -> bool:
-        """True where the block may hold messages of some channels with ``start_ns <= log time < stop_ns``."""
+        """Return True if the block may hold messages of some channels with ``start_ns <= log time < stop_ns``."""
         return (
             self.start_ns < stop_ns
             and (self.end_ns is None or self.end_ns >= start_ns)
@@ -45,44 +50,44 @@ class Block:
 
 
 class Tally:
-    """How many messages of which channels there are, and from when to when."""
+    """Number of messages and time span of each channel."""
 
     def __init__(self) -> None:
         self._spans: dict[int, tuple[int, int, int]] = {}
 
     def add(self, channel_id: int, log_time_ns: int, count: int = 1, last_ns: int | None = None) -> None:
-        """Take one message, or several from a first to a last log time."""
+        """Count one message, or ``count`` messages with log times from ``log_time_ns`` to ``last_ns``."""
         last_ns = log_time_ns if last_ns is None else last_ns
         number, start, end = self._spans.get(channel_id, (0, log_time_ns, last_ns))
         self._spans[channel_id] = number + count, min(start, log_time_ns), max(end, last_ns)
 
     def count(self, channel_id: int) -> int:
-        """How many messages a channel has."""
+        """Return the number of messages of a channel."""
         return self._spans.get(channel_id, (0, 0, 0))[0]
 
     def drop_unknown(self, channels: Mapping[int, object]) -> int:
-        """Forget the messages of all other channels; returns how many they were."""
+        """Remove the channels that are not in ``channels`` and return the number of their messages."""
         unknown = [self._spans.pop(i)[0] for i in tuple(self._spans) if i not in channels]
         return sum(unknown)
 
     @property
     def total(self) -> int:
-        """All messages."""
+        """Number of messages of all channels."""
         return sum(number for number, _, _ in self._spans.values())
 
     @property
     def start_ns(self) -> int | None:
-        """Log time of the first message; None where there is none."""
+        """Least log time; None without messages."""
         return min((start for number, start, _ in self._spans.values() if number), default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """Log time of the last message; None where there is none."""
+        """Greatest log time; None without messages."""
         return max((end for number, _, end in self._spans.values() if number), default=None)
 
 
 class BlockBuilder:
-    """Gathers what a block must say of its messages while they are walked over, and counts them."""
+    """Collects time span and channels of one block, message by message, and counts the messages in a tally."""
 
     def __init__(self, tally: Tally) -> None:
         self._tally = tally
@@ -92,7 +97,7 @@ class BlockBuilder:
         self.num_messages = 0
 
     def add(self, channel_id: int, log_time_ns: int) -> None:
-        """Take one message."""
+        """Add one message."""
         self._tally.add(channel_id, log_time_ns)
         self._start_ns = log_time_ns if self._start_ns is None else min(self._start_ns, log_time_ns)
         self._end_ns = log_time_ns if self._end_ns is None else max(self._end_ns, log_time_ns)
@@ -100,7 +105,7 @@ class BlockBuilder:
         self.num_messages += 1
 
     def build(self, offset: int, length: int, form: str = "") -> list[Block]:
-        """The block; none where it holds no message."""
+        """Return the block as a list, which is empty where no message was added."""
         if self._start_ns is None:
             return []
         channel_ids = frozenset(self._channel_ids)
@@ -109,7 +114,7 @@ class BlockBuilder:
 
 @dataclass
 class Index:
-    """Which channels a log has, how many messages of each, and in which blocks."""
+    """Index of a log: its channels by id, the numbers of their messages, and the blocks that hold them."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
@@ -117,7 +122,10 @@ class Index:
 
 
 class BlockLog(LogReader):
-    """A log with an index of blocks; what a block's bytes hold is the subclass's business."""
+    """A log with an index of blocks. Subclasses read the index and the messages of a block.
+
+    Raises InputError where the file cannot be read.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -138,7 +146,7 @@ class BlockLog(LogReader):
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics, sorted by name and type."""
+        """Topics, sorted by name and type."""
         groups: dict[tuple[str, str, str], list[int]] = {}
         for channel_id, channel in sorted(self._index.channels.items()):
             groups.setdefault((channel.topic, channel.type_name, channel.encoding), []).append(channel_id)
@@ -159,7 +167,7 @@ class BlockLog(LogReader):
 
     @property
     def message_count(self) -> int:
-        """Messages of all topics."""
+        """Number of messages of all topics."""
         return self._index.tally.total
 
     def close(self) -> None:
@@ -191,25 +199,25 @@ class BlockLog(LogReader):
 
     @abstractmethod
     def _read_index(self) -> Index:
-        """The index of the open file; notes what is damaged."""
+        """Return the index of the open file and record what is damaged."""
 
     @abstractmethod
     def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
-        """The messages of the wanted channels in a block; notes what is damaged."""
+        """Yield the messages of the wanted channels in a block and record what is damaged."""
 
     def _bytes_at(self, offset: int, length: int) -> bytes:
-        """Bytes of the file, as many as there are; none where the disk cannot read them."""
+        """Return bytes of the file, fewer at its end and none after a read error."""
         if offset >= self._size:
             return b""
         try:
             self._file.seek(offset)
-            # A file object makes room for as much as it is asked for.
+            # A file object allocates as many bytes as are requested, so a damaged length must not be passed on.
             return self._file.read(min(length, self._size - offset))
         except OSError:
             return b""
 
     def _message(self, entry: Entry) -> RawMessage:
-        """A message with its own copy of the bytes, which lets go of the block and aligns the arrays in it."""
+        """Return a message with a copy of its bytes, which releases the block and aligns the arrays in the message."""
         log_time_ns, _, start, end, channel_id, data = entry
         return RawMessage(
             self.path, self._index.channels[channel_id], log_time_ns, bytearray(memoryview(data)[start:end])

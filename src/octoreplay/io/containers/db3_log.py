@@ -1,4 +1,4 @@
-"""rosbag2's sqlite3 files: read by rosbags, and where that fails by row number, as far as rows can be read."""
+"""Reader of rosbag2's sqlite3 files: by rosbags, and by row number after rosbags meets a damaged page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FORMATS = {
 
 
 def open_db3(path: Path) -> LogReader:
-    """A reader of a sqlite3 recording, also of a damaged one. Raises InputError where nothing in it can be read."""
+    """Open a sqlite3 recording, also a damaged one. Raises InputError where nothing in it can be read."""
     try:
         return Db3Log(path)
     except InputError as error:
@@ -35,7 +35,7 @@ def open_db3(path: Path) -> LogReader:
 
 
 class Db3Log(LogReader):
-    """A sqlite3 recording that rosbags reads; where it meets a damaged page, the rest is read by row number.
+    """A sqlite3 recording read by rosbags. After a damaged page, the remaining rows are read by row number.
 
     Raises InputError where it cannot be opened.
     """
@@ -53,13 +53,13 @@ class Db3Log(LogReader):
             self._is_used = any(c.msgcount for c in self._connections)
             self._span = int(reader.start_time), int(reader.end_time) - 1
         except Exception as error:
-            # On a damaged database rosbags lets whatever its parsers raise through, bare AssertionErrors included.
+            # On a damaged database rosbags raises whatever its parsers raise, also bare AssertionErrors.
             self.close()
-            raise InputError(f"{path}: cannot be read: no rosbag2 recording, or a damaged one") from error
+            raise InputError(f"{path}: cannot be read: not a rosbag2 recording, or a damaged one") from error
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics, sorted by name and type."""
+        """Topics, sorted by name and type."""
         groups: dict[tuple[str, str, str], list[Connection]] = {}
         for connection in self._connections:
             channel = self._channels[connection.id]
@@ -81,12 +81,12 @@ class Db3Log(LogReader):
 
     @property
     def message_count(self) -> int:
-        """Messages of all topics."""
+        """Number of messages of all topics."""
         return sum(connection.msgcount for connection in self._connections)
 
     @property
     def damage_clauses(self) -> tuple[str, ...]:
-        """What is wrong and what was skipped; empty for a good log."""
+        """Clauses on what is damaged and what was skipped; empty for a good log."""
         return self._damage.clauses if self._rows is None else self._rows.damage_clauses
 
     def close(self) -> None:
@@ -115,7 +115,7 @@ class Db3Log(LogReader):
         # A bound outside the log is left out: SQLite takes no integers of more than 64 bits.
         start_ns = None if start_ns is None or start_ns <= first_ns else start_ns
         stop_ns = None if stop_ns is None or stop_ns > end_ns else stop_ns
-        # How many messages of which topic were given at the last log time, for going on by another way.
+        # Number of messages given at the last log time by topic, which reading by row number must leave out.
         last_ns, given = start_ns, dict[str, int]()
         reader = self._reader_of_this_thread()
         wanted = [c for c in reader.connections if c.topic in topics and c.msgcount]
@@ -126,7 +126,7 @@ class Db3Log(LogReader):
             except StopIteration:
                 return
             except Exception:
-                # As at opening, a damaged page can raise anything.
+                # A damaged page can raise any exception, as at opening.
                 break
             if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
                 break
@@ -149,7 +149,7 @@ class Db3Log(LogReader):
     def _rest(
         self, topics: Collection[str], last_ns: int | None, stop_ns: int | None, given: dict[str, int]
     ) -> Iterator[RawMessage]:
-        """The messages from a log time on, without those of that very time that were given already."""
+        """Yield the messages from ``last_ns`` on by row number, without those at this time that were given already."""
         if self._rows is None:
             try:
                 self._rows = DamagedDb3Log(self._file)
@@ -165,7 +165,7 @@ class Db3Log(LogReader):
 
 
 def _channel(connection: Connection) -> Channel:
-    """A connection's topic, type and definition."""
+    """Return the channel of a connection."""
     return Channel(
         connection.topic,
         normalise_type_name(connection.msgtype),
