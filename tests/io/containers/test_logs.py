@@ -321,8 +321,8 @@ def test_other_encodings_are_listed_and_refused_when_decoded(tmp_path):
         ]  # fmt: skip
         assert first_message(log, "/json").decode() == SimpleNamespace()
         for topic, sentence in (
-            ("/cbor", "message encoding 'cbor' is not supported; cdr, ros1, protobuf, json are"),
-            ("/log", "the definition of type 'foxglove.Log' cannot be understood"),
+            ("/cbor", "message encoding 'cbor' is not supported; supported are cdr, ros1, protobuf, json"),
+            ("/log", "the definition of type 'foxglove.Log' cannot be parsed"),
         ):
             with pytest.raises(InputError, match=rf"a\.mcap: topic '{topic}' at 1\.000 s: {sentence}$"):
                 first_message(log, topic).decode()

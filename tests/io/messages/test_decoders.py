@@ -92,12 +92,12 @@ def test_the_definition_in_the_log_holds_where_it_differs_from_the_known_one():
 @pytest.mark.parametrize(
     ("encoding", "definition_format", "definition", "sentence"),
     [
-        ("cbor", "", b"", "message encoding 'cbor' is not supported; cdr, ros1, protobuf, json are"),
+        ("cbor", "", b"", "message encoding 'cbor' is not supported; supported are cdr, ros1, protobuf, json"),
         ("cdr", "ros2msg", b"", "the definition of type 'a/msg/B' is unknown"),
         ("ros1", "ros1msg", b"", "the definition of type 'a/msg/B' is unknown"),
-        ("cdr", "ros2msg", b"\xff\xfe\0 nonsense {", "the definition of type 'a/msg/B' cannot be understood"),
+        ("cdr", "ros2msg", b"\xff\xfe\0 nonsense {", "the definition of type 'a/msg/B' cannot be parsed"),
         ("cdr", "ros2msg", b"other/Missing x\n", "the definition of type 'a/msg/B' "),
-        ("cdr", "ros2idl", b"module {", "the definition of type 'a/msg/B' cannot be understood"),
+        ("cdr", "ros2idl", b"module {", "the definition of type 'a/msg/B' cannot be parsed"),
         ("ros1", "ros1msg", b"float99 x\n", "the definition of type 'a/msg/B' "),
         ("protobuf", "protobuf", b"", "the definition of type 'a/msg/B' "),
         ("protobuf", "protobuf", b"\x0a\x05hello", "the definition of type 'a/msg/B' "),
