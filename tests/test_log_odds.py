@@ -20,7 +20,7 @@ def test_probabilities_sum_to_one_and_have_the_log_odds(log_odds: np.ndarray) ->
 
 
 @given(tables)
-def test_labels_and_their_probabilities_are_the_posteriors_largest(log_odds: np.ndarray) -> None:
+def test_labels_have_the_greatest_probability(log_odds: np.ndarray) -> None:
     full = np.concatenate([np.zeros((len(log_odds), 1)), log_odds], axis=1)
     labels = best_labels(log_odds)
     assert labels.tolist() == [row.tolist().index(max(row)) for row in full]
@@ -32,7 +32,7 @@ def test_free_wins_a_tie() -> None:
     assert best_labels(np.array([[0.0, 0.0], [-1.0, 0.0], [0.5, 0.5]])).tolist() == [0, 0, 1]
 
 
-def test_the_team_posterior_adds_up_what_consensus_averaged() -> None:
+def test_the_team_posterior_adds_the_evidence_of_all_robots() -> None:
     prior, evidence = -0.75, np.array([[1.0, -2.0], [0.5, 0.25], [3.0, 3.0]])
     mean = prior + evidence.mean(axis=0, keepdims=True)
     np.testing.assert_allclose(team_log_odds(mean, prior, 3), prior + evidence.sum(axis=0, keepdims=True))
