@@ -255,7 +255,7 @@ def test_what_the_network_cannot_do_is_one_sentence_and_nothing_is_written(
     ("entries", "sentence"),
     [
         ("- {from: 1, to: 5, robots_off: [husky_1]}\n- {from: 3, robots_off: [husky_1]}",
-         r"robot 'husky_1' is in two entries at 3 s \(from 1 s to 5 s, and from 3 s on\); end the one before"),
+         r"robot 'husky_1' is in two entries at 3 s \(from 1 s to 5 s, and from 3 s on\); end one before"),
         ("- {from: 1, links_down: [[husky_1, husky_2]], links_up: [[husky_2, husky_1]]}", "is in two entries at 1 s"),
         ("- {from: 1}", "the entry from 1 s on has no effect; give it groups, links_down"),
         ("- {from: 1, robots_off: [spot]}", "schedule: robot 'spot' is not in the team: husky_1, husky_2"),
