@@ -33,7 +33,7 @@ class RatioRobot:
         self.total = np.zeros(shape, np.int64)
         self.total_weight = 0
         self.evidence = np.zeros(shape, np.int64)
-        self._last_received: dict[int, tuple[Int64Array, int]] = {}
+        self.last_received: dict[int, tuple[Int64Array, int]] = {}
 
     def observe(self, log_odds: Float64Array) -> None:
         """Add new evidence: y += q(s now) - q(s before)."""
@@ -51,9 +51,9 @@ class RatioRobot:
 
     def receive(self, sender: int, total: Int64Array, total_weight: int) -> None:
         """Receive sums: y += sigma - last sigma of the sender, likewise the weight."""
-        last, last_weight = self._last_received.get(sender, (np.zeros_like(total), 0))
+        last, last_weight = self.last_received.get(sender, (np.zeros_like(total), 0))
         self.mass, self.weight = self.mass + total - last, self.weight + total_weight - last_weight
-        self._last_received[sender] = total, total_weight
+        self.last_received[sender] = total, total_weight
 
     @property
     def log_odds(self) -> Float64Array:
