@@ -19,7 +19,7 @@ from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, Tr
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
 from octoreplay.records import CENTRAL, CONVERGED, FrameCounts, RobotMetrics, RunSummary, TickMetrics
-from result_factory import CLASSES, summary, team, tick_metrics, write_until
+from support.result_factory import CLASSES, summary, team, tick_metrics, write_until
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import octree_factory
 from octoreplay.config.class_file import class_table
 from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import ConfigError, InputError
@@ -22,7 +21,8 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
-from result_factory import CLASSES, state, summary, team, tick_metrics
+from support import octree_factory
+from support.result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25
 NAMES = ("unknown", "free", "ground", "tree")

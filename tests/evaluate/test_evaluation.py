@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dense_scores
 from octoreplay import Evaluation, evaluate_result, load_team_file, open_result, replay_team, resolve
 from octoreplay.errors import InputError
 from octoreplay.evaluate.evaluation import truth_beside_logs
@@ -18,8 +17,9 @@ from octoreplay.evaluate.records import MAP_SCORES, SCORES, MapScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
-from octree_factory import cells_of, cube, octree_of
-from result_factory import state, write_result, write_until
+from support import dense_scores
+from support.octree_factory import cells_of, cube, octree_of
+from support.result_factory import state, write_result, write_until
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 FREE, GROUND, TREE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3)

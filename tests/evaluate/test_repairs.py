@@ -6,11 +6,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import octree_factory
 from octoreplay.evaluate.repairs import Repairs, repairs
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import keys_to_codes
 from octoreplay.result import StoredMap
+from support import octree_factory
 
 FREE, GROUND, TREE = [-2.0, -2.0], [2.0, -1.0], [-1.0, 2.0]
 VALUES = {0: FREE, 1: GROUND, 2: TREE}

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import dense_scores
 from octoreplay.evaluate.morton_intervals import Region
 from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import SemanticOctree, keys_to_codes
-from octree_factory import cells_of, cube, octree_of
+from support import dense_scores
+from support.octree_factory import cells_of, cube, octree_of
 
 FREE, GROUND, TREE, UNSURE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3), (-0.3, -0.4)
 VALUES = (FREE, GROUND, TREE, UNSURE, (0.25, 0.7), (-0.9, 0.35))

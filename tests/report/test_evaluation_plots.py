@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evaluation_factory import evaluation
 from octoreplay.errors import OutputError
 from octoreplay.report import evaluation_plots
 from octoreplay.report.evaluation_plots import write_evaluation_figures
+from support.evaluation_factory import evaluation
 
 NAMES = ["agreement.png", "iou.png", "class_iou.png", "coverage.png", "calibration.png"]
 

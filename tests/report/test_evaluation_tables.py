@@ -7,10 +7,10 @@ import io
 
 import pytest
 
-from evaluation_factory import evaluation
 from octoreplay.evaluate.records import Evaluation
 from octoreplay.report import tables
 from octoreplay.report.evaluation_tables import MAX_TIMES, evaluation_tables
+from support.evaluation_factory import evaluation
 
 
 def rendered(judged: Evaluation) -> str:

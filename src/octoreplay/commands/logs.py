@@ -40,7 +40,7 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
 
     What a run would still miss stands in it too, and is said.
     """
-    from octoreplay.config.team_file import team_template
+    from octoreplay.config.team_template import team_template
     from octoreplay.io.robots import discover
 
     check_output(output, ".yaml", logs)

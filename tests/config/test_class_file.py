@@ -18,21 +18,21 @@ from octoreplay.config.team_file import dump_team, load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.records import ClassTable, FrameCounts, SemanticClass
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 HYDRA = RECORDINGS / "semantic_labels" / "hydra_label_spaces"
-PAIR = Path(__file__).parent / "fixtures" / "pair"
+PAIR = Path(__file__).parents[1] / "fixtures" / "pair"
 ROBOTS = "robots: [{id: husky, log: husky.mcap}]\n"
 LIST = "classes: [{name: road, raw_labels: 1}, {name: car, raw_labels: [2, 5]}, {name: bus, raw_labels: 3}]\n"
 
 
 def _parsed(text, folder=Path("/team")):
-    return parse_team(ROBOTS + text, source="team.yaml", folder=folder)
+    return parse_team(ROBOTS + text, name="team.yaml", folder=folder)
 
 
 def _there_and_back(config):
     text = dump_team(config, Path("/team"))
-    again = parse_team(text, source="again", folder=Path("/team"))
+    again = parse_team(text, name="again", folder=Path("/team"))
     assert again == config
     assert dump_team(again, Path("/team")) == text
     return text

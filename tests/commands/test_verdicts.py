@@ -13,11 +13,11 @@ import pytest
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.report import verdict_tables
-from result_factory import tick_metrics, write_until
+from support.result_factory import tick_metrics, write_until
 
-FIXTURES = Path(__file__).parent / "fixtures"
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
 def octoreplay(*arguments: object) -> subprocess.CompletedProcess[str]:
