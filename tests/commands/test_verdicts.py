@@ -95,7 +95,7 @@ def test_early_maps_can_be_compared(runs: dict[str, Path]) -> None:
 def test_results_that_cannot_be_compared_are_one_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
     text = ends(1, "compare", runs["pair"], runs["finer"])
     assert text.count("\n") == 1
-    assert "finer.mcap: has the resolution 0.4 m" in text
+    assert "finer.mcap: the resolution is 0.4 m" in text
     text = ends(1, "compare", runs["pair"], FIXTURES / "pair" / "husky_1.mcap")
     assert text.count("\n") == 1
     assert "no result of octoreplay" in text
@@ -152,7 +152,7 @@ def test_an_interrupted_run_fails(tmp_path: Path) -> None:
 def test_wrong_usage_of_check(runs: dict[str, Path], tmp_path: Path) -> None:
     assert "no limit given; give at least one, such as --max-label-disagreement 0.001" in ends(2, "check", runs["pair"])
     assert "No such option '--max-fun'" in ends(2, "check", runs["pair"], "--max-fun", 1)
-    assert "is more than 1; it is a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
+    assert "is more than 1; give a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
     assert "needs the truth; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
     assert "must end in .json" in ends(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
 

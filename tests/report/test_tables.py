@@ -101,7 +101,7 @@ def test_point_answers_show_the_next_classes() -> None:
         tables.point_answers(("free", "ground", "tree"), [(1.0, 2.5, -3.0), (9, 9, 9)], answer)
     ).splitlines()
     assert "1, 2.5, -3" in lines[2]
-    assert "ground    84.40 %  tree 11.40 %, free 4.20 %  0.4 m" in lines[2]
+    assert "ground       84.40 %  tree 11.40 %, free 4.20 %  0.4 m" in lines[2]
     assert lines[3].split() == ["9,", "9,", "9", "unknown"]
 
 
