@@ -117,11 +117,13 @@ def _colors(
 
 
 def _label_colors(class_table: ClassTable, leaves: LeafTable) -> UInt8Array:
+    """Colours (L, 3) of the labels; free is grey."""
     palette = np.concatenate([np.array([FREE_COLOR], dtype=np.uint8), class_table.colors])
     return palette.take(best_labels(leaves.log_odds), axis=0)
 
 
 def _robot_color(index: int) -> tuple[int, int, int]:
+    """Colour of a robot by its index."""
     return PALETTE[index % len(PALETTE)]
 
 

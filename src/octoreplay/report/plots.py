@@ -92,6 +92,7 @@ def _cells(record: Any, names: Sequence[str]) -> list[str]:
 
 
 def _cell(value: Any) -> str:
+    """Value as text; truth values are 0 and 1."""
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
 
 
