@@ -58,10 +58,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_a_run_is_the_same_as_itself_and_as_its_repetition(runs: dict[str, Path]) -> None:
     for other in ("pair", "again"):
         text = ends(0, "compare", runs["pair"], runs[other])
-        assert text.endswith("\nthe same: 3 maps, every cell\n")
+        assert text.endswith("\nthe same: all cells of 3 maps\n")
         assert "logs: the same" in text
-        assert "Settings that differ" not in text
-        assert "Where they differ" not in text
+        assert "Different settings" not in text
+        assert "Places of the differences" not in text
 
 
 def test_another_parameter_gives_other_maps_and_is_named(runs: dict[str, Path], tmp_path: Path) -> None:
@@ -73,13 +73,13 @@ def test_another_parameter_gives_other_maps_and_is_named(runs: dict[str, Path], 
     assert [one["robot_id"] for one in content["maps"]] == ["husky_1", "husky_2", "central"]
     assert content["maps"][0]["num_differing"] > 0
     assert content["maps"][2]["num_differing"] == 0
-    assert "the same: 1 map," in ends(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
+    assert "the same: all cells of 1 map" in ends(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
 
 
 def test_a_tolerance_makes_near_maps_the_same(runs: dict[str, Path]) -> None:
     assert ends(1, "compare", runs["pair"], runs["near"]).splitlines()[-1].startswith("different: 2 of 3 maps")
     text = ends(0, "compare", runs["pair"], runs["near"], "--tolerance", 0.5)
-    assert text.splitlines()[-1].startswith("the same within 0.5: 3 maps, every cell")
+    assert text.splitlines()[-1].startswith("the same within 0.5: all cells of 3 maps")
 
 
 def test_a_larger_team_has_a_map_that_the_smaller_lacks(runs: dict[str, Path]) -> None:
@@ -95,7 +95,7 @@ def test_early_maps_can_be_compared(runs: dict[str, Path]) -> None:
 def test_results_that_cannot_be_compared_are_one_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
     text = ends(1, "compare", runs["pair"], runs["finer"])
     assert text.count("\n") == 1
-    assert "finer.mcap: has the resolution 0.4 m" in text
+    assert "finer.mcap: the resolution is 0.4 m" in text
     text = ends(1, "compare", runs["pair"], FIXTURES / "pair" / "husky_1.mcap")
     assert text.count("\n") == 1
     assert "no result of octoreplay" in text
@@ -152,7 +152,7 @@ def test_an_interrupted_run_fails(tmp_path: Path) -> None:
 def test_wrong_usage_of_check(runs: dict[str, Path], tmp_path: Path) -> None:
     assert "no limit given; give at least one, such as --max-label-disagreement 0.001" in ends(2, "check", runs["pair"])
     assert "No such option '--max-fun'" in ends(2, "check", runs["pair"], "--max-fun", 1)
-    assert "is more than 1; it is a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
+    assert "is more than 1; give a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
     assert "needs the truth; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
     assert "must end in .json" in ends(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
 
@@ -172,7 +172,7 @@ def test_what_is_no_result_fails_with_one_sentence(tmp_path: Path) -> None:
      (1.5e-7, "1.5e-07"), (1e20, "1e+20")],
 )  # fmt: skip
 def test_numbers_are_for_comparing(value: float, text: str) -> None:
-    assert verdict_tables.number(value) == text
+    assert verdict_tables.six_digits(value) == text
 
 
 def test_values_that_differ_a_little_look_different() -> None:
