@@ -117,8 +117,8 @@ class World:
     def obstacle_mask(self, cell: float) -> npt.NDArray[np.bool_]:
         """Return a mask (n, n) of the cells in which a robot cannot drive.
 
-        The axes are x and y from -size/2 in steps of ``cell`` [m]. A cell is blocked if a surface other than ground lies
-        0.1 m to 1.5 m above the ground in it.
+        The axes are x and y from -size/2 in steps of ``cell`` [m]. A cell is blocked if a surface other than ground
+        lies 0.1 m to 1.5 m above the ground in it.
         """
         n = grid_length(self.size, cell)
         mask = np.zeros((n, n), dtype=np.bool_)
