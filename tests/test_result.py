@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import leaf_list
 from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.result import Result, open_result
-from result_factory import CLASSES, SECOND, START, leaf_table, state, summary, team, tick_metrics, write_result
+from support import leaf_list
+from support.result_factory import CLASSES, SECOND, START, leaf_table, state, summary, team, tick_metrics, write_result
 
 LEAVES = leaf_table()
 

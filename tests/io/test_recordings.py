@@ -14,8 +14,8 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.robots.discover import describe, discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.trajectories import read_rows, trajectory
-from recordings import RECORDINGS, needs_recordings
-from scan_maps import octree_of
+from support.recordings import RECORDINGS, needs_recordings
+from support.scan_maps import octree_of
 
 pytestmark = needs_recordings
 

@@ -13,7 +13,6 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import octoreplay
-import room
 from fixtures.foxglove_messages import write_protobuf
 from fixtures.make_containers import (
     CAMERA,
@@ -42,7 +41,6 @@ from fixtures.make_containers import (
     scan_ranges,
     write_mcap,
 )
-from log_factory import IDENTITY, SECOND, Entry
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -50,7 +48,9 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameCounts, SemanticClass
-from scan_maps import packet_of
+from support import room
+from support.log_factory import IDENTITY, SECOND, Entry
+from support.scan_maps import packet_of
 
 LOGS = sorted(path.name for path in CONTAINERS.iterdir())
 REFERENCE = "cdr_none.mcap"

@@ -19,14 +19,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import octoreplay
-import room
 from fixtures.make_containers import write_mcap
-from log_factory import OPTICAL, SECOND, Entry, ros2
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, SemanticClass
-from scan_maps import octree_of, packet_of, states_of
+from support import room
+from support.log_factory import OPTICAL, SECOND, Entry, ros2
+from support.scan_maps import octree_of, packet_of, states_of
 
 CLASSES = ClassTable(
     tuple(SemanticClass(k + 1, name, (0, 0, 0), (raw,)) for k, (raw, name) in enumerate(room.NAMES.items()))

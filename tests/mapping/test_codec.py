@@ -17,7 +17,7 @@ from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, quantised
-from octree_factory import brick_code, cells_of, cube, octree_of
+from support.octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
 PLAIN = PacketFormat(zstd_level=None)

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from octoreplay.mapping.consensus import Evidence, Step, gamma_at, sum_of_evidence, team_step
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.replay.session import CONVERGED, Session
-from octree_factory import cells_of, cube, octree_of
+from octoreplay.records import CONVERGED
+from octoreplay.replay.session import Session
 from reference import rules
 from reference.hand_made import team_config
 from reference.scenarios import TeamShape, make_scenario
+from support.octree_factory import cells_of, cube, octree_of
 
 NUM_CLASSES = 3
 RULES = ("gradient", "natural", "bayes", "local")
@@ -305,7 +306,7 @@ class FrameList:
 def _session(shape=SHAPE, **parameters):
     scenario = _scenario(shape)
     sources = [FrameList(tuple(f for f in scenario.frames if f.robot_id == robot)) for robot in scenario.robot_ids]
-    return Session(scenario.config(**parameters), sources, num_threads=1)
+    return Session(scenario.config(**parameters), sources, ThreadPoolExecutor(1))
 
 
 @functools.lru_cache(maxsize=1)
@@ -330,7 +331,7 @@ def test_bayes_keeps_the_mean_and_ends_at_the_oracle(mode, topology):
         if tick.settling and tick.number % 10:
             continue
         mean = np.mean([_values(octree) for octree in tick.maps], axis=0)
-        evidence = np.mean([_values(robot.evidence.octree) for robot in session._robots], axis=0)
+        evidence = np.mean([_values(robot.evidence.octree) for robot in session.team.robots], axis=0)
         np.testing.assert_allclose(mean, evidence, atol=1e-5)
     for octree in tick.maps:
         np.testing.assert_allclose(num_robots * _values(octree), _values(tick.oracle), atol=1e-4)

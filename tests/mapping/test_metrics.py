@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.metrics import MapComparer
-from octree_factory import cube, octree_of
 from reference.metrics import team_metrics
+from support.octree_factory import cube, octree_of
 
 EMPTY = {}
 

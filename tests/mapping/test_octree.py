@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, leaf_list, octree_from_streams
 from octoreplay.records import LeafTable
-from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
+from support.octree_factory import cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
 RESOLUTION = 0.25

@@ -12,7 +12,7 @@ from octoreplay.mapping import codec
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.quantise import CONTENTS, content_numbers, content_values, is_step, quantised, top_classes
-from octree_factory import cells_of, cube, octree_of
+from support.octree_factory import cells_of, cube, octree_of
 
 FLOATS = st.floats(width=32)
 FINITE = st.floats(-100.0, 100.0, width=32)

@@ -28,9 +28,9 @@ from octoreplay.mapping.running_sums import (
     take_in,
     team_take_in,
 )
-from octree_factory import cells_of, cube, octree_of
 from reference import ratio
 from reference.ratio import RatioRobot, quantised
+from support.octree_factory import cells_of, cube, octree_of
 
 NUM_CLASSES = 3
 

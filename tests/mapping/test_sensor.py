@@ -20,11 +20,11 @@ from octoreplay.mapping.sensor import (
     unclamped_increments,
 )
 from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
-from octree_factory import cells_of
 from reference.evidence import Evidence, IndexedScan
 from reference.hand_made import FACING_X, cloud, depth_frame, facing_x
 from reference.scenarios import TeamShape, make_scenario
 from reference.sensor import scan_update
+from support.octree_factory import cells_of
 
 NUM_CLASSES = 5
 SENSOR = SensorConfig(max_range=4.0)

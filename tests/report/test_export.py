@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-import leaf_list
 from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.report.export import FREE_COLOR, export_ply
-from result_factory import leaf_table, state, write_result
+from support import leaf_list
+from support.result_factory import leaf_table, state, write_result
 
 LEAVES = leaf_table()
 DARK, YELLOW = [68, 1, 84], [253, 231, 37]

@@ -11,7 +11,7 @@ import pytest
 from octoreplay.report import map_view
 from octoreplay.report.map_view import BACKGROUND, Faces, View, cube_faces, draw, mesh_faces, overlay, view_of
 from octoreplay.result import StoredMap
-from octree_factory import octree_of
+from support.octree_factory import octree_of
 
 DOWN = View(math.pi / 2, math.pi / 2, (0.0, 0.0, 0.0), 0.1, 80, 60)
 """Straight down, x to the right, y up, ten pixels to a metre."""

@@ -5,7 +5,7 @@ from PIL import Image
 
 from octoreplay.report import paper_plots
 from octoreplay.report.map_view import BACKGROUND
-from result_factory import CLASSES, tick_metrics
+from support.result_factory import CLASSES, tick_metrics
 
 METRICS = [tick_metrics(tick) for tick in range(1, 9)]
 

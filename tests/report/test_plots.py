@@ -9,7 +9,7 @@ from PIL import Image
 
 from octoreplay.errors import InputError, OutputError
 from octoreplay.report import plots
-from result_factory import tick_metrics
+from support.result_factory import tick_metrics
 
 METRICS = [tick_metrics(tick, settling=tick > 6) for tick in range(1, 9)]
 

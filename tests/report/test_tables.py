@@ -12,7 +12,7 @@ from octoreplay.io.robots.discover import LogDescription, LogSummary, RobotSumma
 from octoreplay.records import RobotMetrics
 from octoreplay.report import tables
 from octoreplay.result import PointQuery
-from result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
+from support.result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
 
 
 def rendered(*parts: RenderableType, width: int = 80) -> str:

@@ -17,7 +17,7 @@ from octoreplay.simulate import team
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
-from stored_messages import matrix, pixels, read_messages, stamp_ns
+from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
 SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)

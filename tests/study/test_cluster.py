@@ -17,7 +17,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.study import cluster
 from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
-from study.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
+from support.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
 
 pytest.importorskip("distributed")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from octoreplay.config.team_file import load_team_file
-from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.evaluate.records import SCORES, EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.records import RunSummary, TickMetrics
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import numbers
 from octoreplay.study.numbers import (
@@ -22,7 +22,7 @@ from octoreplay.study.numbers import (
     run_numbers,
     truth_numbers,
 )
-from result_factory import tick_metrics
+from support.result_factory import tick_metrics
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 
@@ -92,9 +92,8 @@ def test_dormant_robots_do_not_count_as_the_worst() -> None:
 
 def scores(robot_id: str, number: float) -> MapScores:
     """Scores that differ by name and robot."""
-    names = [item.name for item in dataclasses.fields(MapScores)]
-    values = {name: number + index / 100 for index, name in enumerate(names)}
-    return MapScores(**{**values, "robot_id": robot_id, "is_active": True, "iou": (number,)})  # type: ignore[arg-type]
+    values = [number + index / 100 for index in range(len(SCORES))]
+    return MapScores(robot_id, True, 1000, *values[1:4], TruthScores((number,), *values[4:]))
 
 
 def test_the_truth_numbers_are_means_over_robots() -> None:
@@ -103,9 +102,9 @@ def test_the_truth_numbers_are_means_over_robots() -> None:
     row = truth_numbers(Evaluation("r", "t", "central", ("x",), (tick,)))
     assert tuple(row) == TRUTH_COLUMNS
     for name in ("mean_iou", "coverage", "free_accuracy", "calibration_error", "team_calibration_error_occupied"):
-        assert row[name] == pytest.approx((getattr(maps[0], name) + getattr(maps[1], name)) / 2)
-    assert row["mean_iou_least"] == maps[0].mean_iou
-    assert row["central_mean_iou"] == maps[2].mean_iou
-    assert row["central_calibration_error"] == maps[2].calibration_error
+        assert row[name] == pytest.approx((maps[0].score(name) + maps[1].score(name)) / 2)
+    assert row["mean_iou_least"] == maps[0].score("mean_iou")
+    assert row["central_mean_iou"] == maps[2].score("mean_iou")
+    assert row["central_calibration_error"] == maps[2].score("calibration_error")
     alone = truth_numbers(Evaluation("r", "t", "central", ("x",), (dataclasses.replace(tick, maps=maps[:2]),)))
     assert math.isnan(alone["central_mean_iou"])

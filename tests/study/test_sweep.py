@@ -17,7 +17,7 @@ import pytest
 import octoreplay
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError, OutputError
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import local
 from octoreplay.study.folder import SweepFolder
@@ -25,6 +25,7 @@ from octoreplay.study.numbers import run_numbers
 from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
+from support.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
 from study.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)

@@ -92,7 +92,7 @@ def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
     return {
         **{name: final.mean(name) for name in (*_SCORES, *_TEAM_SCORES)},
         "mean_iou_least": final.least("mean_iou"),
-        **{f"central_{name}": math.nan if central is None else getattr(central, name) for name in _SCORES},
+        **{f"central_{name}": math.nan if central is None else central.score(name) for name in _SCORES},
     }
 
 

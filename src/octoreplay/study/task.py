@@ -96,7 +96,7 @@ def execute_task(task: Task) -> Row:
 def _replay_and_measure(task: Task) -> Row:
     """Row of a task; errors are raised."""
     from octoreplay.config.team_file import parse_team
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
     from octoreplay.result import open_result
     from octoreplay.study.numbers import run_numbers, truth_numbers
 

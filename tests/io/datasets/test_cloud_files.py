@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.cloud_files import read_cloud, read_kitti_labels
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]
 

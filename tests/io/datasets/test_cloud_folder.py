@@ -15,8 +15,8 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.datasets.cloud_folder import import_clouds
 from octoreplay.io.sensors.clouds import decode_cloud
 from octoreplay.records import ClassTable, SemanticClass
-from recordings import RECORDINGS, needs_recordings
-from stored_messages import matrix, read_messages
+from support.recordings import RECORDINGS, needs_recordings
+from support.stored_messages import matrix, read_messages
 
 BKI = RECORDINGS / "semantic_pcd" / "bki_sim"
 KITTI = RECORDINGS / "semantic_misc" / "mmdet3d_semantickitti" / "sequences" / "00"

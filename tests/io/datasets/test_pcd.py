@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.pcd import _unpack_lzf, read_pcd, read_viewpoint
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 HEADER = (
     "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\n"

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError
 from octoreplay.io.datasets.rgbd_folder import import_rgbd
 from octoreplay.records import ClassTable, SemanticClass
-from recordings import RECORDINGS, needs_recordings
-from stored_messages import matrix, pixels, read_messages
+from support.recordings import RECORDINGS, needs_recordings
+from support.stored_messages import matrix, pixels, read_messages
 
 K = "4 0 2.5\n0 4.5 1.5\n0 0 1\n"
 

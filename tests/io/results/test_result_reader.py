@@ -9,7 +9,7 @@ from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import message, time_message
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
-from result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
+from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
 
 METRICS = [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
 

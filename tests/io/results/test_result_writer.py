@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.results.result_writer import ResultWriter, _quaternion, partial_path
-from result_factory import (
+from support.result_factory import (
     CLASSES,
     SECOND,
     START,

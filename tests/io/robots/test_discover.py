@@ -7,7 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.class_file import class_table
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, parse_team
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import ConfigError, InputError, OctoreplayError
+from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.discover import LogDescription, describe, discover, resolve
+from octoreplay.io.robots.robot_log import RobotLog
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     HEIGHT,
     IDENTITY,
@@ -30,15 +39,6 @@ from log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-from octoreplay.config.class_file import class_table
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.config.team_file import dump_team, parse_team
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import ConfigError, InputError, OctoreplayError
-from octoreplay.io.messages.sensor_messages import Kind, kind_of
-from octoreplay.io.robots.discover import LogDescription, describe, discover, resolve
-from octoreplay.io.robots.robot_log import RobotLog
 
 START = 100 * SECOND
 DEPTH, LABELS, INFO = "/camera/depth/image_raw", "/camera/labels/image_raw", "/camera/depth/camera_info"

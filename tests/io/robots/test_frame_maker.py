@@ -5,7 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.errors import InputError
+from octoreplay.io.containers.log_reader import RawMessage
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker
+from octoreplay.io.robots.frame_queue import Settled
+from octoreplay.io.sensors import cameras
+from octoreplay.io.sensors.labels import OCCUPIED, LabelLookup, class_table_from_names
+from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
+from support.log_factory import (
     HEIGHT,
     NAMES,
     WIDTH,
@@ -17,15 +26,6 @@ from log_factory import (
     ros2,
     ros_row,
 )
-from octoreplay.config.robot import RobotConfig
-from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import RawMessage
-from octoreplay.io.messages.decoders import DamagedMessageError
-from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker
-from octoreplay.io.robots.frame_queue import Settled
-from octoreplay.io.sensors import cameras
-from octoreplay.io.sensors.labels import OCCUPIED, LabelLookup, class_table_from_names
-from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
 
 TABLE = class_table_from_names({"r": NAMES})
 DEPTH, LABELS, SURE, INFO, POINTS = "/depth", "/labels", "/sure", "/info", "/points"

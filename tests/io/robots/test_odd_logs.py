@@ -7,7 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import InputError
+from octoreplay.io.robots.discover import discover, resolve
+from octoreplay.io.robots.pose_source import PoseSource
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_bodies import TeamBodies
+from octoreplay.io.sensors.labels import class_table_from_names
+from octoreplay.records import FrameCounts
+from support.log_factory import (
     IDENTITY,
     NAMES,
     SECOND,
@@ -20,16 +30,6 @@ from log_factory import (
     write_mcap,
     write_rows,
 )  # fmt: skip
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import InputError
-from octoreplay.io.robots.discover import discover, resolve
-from octoreplay.io.robots.pose_source import PoseSource
-from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.robots.team_bodies import TeamBodies
-from octoreplay.io.sensors.labels import class_table_from_names
-from octoreplay.records import FrameCounts
 
 TABLE = class_table_from_names({"r": NAMES})
 START = 100 * SECOND

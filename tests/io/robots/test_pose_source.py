@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.errors import InputError
+from octoreplay.io.containers.logs import open_log
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.robots.pose_source import PoseSource, is_static_tf, moving_tf_names, tf_topics
+from octoreplay.transforms import inverse, pose_matrix
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     IDENTITY,
     SECOND,
@@ -22,12 +28,6 @@ from log_factory import (
     ros_row,
     write_rows,
 )
-from octoreplay.config.robot import RobotConfig
-from octoreplay.errors import InputError
-from octoreplay.io.containers.logs import open_log
-from octoreplay.io.messages.decoders import DamagedMessageError
-from octoreplay.io.robots.pose_source import PoseSource, is_static_tf, moving_tf_names, tf_topics
-from octoreplay.transforms import inverse, pose_matrix
 
 START = 1_700_000_000 * SECOND + 1
 TURN = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))

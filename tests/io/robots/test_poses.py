@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_np
 from scipy.spatial.transform import Rotation, Slerp
 
-from log_factory import IDENTITY, ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Transforms, convert
 from octoreplay.io.robots.poses import FrameTree, PoseTrack
 from octoreplay.transforms import normalise
+from support.log_factory import IDENTITY, ros2
 
 MS = 1_000_000
 

@@ -6,13 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from log_factory import NAMES, robot_entries, write_mcap
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.sensors.labels import class_table_from_names
+from support.log_factory import NAMES, robot_entries, write_mcap
 
 TABLE = class_table_from_names({"r": NAMES})
 

@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.robots.frame_maker import DepthFrameMaker
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.sensors.labels import class_table_from_names
+from octoreplay.records import CameraModel, FrameCounts
+from octoreplay.transforms import inverse, pose_matrix
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     HEIGHT,
     IDENTITY,
@@ -29,14 +37,6 @@ from log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.robots.frame_maker import DepthFrameMaker
-from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.sensors.labels import class_table_from_names
-from octoreplay.records import CameraModel, FrameCounts
-from octoreplay.transforms import inverse, pose_matrix
 
 TABLE = class_table_from_names({"r": NAMES})
 START = 100 * SECOND

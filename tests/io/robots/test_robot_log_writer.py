@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
 from octoreplay.records import CameraModel, ClassTable, SemanticClass
-from stored_messages import matrix, pixels, read_messages, stamp_ns
+from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 CAMERA = CameraModel(width=5, height=3, fx=4.0, fy=4.5, cx=2.25, cy=1.5)
 CLASSES = ClassTable((SemanticClass(1, "road", (1, 2, 3), (7, 9)), SemanticClass(2, "tree", (4, 5, 6), (2,))), (255,))

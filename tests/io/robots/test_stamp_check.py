@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from log_factory import SECOND
 from octoreplay.io.robots.stamp_check import MAX_JUMP_NS, MAX_STAMP_NS, StampCheck
+from support.log_factory import SECOND
 
 START = 1_700_000_000 * SECOND
 

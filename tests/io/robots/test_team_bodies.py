@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log_factory import SECOND, robot_entries, write_mcap
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.team_bodies import TeamBodies
+from support.log_factory import SECOND, robot_entries, write_mcap
 
 START = 100 * SECOND
 BOX = (-0.5, -0.4, 0.0, 0.5, 0.4, 0.6)

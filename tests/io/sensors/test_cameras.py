@@ -7,11 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from log_factory import Factory
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Calibration, convert
 from octoreplay.io.sensors.cameras import FISHEYE_MODELS, POLYNOMIAL_MODELS, camera_model
 from octoreplay.records import CameraModel
+from support.log_factory import Factory
 
 HERE = "a.mcap: topic '/camera_info' at 1.000 s"
 K = (70.0, 0, 31, 0, 71, 23, 0, 0, 1)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log_factory import Factory, ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Cloud, CloudField, Scan, convert
 from octoreplay.io.sensors.clouds import decode_cloud, decode_scan, label_field
+from support.log_factory import Factory, ros2
 
 HERE = "a.mcap: topic '/points' at 1.000 s"
 KINDS = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]

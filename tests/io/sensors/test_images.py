@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log_factory import ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import CompressedImage, Image, convert
@@ -25,6 +24,7 @@ from octoreplay.io.sensors.images import (
     decode_labels,
     encoding_and_size,
 )
+from support.log_factory import ros2
 
 HERE = "a.mcap: topic '/x' at 1.000 s"
 KINDS = {

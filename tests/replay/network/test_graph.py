@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import NetworkConfig, ScheduleEntry
 from octoreplay.errors import ConfigError
-from octoreplay.replay.network.graph import TeamNetwork, build_graph, check_team_graph, settle_ticks_max, step_size
+from octoreplay.replay.network.graph import TeamNetwork, build_graph, check_team_graph, step_size
+from octoreplay.replay.settling import settle_ticks_max
 from reference import graph as reference
 
 NAMES = ("husky_1", "husky_2", "husky_3", "husky_4", "husky_5", "husky_6", "husky_7")
@@ -569,6 +570,6 @@ def test_a_partition_leaves_the_parts_of_the_graph_that_lie_within_groups(tick):
 
 
 def test_importing_the_module_leaves_networkx_out():
-    code = "import sys, octoreplay.replay.graph; print('networkx' in sys.modules)"
+    code = "import sys, octoreplay.replay.network.graph; print('networkx' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -13,11 +13,11 @@ import pytest
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.report import verdict_tables
-from result_factory import tick_metrics, write_until
+from support.result_factory import tick_metrics, write_until
 
-FIXTURES = Path(__file__).parent / "fixtures"
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
 def octoreplay(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -150,12 +150,10 @@ def test_an_interrupted_run_fails(tmp_path: Path) -> None:
 
 
 def test_wrong_usage_of_check(runs: dict[str, Path], tmp_path: Path) -> None:
-    assert "no limit is given; give at least one, such as --max-label-disagreement 0.001" in ends(
-        2, "check", runs["pair"]
-    )
+    assert "no limit given; give at least one, such as --max-label-disagreement 0.001" in ends(2, "check", runs["pair"])
     assert "No such option '--max-fun'" in ends(2, "check", runs["pair"], "--max-fun", 1)
     assert "is more than 1; it is a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
-    assert "needs the true world; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
+    assert "needs the truth; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
     assert "must end in .json" in ends(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
 
 

@@ -15,7 +15,7 @@ from octoreplay.mapping.quantise import quantised, top_classes
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.public_map import PublicMap
-from octree_factory import cells_of, octree_of
+from support.octree_factory import cells_of, octree_of
 
 SOURCE = Source(0, 0)
 

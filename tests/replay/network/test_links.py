@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.config import ConfigError
 from octoreplay.config.network import LinkConfig
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
+from octoreplay.errors import ConfigError
 from octoreplay.replay.network.links import LinkCounts, Links
 
 SECOND = 1_000_000_000

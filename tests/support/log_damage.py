@@ -17,10 +17,10 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from log_factory import ROS1
 from octoreplay.errors import OctoreplayError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.ros_types import typestore
+from support.log_factory import ROS1
 
 STRING = "std_msgs/msg/String"
 NUM_MESSAGES = 60

@@ -20,9 +20,6 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-import room
-from log_damage import MUTATIONS, damage_log, reseal_chunk
-from log_factory import Row, write_rows
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -33,10 +30,13 @@ from octoreplay.io.robots.discover import describe, discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import ClassTable, SemanticClass
-from octoreplay.replay.session import replay_team
-from scan_maps import MAP, SENSOR, octree_of
+from octoreplay.replay.run import replay_team
+from support import room
+from support.log_damage import MUTATIONS, damage_log, reseal_chunk
+from support.log_factory import Row, write_rows
+from support.scan_maps import MAP, SENSOR, octree_of
 
-FIXTURES = Path(__file__).parent / "fixtures"
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 LOGS = tuple(
     sorted(
         path.relative_to(FIXTURES).as_posix()
