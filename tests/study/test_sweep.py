@@ -26,7 +26,7 @@ from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
 from support.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
-from study.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
+from support.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 SETTINGS = {"resolution": 0.6, "duration": 2.0}
