@@ -11,9 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.evaluate.runs import Region
-from octoreplay.evaluate.scores import agreement, no_truth_scores, truth_scores
-import dense_scores
 from octoreplay.evaluate.morton_intervals import Region
 from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import Truth

@@ -14,9 +14,8 @@ import pytest
 from octoreplay.errors import OutputError
 from octoreplay.evaluate.records import SCORES, MapScores, TruthScores
 from octoreplay.records import CENTRAL
-from octoreplay.report.evaluation_files import SCORES, evaluation_csv, evaluation_json, write_evaluation
-from support.evaluation_factory import evaluation
 from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json, write_evaluation
+from support.evaluation_factory import evaluation
 
 
 def rows(text: str) -> list[dict[str, str]]:

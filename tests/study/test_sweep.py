@@ -25,7 +25,6 @@ from octoreplay.study.numbers import run_numbers
 from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
-from support.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
 from support.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
