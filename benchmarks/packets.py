@@ -35,9 +35,9 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import PacketFormat
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
-from octoreplay.mapping.kernels.storage import KEY_BITS
-from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values
+from octoreplay.mapping.octree import KEY_BITS, SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
+from octoreplay.mapping.streams import leaf_list, leaf_values
 from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array, TickMetrics
 from octoreplay.replay.exchange.messages import Source
 from octoreplay.replay.session import Session

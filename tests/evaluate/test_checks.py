@@ -56,7 +56,7 @@ def run_summary(metrics: Sequence[TickMetrics]) -> RunSummary:
 def stored(folder: Path, metrics: Sequence[TickMetrics], of_run: RunSummary | None = None) -> Path:
     """A finished result with these ticks."""
     path = folder / "result.mcap"
-    with ResultWriter(path, team(folder), CLASSES) as writer:
+    with ResultWriter(path, team(folder)) as writer:
         for tick in metrics:
             writer.write_metrics(tick)
         writer.complete(run_summary(metrics) if of_run is None else of_run)

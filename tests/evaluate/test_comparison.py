@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.config.class_file import class_table
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate import comparison
 from octoreplay.evaluate.comparison import LabelChange, compare_results
@@ -34,14 +34,14 @@ def stored(folder: Path, maps: dict[str, dict], *, classes=CLASSES, late=None, i
     folder.mkdir(exist_ok=True)
     config = team(folder)
     robots = tuple(
-        RobotConfig(name, (folder / "alpha.bag",), depth_topic="/depth", pose_topic="/odom")
+        ResolvedRobot(name, (folder / "alpha.bag",), depth_topic="/depth", pose_topic="/odom")
         for name in maps if name != CENTRAL
     )  # fmt: skip
     parameters = {"resolution": RESOLUTION, **parameters}
     config = dataclasses.replace(config, robots=robots, classes=classes).with_parameters(parameters)
     path = folder / "result.mcap"
     ticks = [tick_metrics(tick) for tick in (1, 2, 3)]
-    with ResultWriter(path, config, classes) as writer:
+    with ResultWriter(path, config) as writer:
         for tick in ticks:
             writer.write_metrics(tick)
         for number, (at, content) in enumerate(((1, maps), (3, late or {}))):

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
@@ -22,7 +22,7 @@ CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
 def robot_of(tmp_path, name, **fields):
     """A robot that drives along x and sees a wall 1 m ahead of its camera, all the time."""
     path = write_mcap(tmp_path / f"{name}.mcap", robot_entries(num_frames=10, labels=False))
-    return RobotConfig(
+    return ResolvedRobot(
         name, (path,), depth_topic="/camera/depth/image_raw", camera_info_topic="/camera/depth/camera_info",
         pose_topic="/odom", label_topic="", **fields,
     )  # fmt: skip

@@ -431,8 +431,8 @@ def _change_steps(monkeypatch, change):
     """Every robot's iterations are done as ``change`` describes them."""
     right = consensus_module.team_step
 
-    def wrong(steps, *, rule, **kwargs):
-        return right([change(step) for step in steps], rule=rule, **kwargs)
+    def wrong(steps, **kwargs):
+        return right([change(step) for step in steps], **kwargs)
 
     monkeypatch.setattr(consensus_module, "team_step", wrong)
 
@@ -485,10 +485,10 @@ def _free_is_not_reset(monkeypatch):
     """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
     right = consensus_module.team_step
 
-    def wrong(steps, *, rule, **kwargs):
+    def wrong(steps, **kwargs):
         mixed = [dataclasses.replace(step, own=step.own.copy(), gamma=0.0) for step in steps]
-        right(mixed, rule=rule, **kwargs)
-        changes = right(steps, rule=rule, **kwargs)
+        right(mixed, **kwargs)
+        changes = right(steps, **kwargs)
         for own, without in ((step.own, other.own) for step, other in zip(steps, mixed, strict=True)):
             codes = own.codes[own.bricks.masks[: own.num_bricks].any(axis=1)]
             rows, others = class_rows(own, own.find(codes)), class_rows(without, without.find(codes))
@@ -537,8 +537,8 @@ def _half_a_step(monkeypatch):
 def _neighbours_cells_are_not_taken(monkeypatch):
     right = consensus_kernels.join_columns
 
-    def wrong(table, columns, is_awake, known, has_block, layout):
-        right(table, columns, is_awake, known, has_block, layout)
+    def wrong(table, columns, needs_update, known, has_block, layout):
+        right(table, columns, needs_update, known, has_block, layout)
         known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
 
     monkeypatch.setattr(consensus_kernels, "join_columns", wrong)

@@ -11,15 +11,12 @@ import numpy.typing as npt
 from octoreplay.evaluate.morton_intervals import Region, common_intervals
 from octoreplay.evaluate.records import TruthScores
 from octoreplay.evaluate.truth import Truth
-from octoreplay.log_odds import best_labels, team_log_odds
+from octoreplay.log_odds import TIE_TOLERANCE, best_labels, shifted_exp_sum, team_log_odds
 from octoreplay.mapping.octree import LeafSpans
 from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 
 NUM_BINS = 15
 """Number of bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
-
-TIE = 1e-3
-"""A label agrees where the reference's log-odds of it are within this of its largest."""
 
 
 def truth_scores(
@@ -76,7 +73,7 @@ def agreement(
     values = reference.deviations + np.float32(reference_prior)
     best = np.maximum(values.max(axis=1, initial=0.0), 0.0)[other]
     of_label = np.where(labels > 0, values[other, np.maximum(labels, 1) - 1], 0.0)
-    agrees = of_label >= best - np.float32(TIE)
+    agrees = of_label >= best - np.float32(TIE_TOLERANCE)
     is_occupied = best_labels(values) > 0
     weights = intervals.num_cells[both] * agrees
     parts = weights.sum(), weights[is_occupied[other]].sum()
@@ -159,7 +156,7 @@ def _calibration_errors(
     num_judged = num_cells - surface.num_void
     # Of a leaf that the map calls free, only the surface in it counts as occupied, and all of it is wrong.
     num_surface = surface.num_cells - surface.num_void
-    confidence = _confidence(by_class)
+    confidence = 1.0 / shifted_exp_sum(by_class, class_axis=0).astype(np.float64)
     bins = np.clip(np.ceil(confidence * NUM_BINS).astype(np.int64) - 1, 0, NUM_BINS - 1)
     return (
         _calibration_error(bins, confidence, num_correct, num_judged),
@@ -174,13 +171,6 @@ def _calibration_error(
     correct = _sums(bins, num_correct, NUM_BINS)
     expected = np.bincount(bins, confidence * num_cells, NUM_BINS)
     return _ratio(np.abs(correct - expected).sum(), num_cells.sum())
-
-
-def _confidence(by_class: Float32Array) -> Float64Array:
-    """Probability (L,) of the most probable class from log-odds (C, L), divided in float64 to keep the bins' edges."""
-    largest = np.maximum(by_class.max(axis=0, initial=-np.inf), np.float32(0.0))
-    total: Float64Array = (np.exp(-largest) + np.exp(by_class - largest).sum(axis=0)).astype(np.float64)
-    return 1.0 / total
 
 
 def _sums(places: npt.NDArray[np.integer], weights: Int64Array, size: int) -> Int64Array:

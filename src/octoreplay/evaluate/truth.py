@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.ply_files import read_labelled_ply
-from octoreplay.mapping.kernels.storage import KEY_OFFSET
-from octoreplay.mapping.octree import keys_to_codes
+from octoreplay.mapping.octree import KEY_OFFSET, keys_to_codes
 from octoreplay.mapping.surface import CellVotes, num_cuts, points_on_triangles
 from octoreplay.records import NO_CLASS, BoolArray, ClassTable, Float64Array, Int64Array, UInt8Array
 

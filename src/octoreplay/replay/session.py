@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import TypeVar
 
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
-from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.records import Frame, RobotPose
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import check_budget
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
@@ -35,8 +34,8 @@ class Session:
 
     Parameters
     ----------
-    config : RunConfig
-        Resolved configuration with a class table.
+    config : ResolvedRun
+        Resolved configuration.
     sources : sequence of FrameSource
         Frames of each robot, in the order of ``config.robots``.
     threads : Executor
@@ -63,14 +62,12 @@ class Session:
 
     def __init__(
         self,
-        config: RunConfig,
+        config: ResolvedRun,
         sources: Sequence[FrameSource],
         threads: Executor,
         *,
         bodies: Bodies | None = None,
     ) -> None:
-        if config.classes is None:
-            raise InputError("a session needs a class table")
         self.config = config
         self.stop_reason = ""
         self.is_symmetric = True
@@ -81,8 +78,8 @@ class Session:
         self._timeline = Timeline(sources)
         self._bodies = bodies
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
-        self._encoder = PacketEncoder(config.packet)
-        self.team = make_team(config, config.classes.num_classes, self._encoder)
+        self._packet_codec = PacketCodec(config.packet)
+        self.team = make_team(config, config.classes.num_classes, self._packet_codec)
         self._links: Links[Content] = Links(config)
         self._measurer = TickMeasurer(config, config.classes.num_classes, threads)
         self._period_ns = round(config.network.publish_period * 1e9)
@@ -125,7 +122,7 @@ class Session:
         max_change = self._iterate(graph, gamma_factor, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
         metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
-        self._encoder.end_tick()
+        self._packet_codec.end_tick()
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots), self._measurer.oracle,
             tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in robots if r.T_team_sensor is not None), metrics,
@@ -160,7 +157,7 @@ class Session:
         """A robot's frame with the boxes of the other robots."""
         if self._bodies is None:
             return frame
-        return dataclasses.replace(frame, boxes=(*frame.boxes, *self._bodies.seen_by(index, frame.stamp_ns)))
+        return self._bodies.add_to(index, frame)
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Publication of each robot that is active and due in this tick; its packets are handed to the links."""

@@ -119,9 +119,7 @@ def _squares(axes: Axes, rows: Sequence[Row], column: str, form: str) -> None:
 def _bound(rows: Sequence[Row]) -> Figure:
     """Factor of Phi per settling tick: theory as lines, measurements as markers."""
     figure = new_figure(7.0, 4.2)
-    axes = style(
-        figure.add_subplot(), "Mixing (bayes, settling)", "epsilon / bound", "factor of Φ per tick"
-    )
+    axes = style(figure.add_subplot(), "Mixing (bayes, settling)", "epsilon / bound", "factor of Φ per tick")
     for index, ((topology,), part) in enumerate(groups(rows, "topology").items()):
         shares = [row["epsilon_share"] for row in part]
         for name, form, label in (("contraction_theory", "-", f"{topology}, theory"), ("contraction", "", topology)):

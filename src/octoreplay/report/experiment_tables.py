@@ -178,9 +178,7 @@ def _noise(found: Tables) -> Iterator[str]:
 
 def _choose(found: Tables) -> Iterator[str]:
     columns = (
-        Column(
-            "agreement over the logs, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")
-        ),
+        Column("agreement over the logs, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")),
         Column("agreement, settled", _pair("agreement", "agreement_occupied")),
         Column("mean IoU", _share("mean_iou", 3)),
         Column("kB per robot and second", _kilobytes("sent_bytes_per_second")),

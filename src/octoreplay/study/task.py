@@ -118,12 +118,10 @@ def _replay_and_measure(task: Task) -> Row:
 
 
 def _compile_first() -> None:
-    """Compile the kernels if none are cached, so that the measured time does not include it."""
-    from octoreplay.mapping.kernels import compiler
-    from octoreplay.mapping.warm_up import compile_kernels
+    """Compile the kernels if needed, so that the run's time does not include compilation."""
+    from octoreplay.mapping.warm_up import compile_if_needed
 
-    if compiler.cache_is_empty():
-        compile_kernels()
+    compile_if_needed()
 
 
 def _loss(counts: FrameCounts) -> str:

@@ -13,9 +13,9 @@ from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknowledgement
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from support.octree_factory import octree_of
 
 NUM_BRICKS = 6
@@ -41,7 +41,7 @@ class Author:
 
     def __init__(self, index, config, random):
         self.source = Source(index, 0)
-        self.exchange = Exchange(config, PacketEncoder(config))
+        self.exchange = Exchange(config, PacketCodec(config))
         self.versions = {}
         self._random = random
         self._cells = {}
@@ -147,7 +147,7 @@ def test_forwarded_maps_come_through_whole(name, decodes, seed):
 def test_without_acknowledgement_a_loss_is_a_gap_until_the_next_whole_map():
     config = PacketConfig(packets="delta", acknowledge=False, key_frame_every=4)
     author = Author(0, config, np.random.default_rng(0))
-    receiver = Exchange(config, PacketEncoder(config))
+    receiver = Exchange(config, PacketCodec(config))
     fates = []
     for tick in range(1, 10):
         author.publish(tick)
@@ -161,12 +161,12 @@ def test_without_acknowledgement_a_loss_is_a_gap_until_the_next_whole_map():
 
 
 def test_a_receiver_that_lost_everything_gets_a_whole_map_again():
-    author, receiver = Author(0, DELTA, np.random.default_rng(0)), Exchange(DELTA, PacketEncoder(DELTA))
+    author, receiver = Author(0, DELTA, np.random.default_rng(0)), Exchange(DELTA, PacketCodec(DELTA))
     kinds, gaps = [], []
     for tick in range(1, 8):
         author.publish(tick)
         if tick == 4:
-            receiver = Exchange(DELTA, PacketEncoder(DELTA))
+            receiver = Exchange(DELTA, PacketCodec(DELTA))
         ((_, message),) = author.exchange.outbox([1], [author.source], keep_alive=True)
         receipt, answer = receiver.receive(0, message)
         author.exchange.acknowledged(1, answer)
@@ -179,7 +179,7 @@ def test_a_receiver_that_lost_everything_gets_a_whole_map_again():
 def test_a_delta_holds_what_changed_since_what_was_acknowledged():
     octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [3.0, 4.0], (8, 0, 0): [5.0, 6.0]})
     octree.revisions[octree.find(octree_of({(4, 0, 0): 0.0}).codes)] = 5
-    author, source = Exchange(DELTA, PacketEncoder(DELTA)), Source(0, 0)
+    author, source = Exchange(DELTA, PacketCodec(DELTA)), Source(0, 0)
     author.hold(source, HeldMap(octree, 6))
     for base, expected in ((None, 3), (1, 3), (2, 1), (5, 1), (6, 0)):
         if base is not None:
@@ -190,7 +190,7 @@ def test_a_delta_holds_what_changed_since_what_was_acknowledged():
 
 
 def test_who_sends_a_map_needs_no_copy_of_it():
-    exchanges = [Exchange(PacketConfig(), PacketEncoder(PacketConfig())) for _ in range(2)]
+    exchanges = [Exchange(PacketConfig(), PacketCodec(PacketConfig())) for _ in range(2)]
     source = Source(7, 0)
     exchanges[0].held[source] = HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3)
     ((_, message),) = exchanges[0].outbox([1], [source], keep_alive=False)
@@ -200,7 +200,7 @@ def test_who_sends_a_map_needs_no_copy_of_it():
 
 
 def test_a_damaged_acknowledgement_is_dropped():
-    exchange = Exchange(DELTA, PacketEncoder(DELTA))
+    exchange = Exchange(DELTA, PacketCodec(DELTA))
     source = Source(0, 0)
     exchange.hold(source, HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3))
     exchange.acknowledged(1, _acknowledgement(source, 3).damaged(0.5))
@@ -221,8 +221,8 @@ def test_within_a_budget_everything_arrives_later(seed, cast):
     random = np.random.default_rng(seed)
     config = dataclasses.replace(BUDGET, cast=cast)
     octree = SemanticOctree(0.25, 2)
-    exchange = Exchange(config, PacketEncoder(config))
-    receivers = {receiver: Exchange(config, PacketEncoder(config)) for receiver in (1, 2)}
+    exchange = Exchange(config, PacketCodec(config))
+    receivers = {receiver: Exchange(config, PacketCodec(config)) for receiver in (1, 2)}
     source = Source(0, 0)
     for tick in range(1, 200):
         if tick <= 60:
@@ -259,7 +259,7 @@ def test_what_is_forwarded_in_pieces_lacks_nothing_after_a_late_answer():
     """A delta that overlaps what is there must not make a brick look newer than one that changed after it."""
     rng = np.random.default_rng(0)
     source, octree = Source(0, 0), SemanticOctree(0.25, 2)
-    author, forwarder, last = (Exchange(BUDGET, PacketEncoder(BUDGET)) for _ in range(3))
+    author, forwarder, last = (Exchange(BUDGET, PacketCodec(BUDGET)) for _ in range(3))
 
     def publish(brick, version):
         keys = [(4 * brick + x, y, z) for x in range(4) for y in range(2) for z in range(2)]
