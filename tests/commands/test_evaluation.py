@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from octoreplay import evaluate_result
 from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json
+from support.processes import octoreplay
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-
-
-def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the command line as a process with a terminal width of 100 columns."""
-    return subprocess.run(
-        [sys.executable, "-m", "octoreplay", *map(str, arguments)], cwd=folder, text=True, capture_output=True,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-    )  # fmt: skip
 
 
 def fails(code: int, sentence: str, *arguments: object) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,17 +12,10 @@ from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
 from octoreplay.replay.run import replay_team
 from octoreplay.report import verdict_tables
+from support.processes import octoreplay
 from support.result_factory import tick_metrics, write_until
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-
-
-def octoreplay(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command line as a process with a terminal width of 100 columns."""
-    return subprocess.run(
-        [sys.executable, "-m", "octoreplay", *map(str, arguments)], text=True, capture_output=True,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-    )  # fmt: skip
 
 
 def ends(code: int, *arguments: object) -> str:
