@@ -44,8 +44,10 @@ def _option(parameter: Parameter) -> _ParameterOption:
     name = parameter.name.replace("_", "-")
     declaration = f"--{name}/--no-{name}" if parameter.kind == "bool" else f"--{name}"
     kind: Any = {"float": float, "int": int, "bool": bool}.get(parameter.kind, str)
-    shown = parameter.kind != "bool" and parameter.default not in (None, ())
-    default = f"  [default: {parameter.default}]" if shown else ""
+    value = parameter.default
+    if parameter.kind == "bool":
+        value = name if value else f"no-{name}"
+    default = "" if value in (None, ()) else f"  [default: {value}]"
     option = _ParameterOption(
         [declaration, parameter.name],
         type=click.Choice(parameter.choices) if parameter.choices else kind,
