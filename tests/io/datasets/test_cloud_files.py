@@ -83,7 +83,7 @@ def test_a_ply_file_cut_anywhere_is_never_read(tmp_path, text):
 @pytest.mark.parametrize("text", [True, False])
 @pytest.mark.parametrize(
     ("new", "message"),
-    [(b"vertex 2", "more follows than its header announces"), (b"vertex 4000000000000", "is cut or damaged"),
+    [(b"vertex 2", "it is longer than its header says"), (b"vertex 4000000000000", "is cut or damaged"),
      (b"vertex -3", "is cut or damaged"), (b"vertex three", "is cut or damaged"), (b"point 3", "no element 'vertex'")],
 )  # fmt: skip
 def test_a_ply_header_that_lies_is_found_out(tmp_path, text, new, message):
@@ -133,7 +133,7 @@ def test_what_is_no_label_is_65535(tmp_path):
 
 def test_a_cloud_without_coordinates_names_its_fields(tmp_path):
     path = save_pcd(tmp_path / "a.pcd", "x y label", "4 4 4", "F F U", ["1 2 3"])
-    with pytest.raises(InputError, match=r"has no field 'z' of one number a point; its fields are x, y, label"):
+    with pytest.raises(InputError, match=r"has no field 'z' with one number per point; its fields are x, y, label"):
         read_cloud(path)
 
 

@@ -342,7 +342,7 @@ def remove(pattern: str):
     [
         (spoil("velodyne/000001.bin", bytes(40)), r"000001\.bin: 40 bytes are not KITTI's points"),
         (spoil("labels/000001.label", bytes(12)), r"000001\.label: holds 3 labels of 4 bytes, but its cloud has 4"),
-        (spoil("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2), "has 2 poses; the folder has 3 clouds, of which 3 are"),
+        (spoil("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2), "has 2 poses; the folder has 3 frames, 3 of them chosen"),
         (spoil("poses.txt", "1 0 0 0 0 1 0\n" * 3), r"poses\.txt line 1: expects 8 numbers"),
         (spoil("poses.txt", ""), r"poses\.txt: holds no poses"),
         (spoil("poses.txt", "nan " * 12 + "\n" + "inf " * 12 + "\n" + "nan " * 12),
@@ -351,7 +351,7 @@ def remove(pattern: str):
         (remove("poses.txt"), "no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one"),
         (spoil("times.txt", "1\n2\n"), r"times\.txt: has 2 times; the folder has 3 frames"),
         (spoil("times.txt", "1\n2\n3000000000"), r"times\.txt: times must be below 2\^31 s"),
-        (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; leave the clouds of one kind in it"),
+        (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; keep clouds of one format in it"),
         (remove("velodyne/*.bin"), r"no clouds found; looked for \.pcd, \.ply, \.bin, also in velodyne/; the fold"),
     ],
 )  # fmt: skip
@@ -389,7 +389,7 @@ def test_labels_that_begin_later_are_refused(tmp_path):
     folder = pcd_folder(tmp_path / "in")
     first = folder / "scan_2.pcd"
     first.write_text(first.read_text().replace("x y z label", "x y z nothing"))
-    with pytest.raises(InputError, match=r"scan_9\.pcd: has labels, but the clouds before it have none; start with it"):
+    with pytest.raises(InputError, match=r"scan_9\.pcd: has labels, but the clouds before it have none; choose it as"):
         import_clouds(folder, tmp_path / "a.mcap", rate=1.0)
     assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0, first=1).num_labelled == 2
 
@@ -404,7 +404,7 @@ def test_labels_that_begin_later_are_refused(tmp_path):
         ({"robot_id": "a/b"}, ConfigError, "robot id 'a/b'"),
         ({"times": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
         ({"poses": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
-        ({"labels": Path("missing")}, InputError, r"missing: holds no \.label file that is named like a cloud such as"),
+        ({"labels": Path("missing")}, InputError, r"missing: holds no \.label file with the name of a cloud such as"),
     ],
 )
 def test_options_that_do_not_fit(tmp_path, options, error, message):

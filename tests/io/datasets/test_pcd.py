@@ -106,21 +106,21 @@ def test_a_file_may_hold_no_points(tmp_path, data):
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
-    [("DATA ascii", "", "is no PCD file, or cut: its header has no line 'DATA'"),
+    [("DATA ascii", "", "is not a PCD file, or is cut: its header has no line 'DATA'"),
      ("DATA ascii", "DATA zip", "its data is 'zip'; expects ascii"),
      ("FIELDS x y z label", "", "FIELDS, SIZE, TYPE and COUNT do not fit together"),
      ("SIZE 4 4 4 4", "SIZE 4 4 4", "FIELDS, SIZE, TYPE and COUNT do not fit together"),
      ("SIZE 4 4 4 4", "SIZE 4 4 4 four", "line SIZE is '4 4 4 four'; expects integers"),
-     ("SIZE 4 4 4 4", "SIZE 4 4 4 3", "field 'label' has the unknown type U of 1 times 3 bytes"),
+     ("SIZE 4 4 4 4", "SIZE 4 4 4 3", "field 'label' has the unknown type U with 1 x 3 bytes"),
      ("COUNT 1 1 1 1", "COUNT 1 1 1 999999999999", "field 'label' has the unknown type"),
      ("COUNT 1 1 1 1", "COUNT 1 1 1 0", "field 'label' has the unknown type"),
      ("POINTS 3", "POINTS 4", "POINTS, WIDTH and HEIGHT do not fit together"),
      ("POINTS 3", "POINTS -3", "POINTS, WIDTH and HEIGHT do not fit together"),
      ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0 0", "VIEWPOINT is '0 0 0'; expects 7 numbers"),
      ("FIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1",
-      "FIELDS x y z label more\nSIZE 4 4 4 4 4\nTYPE F F F U U\nCOUNT 1 1 1 1 1", "announces 5 columns, but its rows"),
-     ("-1.5 nan 0 8", "", "announces 3 points, but it has 2 rows"),
-     ("4 5 6 9", "4 5 6 9\n4 5 6 9", "announces 3 points, but it has 4 rows"),
+      "FIELDS x y z label more\nSIZE 4 4 4 4 4\nTYPE F F F U U\nCOUNT 1 1 1 1 1", "gives 5 columns, but its rows"),
+     ("-1.5 nan 0 8", "", "gives 3 points, but it has 2 rows"),
+     ("4 5 6 9", "4 5 6 9\n4 5 6 9", "gives 3 points, but it has 4 rows"),
      ("4 5 6 9", "4 5", "row 3 has 2 columns, the first one 4"),
      ("4 5 6 9", "4 5 six 9", "row 3 is not numbers: '4 5 six 9'")],
 )  # fmt: skip
@@ -142,8 +142,8 @@ def test_a_file_cut_anywhere_is_never_read(tmp_path, data):
             read_pcd(tmp_path / "a.pcd")
 
 
-def test_more_binary_points_than_announced_are_refused(tmp_path):
-    with pytest.raises(InputError, match="announces 3 points of 16 bytes, but it holds 64 bytes"):
+def test_more_binary_points_than_the_header_gives_are_refused(tmp_path):
+    with pytest.raises(InputError, match="gives 3 points of 16 bytes, but it holds 64 bytes"):
         read_pcd(save(tmp_path / "a.pcd", HEADER.format("binary"), POINTS.tobytes() + bytes(16)))
     read_pcd(save(tmp_path / "a.pcd", HEADER.format("binary"), POINTS.tobytes() + b"\n"))
 

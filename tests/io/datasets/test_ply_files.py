@@ -72,7 +72,7 @@ def test_a_mesh_cut_anywhere_is_never_read(tmp_path: Path, options: dict[str, ob
 
 @pytest.mark.parametrize("index", [-1, 5])
 def test_a_face_of_vertices_that_are_not_there(tmp_path: Path, index: int) -> None:
-    with pytest.raises(InputError, match=r"a\.ply: is damaged: a face names a vertex that is not there"):
+    with pytest.raises(InputError, match=r"a\.ply: is damaged: a face has a vertex index out of range"):
         read_labelled_ply(save(tmp_path / "a.ply", [[0, 1, index]], [7]))
 
 
@@ -85,7 +85,7 @@ def test_what_a_mesh_needs(tmp_path: Path) -> None:
             read_labelled_ply(path)
     points = np.array([(0, 0, 1)], [("x", "f4"), ("z", "f4"), ("label", "u1")])
     PlyData([PlyElement.describe(points, "vertex")]).write(str(tmp_path / "c.ply"))
-    with pytest.raises(InputError, match=r"c\.ply: its vertices have no number 'y'"):
+    with pytest.raises(InputError, match=r"c\.ply: its vertices have no numeric property 'y'"):
         read_labelled_ply(tmp_path / "c.ply")
     with pytest.raises(InputError, match=r"d\.ply: cannot be read"):
         read_labelled_ply(tmp_path / "d.ply")

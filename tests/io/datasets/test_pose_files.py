@@ -61,7 +61,7 @@ def test_kitti_camera_poses_become_the_lidars_with_calib(tmp_path):
 @pytest.mark.parametrize("lines", [("P0: " + "1 " * 12,), ("Tr: " + "nan " * 12,)])
 def test_a_calibration_without_the_lidar_is_refused(tmp_path, lines):
     save(tmp_path / "calib.txt", *lines)
-    with pytest.raises(InputError, match=r"calib\.txt: has no usable row 'Tr:', lidar to camera; mend it, or take it"):
+    with pytest.raises(InputError, match=r"calib\.txt: has no usable row 'Tr:' \(lidar to camera\); correct it"):
         read_poses(save(tmp_path / "poses.txt", kitti_row(pose(0))))
 
 

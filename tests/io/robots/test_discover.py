@@ -219,7 +219,7 @@ def test_the_map_frame_of_tf_is_the_root_above_the_sensor(tmp_path):
     ]
     (robot,) = discover([write_mcap(tmp_path / "r.mcap", entries)])
     assert robot.map_frame == "earth"
-    with pytest.raises(InputError, match="TF knows no frame above the sensor's frame 'lens'"):
+    with pytest.raises(InputError, match="TF has no frame above the sensor's frame 'lens'"):
         resolve(run_of(replace(robot, map_frame=None, sensor_frame="lens")))
 
 
@@ -230,7 +230,7 @@ def test_the_map_frame_of_tf_is_the_root_above_the_sensor(tmp_path):
         (INFO, f"there is no CameraInfo for '{DEPTH}'; give intrinsics"),
         (
             "/odom",
-            r"no poses \(.*\) for robot 'r'; give pose_file: .*, or, if the sensor stands still, pose_topic",
+            r"no poses \(.*\) for robot 'r'; give pose_file: .*, or, if the sensor does not move, pose_topic",
         ),
     ],
 )
@@ -259,7 +259,11 @@ def test_a_sensor_that_stands_still(tmp_path):
     ("role", "name", "sentence"),
     [
         ("depth_topic", "/depth", "topic '/depth' not found; image topics: '/camera/depth/image_raw', '/camera/labels"),
-        ("depth_topic", "/odom", "topic '/odom' is of type nav_msgs/msg/Odometry, no depth_topic; image topics: "),
+        (
+            "depth_topic",
+            "/odom",
+            "topic '/odom' is of type nav_msgs/msg/Odometry and cannot be the depth_topic; image topics: ",
+        ),
         ("pose_topic", "/pose", "topic '/pose' not found; pose topics: '/odom', '/tf_static'"),
         ("cloud_topic", "/points", "topic '/points' not found; there are no point cloud or laser scan topics"),
         ("camera_info_topic", "/x", "topic '/x' not found; CameraInfo topics: '/camera/depth/camera_info'"),
@@ -310,7 +314,7 @@ def test_a_team_without_labels_maps_occupancy(tmp_path):
 def test_labels_without_a_table_or_of_some_robots_only_are_refused(tmp_path):
     entries = [e for e in robot_entries() if e.topic != "/label_info"]
     path = write_mcap(tmp_path / "r.mcap", entries)
-    with pytest.raises(ConfigError, match=f"labels on '{LABELS}' but no LabelInfo says what they mean; give 'classes'"):
+    with pytest.raises(ConfigError, match=f"no LabelInfo names the labels on '{LABELS}'; give 'classes'"):
         resolve(run_of(*discover([path])))
     with_labels = write_mcap(tmp_path / "with.mcap", robot_entries())
     without = write_mcap(tmp_path / "without.mcap", robot_entries(labels=False))
@@ -325,7 +329,7 @@ def test_clouds_are_taken_where_there_is_no_depth(tmp_path, with_label):
     assert (robot.depth_topic, robot.cloud_topic, robot.sensor_frame) == (None, "/points", "camera")
     assert count_frames(robot) == 1
     if with_label:
-        with pytest.raises(ConfigError, match="labels on '/points' but no LabelInfo"):
+        with pytest.raises(ConfigError, match="no LabelInfo names the labels on '/points'"):
             resolve(run_of(robot))
     else:
         assert resolve(run_of(robot)).classes.names == ("occupied",)
@@ -363,7 +367,7 @@ def test_describe_lists_what_is_missing_instead_of_raising(tmp_path):
     assert any("no poses" in sentence for sentence in a)
     assert any("no transform from 'camera' to 'base_link'" in sentence for sentence in b)
     assert any("the log holds no messages" in sentence for sentence in c)
-    assert any("no LabelInfo says what they mean" in sentence for sentence in description.missing)
+    assert any("no LabelInfo names the labels" in sentence for sentence in description.missing)
     assert description.overlap_ns is not None
     description = describe([tmp_path / "missing.mcap", paths[0]])
     assert [log.error for log in description.logs] == [f"{tmp_path / 'missing.mcap'}: no such file", None]

@@ -172,10 +172,12 @@ def test_a_scan_is_a_cloud_without_labels():
 
 def test_messages_of_another_type_are_damage_and_no_camera():
     maker = CloudFrameMaker(robot_of(cloud_topic=DEPTH), None)
-    with pytest.raises(DamagedMessageError, match=r"topic '/depth' at .*: is of type sensor_msgs/msg/Image, no point"):
+    with pytest.raises(
+        DamagedMessageError, match=r"topic '/depth' at .*: is of type sensor_msgs/msg/Image, not a point"
+    ):
         make(maker, DEPTH_IMAGE)
     for depth, label in ((cloud(), LABEL_IMAGE), (DEPTH_IMAGE, cloud())):
-        with pytest.raises(DamagedMessageError, match=r"is of type sensor_msgs/msg/PointCloud2, no image"):
+        with pytest.raises(DamagedMessageError, match=r"is of type sensor_msgs/msg/PointCloud2, not an image"):
             make(depth_maker(INFO_MESSAGE), depth, label, None)
     with pytest.raises(InputError, match=r"is of type sensor_msgs/msg/Image, no CameraInfo"):
         DepthFrameMaker(robot_of(depth_topic=DEPTH), None, DEPTH_IMAGE)

@@ -137,7 +137,7 @@ def test_stamped_poses_with_a_given_mount(tmp_path, kind):
     rows = [row(stamp) for stamp in STAMPS]
     poses = Poses(tmp_path, rows, pose_topic="/pose", T_body_sensor=(*MOUNT[0], *MOUNT[1]))
     poses.check(lambda stamp: pose_matrix(position(stamp), IDENTITY) @ pose_matrix(*MOUNT))
-    with pytest.raises(InputError, match=r"topic '/pose' at .* s: the poses do not name .* give T_body_sensor"):
+    with pytest.raises(InputError, match=r"topic '/pose' at .* s: the poses have no child frame; give T_body_sensor"):
         Poses(tmp_path, [*rows, *static()], pose_topic="/pose")
 
 
@@ -321,7 +321,7 @@ def test_poses_without_a_time_each_are_refused_with_both_counts(tmp_path):
     with pytest.raises(InputError) as caught:
         Poses(tmp_path, images(), pose_file=kitti)
     assert str(caught.value) == (
-        f"{kitti}: has 7 poses, but '{IMAGE}' 11 messages; give pose_times: a file with a time [s] for every pose"
+        f"{kitti}: has 7 poses, but '{IMAGE}' 11 messages; give pose_times: a file with the time [s] of each pose"
     )
     times = tmp_path / "times.txt"
     times.write_text("1\n2\n")
@@ -421,5 +421,5 @@ def test_a_message_of_another_type_on_the_pose_topic_is_damage(tmp_path):
     pixels = np.ones((1, 1), np.uint16)
     poses = Poses(tmp_path, [*odometry(), *static()], pose_topic="/odom")
     other = entry("/odom", "sensor_msgs/msg/Image", ros2.image(START, pixels, "16UC1"), START)
-    with pytest.raises(DamagedMessageError, match=r"topic '/odom' at .*: is of type sensor_msgs/msg/Image, no pose"):
+    with pytest.raises(DamagedMessageError, match=r"topic '/odom' at .*: is of type sensor_msgs/msg/Image, not a pose"):
         poses.source.take(other.message())

@@ -273,7 +273,9 @@ def test_stamped_poses_need_the_sensor_transform(tmp_path):
         if e.topic == "/odom" else e
         for e in robot_entries()
     ]  # fmt: skip
-    with pytest.raises(InputError, match=r"topic '/pose' at 100\.000 s: the poses do not name .* give T_body_sensor"):
+    with pytest.raises(
+        InputError, match=r"topic '/pose' at 100\.000 s: the poses have no child frame; give T_body_sensor"
+    ):
         read_entries(tmp_path, entries, pose_topic="/pose")
     frames, _ = read_entries(tmp_path, entries, pose_topic="/pose", T_body_sensor=(0.0, 0.0, 1.0, *IDENTITY))
     np.testing.assert_allclose(frames[0].T_team_sensor, pose_matrix((5, 0, 1), IDENTITY))
@@ -487,7 +489,7 @@ def test_a_pose_out_of_reach_is_none(tmp_path, x):
 def test_poses_that_are_all_out_of_reach_end_with_the_remedy(tmp_path):
     robot = robot_of(write_mcap(tmp_path / "r.mcap", robot_entries()), T_team_map=(5e5, 4e6, 0, *IDENTITY))
     with RobotLog(robot, TimeConfig(), TABLE, reach=1000.0) as log:
-        with pytest.raises(InputError, match=r"all poses of robot 'r' lie outside the map.* 1000 m .*T_team_map"):
+        with pytest.raises(InputError, match=r"all poses of robot 'r' are outside the map.* 1000 m .*T_team_map"):
             list(log.frames())
         assert log.counts == FrameCounts(no_pose=6)
 

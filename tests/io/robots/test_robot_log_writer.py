@@ -209,7 +209,7 @@ def test_a_cloud_needs_coordinates_only_and_may_be_empty(tmp_path):
 )  # fmt: skip
 def test_a_cloud_that_does_not_fit_is_refused(tmp_path, fields):
     with pytest.raises(
-        InputError, match=r"r1\.mcap: topic '/r1/lidar/points': takes clouds in a lidar's log only, whose"
+        InputError, match=r"r1\.mcap: topic '/r1/lidar/points': takes clouds in a lidar's log only; labels"
     ):
         write_cloud(tmp_path / "r1.mcap", **fields)
 

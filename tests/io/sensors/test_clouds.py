@@ -197,7 +197,7 @@ HUGE = 2**32 - 1
 def test_sizes_that_cannot_be_are_damage_and_take_no_memory(changes):
     cloud = cloud_of(columns_of(6000), height=2)
     tracemalloc.start()
-    with pytest.raises(DamagedMessageError, match=r"^a\.mcap: .* are announced"):
+    with pytest.raises(DamagedMessageError, match=r"^a\.mcap: .* are expected"):
         decode_cloud(dataclasses.replace(cloud, **changes), HERE)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -196,12 +196,12 @@ def test_a_photograph_does_not_fill_the_memory_with_colours():
     [
         (
             ClassTable((SemanticClass(1, "road", (1, 2, 255), ()), SemanticClass(2, "tower", (1, 2, 255), ()))),
-            "#0102ff means both 'road' and 'tower'; join them with merge_classes",
+            "#0102ff is both 'road' and 'tower'; join them with merge_classes",
         ),
-        (ClassTable((SemanticClass(1, "a", (1, 2, 3), ()),), (), ((1, 2, 3),)), "#010203 means 'a' and is ignored"),
+        (ClassTable((SemanticClass(1, "a", (1, 2, 3), ()),), (), ((1, 2, 3),)), "#010203 is both 'a' and ignored"),
         (
             ClassTable((SemanticClass(1, "a", (1, 2, 3), (), ()),)),
-            "no class has one; give every class",
+            "no class has a colour; give every class",
         ),
     ],
 )
