@@ -29,7 +29,7 @@ def save(path: Path, text: str, data: bytes = b"") -> Path:
 
 
 def literal_lzf(data: bytes) -> bytes:
-    """LZF that copies nothing: runs of at most 32 bytes."""
+    """LZF data of literals alone, in runs of at most 32 bytes."""
     return b"".join(bytes([len(data[k : k + 32]) - 1]) + data[k : k + 32] for k in range(0, len(data), 32))
 
 
@@ -40,7 +40,7 @@ def compressed(points: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
-def test_the_three_kinds_hold_the_same(tmp_path, data):
+def test_the_three_encodings_hold_the_same_points(tmp_path, data):
     body = {"ascii": ROWS.encode(), "binary": POINTS.tobytes(), "binary_compressed": compressed(POINTS)}[data]
     columns, extra = read_pcd(save(tmp_path / "a.pcd", HEADER.format(data), body))
     assert (list(columns), extra) == (["x", "y", "z", "label"], 0)
@@ -53,7 +53,7 @@ def test_the_three_kinds_hold_the_same(tmp_path, data):
 def test_files_of_open3d_are_read_to_the_bit(tmp_path, options):
     o3d = pytest.importorskip("open3d")
     rng = np.random.default_rng(1)
-    # Rounded numbers repeat, so that the compressed file copies from near and far.
+    # Rounded numbers repeat, so that the compressed file has copies of several distances.
     positions = np.round(rng.normal(size=(5000, 3)) * 4).astype(np.float32)
     positions[:40] = rng.normal(size=(40, 3))
     labels = rng.integers(-3, 70000, size=(5000, 1)).astype(np.int32)
@@ -91,7 +91,7 @@ def test_extra_columns_of_a_text_are_counted_and_not_read(tmp_path):
     np.testing.assert_array_equal(columns["label"], [7, 7, 7])
 
 
-def test_a_number_that_its_type_cannot_hold_is_kept(tmp_path):
+def test_a_number_out_of_its_types_range_is_kept(tmp_path):
     columns, _ = read_pcd(save(tmp_path / "a.pcd", HEADER.format("ascii"), b"1 2 3 -1\n1 2 3 4\n1 2 3 nan\n"))
     np.testing.assert_array_equal(columns["label"], [-1, 4, np.nan])
 
@@ -135,7 +135,7 @@ def test_damage_is_one_sentence(tmp_path, old, new, message):
 def test_a_file_cut_anywhere_is_never_read(tmp_path, data):
     body = {"ascii": ROWS.encode(), "binary": POINTS.tobytes(), "binary_compressed": compressed(POINTS)}[data]
     whole = HEADER.format(data).encode() + body
-    # A text may miss its last line break, and the last digit of its last number is not missed.
+    # A text file may lack its last line break, and a lost last digit cannot be detected.
     for length in range(len(whole) - (2 if data == "ascii" else 0)):
         (tmp_path / "a.pcd").write_bytes(whole[:length])
         with pytest.raises(InputError, match=r"a\.pcd: "):
@@ -150,7 +150,7 @@ def test_more_binary_points_than_the_header_gives_are_refused(tmp_path):
 
 @settings(deadline=None)
 @given(st.binary(max_size=400))
-def test_whatever_bytes_follow_the_header_end_in_one_sentence(tmp_path_factory, body):
+def test_random_data_is_refused_in_one_sentence(tmp_path_factory, body):
     path = tmp_path_factory.getbasetemp() / "any.pcd"
     for data in ("ascii", "binary", "binary_compressed"):
         try:
@@ -166,7 +166,7 @@ copies = st.tuples(st.integers(3, 264), st.integers(1, 8192))
 
 @settings(deadline=None)
 @given(st.lists(st.one_of(literals, copies), max_size=30))
-def test_lzf_is_unpacked_as_its_pieces_say(pieces):
+def test_lzf_literals_and_copies_are_unpacked(pieces):
     packed, plain = bytearray(), bytearray()
     for piece in pieces:
         if isinstance(piece, bytes):
@@ -203,7 +203,7 @@ def test_a_viewpoint_without_a_direction_is_none(tmp_path, line):
 
 @needs_recordings
 def test_the_fourth_column_of_the_real_scans_is_the_label():
-    """Their rows have five columns for four fields: near points of two scans agree in the fourth alone."""
+    """The rows have five columns for four fields; near points of two scans agree in the fourth alone."""
     from scipy.spatial import cKDTree
 
     folder = RECORDINGS / "semantic_pcd" / "bki_sim"

@@ -72,7 +72,7 @@ def tum(folder: Path, stamps: tuple[str, ...] = ("1305031102.000000123", "130503
 
 
 def camera_poses(messages) -> list[tuple[int, np.ndarray]]:
-    """The camera's poses as a reader of the log finds them: odometry after the static transform."""
+    """Camera poses from the log: odometry and the static transform."""
     [(_, tf)] = next(found for topic, found in messages.items() if topic == "/tf_static")
     static = tf.transforms[0].transform
     T_body_camera = matrix(static.translation, static.rotation)
@@ -111,7 +111,7 @@ def test_intrinsics_one_folder_up_and_by_option(tmp_path):
     assert (given.fx, given.fy, given.cx, given.cy) == (5.0, 6.0, 2.0, 1.0)
 
 
-def test_intrinsics_are_not_guessed_for_another_size(tmp_path):
+def test_published_intrinsics_are_used_for_their_size_only(tmp_path):
     folder = seven_scenes(tmp_path / "in", count=1)
     (folder / "camera-intrinsics.txt").unlink()
     with pytest.raises(ConfigError, match=r"is 6x4 pixels, and the folder has no intrinsics; give"):
@@ -159,7 +159,7 @@ def test_times_that_do_not_fit(tmp_path, text, message):
 def test_tum_has_its_own_stamps_and_interpolated_poses(tmp_path):
     summary = import_rgbd(tum(tmp_path / "in"), tmp_path / "a.mcap", intrinsics=(4, 4, 2.5, 1.5))
     messages = read_messages(tmp_path / "a.mcap")
-    # The third picture lies beyond the last pose.
+    # The third image is later than the last pose.
     assert (summary.layout, summary.num_frames, summary.num_without_pose) == ("TUM RGB-D", 2, 1)
     assert [t for t, _ in images(messages, "depth")] == [1305031102_000000123, 1305031102_050000000]
     rotations = Rotation.from_matrix([pose(0)[:3, :3], pose(1)[:3, :3]])
@@ -239,7 +239,7 @@ def repaint(values: np.ndarray):
         (lambda f: [path.unlink() for path in f.glob("*.png")], "no RGB-D sequence found; looked for"),
     ],
 )  # fmt: skip
-def test_what_is_damaged_is_named_and_nothing_is_left(tmp_path, spoiler, message):
+def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
     folder = seven_scenes(tmp_path / "in")
     spoiler(folder)
     (tmp_path / "out").mkdir()
@@ -281,7 +281,7 @@ def test_options_that_do_not_fit(tmp_path, options, error, message):
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_label_pictures_of_another_size_or_name_are_refused(tmp_path):
+def test_label_images_of_another_size_or_name_are_refused(tmp_path):
     folder = scannet(tmp_path / "in")
     save_png(folder / "label" / "9.png", np.zeros((8, 12), np.uint8))
     with pytest.raises(InputError, match=r"9\.png: is 12x8 pixels, but the depth images are 6x4; resize it"):
