@@ -253,14 +253,14 @@ class Result:
 
     def _stamp_of(self, robot_id: str, tick: int) -> int:
         """Stamp of a robot's map stored at a tick."""
-        times = dict(self._reader.state_times(robot_id))
-        if tick not in times:
-            near = sorted(sorted(times, key=lambda stored: abs(stored - tick))[:6])
+        stamp_ns = self._reader.state_stamp(robot_id, tick)
+        if stamp_ns is None:
+            near = sorted(sorted(self.stored_ticks(robot_id), key=lambda stored: abs(stored - tick))[:6])
             raise InputError(
                 f"{self.path}: no map of robot '{robot_id}' is stored at tick {tick}; stored nearby:"
                 f" {', '.join(map(str, near)) or 'none'}"
             )
-        return times[tick]
+        return stamp_ns
 
 
 def open_result(path: str | Path) -> Result:

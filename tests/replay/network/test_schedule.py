@@ -131,7 +131,7 @@ def test_a_robot_has_what_it_scanned_while_it_was_on_and_has_not_forgotten():
         ),
         (
             [ScheduleEntry(20.0, robots_silent=("spot",)), ScheduleEntry(0.0, 30.0, robots_off=("husky", "spot"))],
-            r"robot 'spot' is in two entries at 20 s \(from 0 s to 30 s, and from 20 s on\); end the one before the other",
+            r"robot .spot. is in two entries at 20 s \(from 0 s to 30 s, and from 20 s on\); end one before the other",
         ),
         (
             [

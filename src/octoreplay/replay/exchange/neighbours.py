@@ -171,9 +171,7 @@ class Exchange:
     def _whole_part(self, source: Source, base: int | None) -> MapPart:
         """The packet from a base to the newest state of a map."""
         held = self._held[source]
-        return MapPart(
-            self._codec.packet(source, held, base), source, base, None if self._config.decode_packets else held
-        )
+        return MapPart(self._codec.packet(source, held, base), source, base, None if self._codec.decodes else held)
 
     def _within(self, source: Source, base: int, size: int) -> bytes | None:
         """Packet of at most ``size`` bytes: all changes after version ``base``, or else the oldest of them.
