@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import numpy as np
@@ -45,7 +46,7 @@ def num_occupied(config, *, hides):
         logs = [stack.enter_context(RobotLog(robot, config.time, CLASSES)) for robot in config.robots]
         sources = [stack.enter_context(ReadAhead(log)) for log in logs]
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
-        *_, last = Session(config, sources, bodies=bodies).ticks()
+        *_, last = Session(config, sources, ThreadPoolExecutor(2), bodies=bodies).ticks()
         return [int(np.count_nonzero(octree.leaves(0.0).log_odds[:, 0] > 0)) for octree in last.maps]
 
 

@@ -82,7 +82,7 @@ def test_closing_ends_a_read_without_frames(robot, monkeypatch):
     """Reading ends at the next message after closing, not at the end of the log."""
     seen = []
 
-    def messages(self, topics):
+    def messages(self, topics, *_):
         for number in range(10**9):
             seen.append(number)
             yield from original(self, topics)

@@ -12,7 +12,7 @@ from numpy.polynomial import Polynomial
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Calibration
 from octoreplay.io.sensors.images import MAX_PIXELS
-from octoreplay.records import CameraModel, Float32Array, Float64Array
+from octoreplay.records import CameraModel, Float32Array, Float64Array, read_only
 
 POLYNOMIAL_MODELS = ("plumb_bob", "rational_polynomial")
 FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
@@ -118,8 +118,7 @@ def _rays(
         slopes = np.where(is_real[:, None], flat, np.nan).astype(np.float32)
     slopes = np.ascontiguousarray(slopes.T.reshape(2, height, width))
     # The cached array is shared by all cameras with the same lens.
-    slopes.flags.writeable = False
-    return slopes
+    return read_only(slopes)
 
 
 def _monotonic_limit(numerator: Polynomial, denominator: Polynomial) -> float:
