@@ -1,11 +1,8 @@
-"""``octoreplay check`` and ``octoreplay compare`` as processes, on runs of the small recorded teams."""
+"""Tests of the commands 'check' and 'compare', run as processes on results of the fixture teams."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,21 +12,14 @@ from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
 from octoreplay.replay.run import replay_team
 from octoreplay.report import verdict_tables
+from support.processes import octoreplay
 from support.result_factory import tick_metrics, write_until
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
-def octoreplay(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command line as a process, 100 columns wide."""
-    return subprocess.run(
-        [sys.executable, "-m", "octoreplay", *map(str, arguments)], text=True, capture_output=True,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-    )  # fmt: skip
-
-
 def ends(code: int, *arguments: object) -> str:
-    """What a command says that ends with this code and without a traceback."""
+    """Run a command, check its exit code, and return its output without a traceback."""
     done = octoreplay(*arguments)
     assert done.returncode == code, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
@@ -38,7 +28,7 @@ def ends(code: int, *arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Two robots, once more, with a smaller step, with other cells, and three robots."""
+    """Results by name: two robots twice, with smaller steps and other cells, and three robots."""
     folder = tmp_path_factory.mktemp("runs")
     chosen = {
         "pair": ("pair", {}), "again": ("pair", {}), "slower": ("pair", {"epsilon": 0.1, "settle": 0}),
@@ -55,16 +45,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 # --- compare ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_is_the_same_as_itself_and_as_its_repetition(runs: dict[str, Path]) -> None:
+def test_a_result_equals_itself_and_its_repetition(runs: dict[str, Path]) -> None:
     for other in ("pair", "again"):
         text = ends(0, "compare", runs["pair"], runs[other])
-        assert text.endswith("\nthe same: 3 maps, every cell\n")
+        assert text.endswith("\nthe same: all cells of 3 maps\n")
         assert "logs: the same" in text
-        assert "Settings that differ" not in text
-        assert "Where they differ" not in text
+        assert "Different settings" not in text
+        assert "Places of the differences" not in text
 
 
-def test_another_parameter_gives_other_maps_and_is_named(runs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_changed_parameter_is_named(runs: dict[str, Path], tmp_path: Path) -> None:
     report = tmp_path / "report.json"
     text = ends(1, "compare", runs["pair"], runs["slower"], "--json", report)
     assert "\ndifferent: 2 of 3 maps, in up to " in text
@@ -73,16 +63,16 @@ def test_another_parameter_gives_other_maps_and_is_named(runs: dict[str, Path], 
     assert [one["robot_id"] for one in content["maps"]] == ["husky_1", "husky_2", "central"]
     assert content["maps"][0]["num_differing"] > 0
     assert content["maps"][2]["num_differing"] == 0
-    assert "the same: 1 map," in ends(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
+    assert "the same: all cells of 1 map" in ends(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
 
 
-def test_a_tolerance_makes_near_maps_the_same(runs: dict[str, Path]) -> None:
+def test_maps_are_equal_within_a_tolerance(runs: dict[str, Path]) -> None:
     assert ends(1, "compare", runs["pair"], runs["near"]).splitlines()[-1].startswith("different: 2 of 3 maps")
     text = ends(0, "compare", runs["pair"], runs["near"], "--tolerance", 0.5)
-    assert text.splitlines()[-1].startswith("the same within 0.5: 3 maps, every cell")
+    assert text.splitlines()[-1].startswith("the same within 0.5: all cells of 3 maps")
 
 
-def test_a_larger_team_has_a_map_that_the_smaller_lacks(runs: dict[str, Path]) -> None:
+def test_a_map_that_only_one_result_has_is_named(runs: dict[str, Path]) -> None:
     text = ends(1, "compare", runs["pair"], runs["trio"])
     assert "logs: different" in text
     assert text.endswith("; only B has a map of husky_3\n")
@@ -92,10 +82,10 @@ def test_early_maps_can_be_compared(runs: dict[str, Path]) -> None:
     assert "the same" in ends(0, "compare", runs["pair"], runs["again"], "--at", 1.5)
 
 
-def test_results_that_cannot_be_compared_are_one_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
+def test_results_that_cannot_be_compared_are_reported_in_one_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
     text = ends(1, "compare", runs["pair"], runs["finer"])
     assert text.count("\n") == 1
-    assert "finer.mcap: has the resolution 0.4 m" in text
+    assert "finer.mcap: the resolution is 0.4 m" in text
     text = ends(1, "compare", runs["pair"], FIXTURES / "pair" / "husky_1.mcap")
     assert text.count("\n") == 1
     assert "no result of octoreplay" in text
@@ -135,7 +125,7 @@ def test_a_limit_that_fails_is_named_first(runs: dict[str, Path], tmp_path: Path
     assert first["robot"] in ("husky_1", "husky_2")
 
 
-def test_a_run_that_did_not_settle(runs: dict[str, Path]) -> None:
+def test_a_run_that_did_not_settle_fails(runs: dict[str, Path]) -> None:
     text = ends(1, "check", runs["slower"], "--settled")
     assert "stopped: " in text
     assert text.endswith("\nfailed: 1 of 1 check: settled\n")
@@ -150,22 +140,20 @@ def test_an_interrupted_run_fails(tmp_path: Path) -> None:
 
 
 def test_wrong_usage_of_check(runs: dict[str, Path], tmp_path: Path) -> None:
-    assert "no limit is given; give at least one, such as --max-label-disagreement 0.001" in ends(
-        2, "check", runs["pair"]
-    )
+    assert "no limit given; give at least one, such as --max-label-disagreement 0.001" in ends(2, "check", runs["pair"])
     assert "No such option '--max-fun'" in ends(2, "check", runs["pair"], "--max-fun", 1)
-    assert "is more than 1; it is a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
-    assert "needs the true world; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
+    assert "is more than 1; give a share" in ends(2, "check", runs["pair"], "--min-agreement", 99)
+    assert "needs the truth; give it with --truth" in ends(2, "check", runs["pair"], "--min-coverage", 0.5)
     assert "must end in .json" in ends(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
 
 
-def test_what_is_no_result_fails_with_one_sentence(tmp_path: Path) -> None:
+def test_another_file_than_a_result_is_reported_in_one_sentence(tmp_path: Path) -> None:
     text = ends(1, "check", FIXTURES / "pair" / "team.yaml", "--min-agreement", 0.5)
     assert text.count("\n") == 1
     assert "team.yaml: not a finished MCAP file" in text
 
 
-# --- words ------------------------------------------------------------------------------------------------------------
+# --- texts ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -173,16 +161,16 @@ def test_what_is_no_result_fails_with_one_sentence(tmp_path: Path) -> None:
     [(0.0, "0"), (1234567.0, "1,234,567"), (0.99899, "0.99899"), (float("nan"), "-"), (float("inf"), "inf"),
      (1.5e-7, "1.5e-07"), (1e20, "1e+20")],
 )  # fmt: skip
-def test_numbers_are_for_comparing(value: float, text: str) -> None:
-    assert verdict_tables.number(value) == text
+def test_numbers_have_a_fixed_format(value: float, text: str) -> None:
+    assert verdict_tables.six_digits(value) == text
 
 
-def test_values_that_differ_a_little_look_different() -> None:
+def test_close_values_are_shown_with_enough_digits() -> None:
     row = CheckRow("min_agreement", 0.999, 0.9989999999, "alpha", None, None, passed=False)
     assert verdict_tables._values(row) == ("at least 0.999", "0.9989999999")
 
 
-def test_limits_hold_against_the_true_world(runs: dict[str, Path]) -> None:
+def test_limits_that_need_the_ground_truth(runs: dict[str, Path]) -> None:
     world = FIXTURES / "pair" / "world.npz"
     text = ends(0, "check", runs["pair"], "--truth", world, "--min-coverage", 0.5, "--min-mean-iou", 0.05)
     assert text.endswith("\npassed: all 2 checks\n")

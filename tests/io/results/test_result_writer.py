@@ -1,4 +1,3 @@
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.results.result_writer import ResultWriter, _quaternion, partial_path
 from support.result_factory import (
-    CLASSES,
     SECOND,
     START,
     leaf_table,
@@ -40,7 +38,7 @@ def metadata(path: Path) -> dict[str, dict[str, str]]:
 
 def test_rosbags_reads_every_message_by_the_schemas_in_the_file(tmp_path: Path) -> None:
     path = write_result(tmp_path, fill)
-    # A bare store: octoreplay's own types can only come from the file.
+    # An empty type store: octoreplay's types can only come from the file.
     with AnyReader([path], default_typestore=get_typestore(Stores.EMPTY)) as reader:
         seen: dict[str, list[tuple[int, object]]] = {}
         for connection, stamp, raw in reader.messages():
@@ -124,7 +122,7 @@ def test_frames_and_graph_show_where_the_robots_are(tmp_path: Path) -> None:
     assert [name.text for name in names] == ["alpha", "beta"]
 
 
-def test_a_graph_without_links_takes_the_old_lines_away(tmp_path: Path) -> None:
+def test_a_graph_without_links_deletes_the_old_lines(tmp_path: Path) -> None:
     poses = [pose("alpha", 1.0), pose("beta", 2.0)]
     path = write_result(tmp_path, lambda writer: writer.write_graph(START + 9 * SECOND, [], poses))
     with AnyReader([path]) as reader:
@@ -143,14 +141,14 @@ def test_quaternions_are_those_of_scipy(seed: int) -> None:
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
-def test_half_turns_have_a_quaternion_too(axis: tuple[int, int, int]) -> None:
+def test_quaternions_of_half_turns(axis: tuple[int, int, int]) -> None:
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
     q = _quaternion(transform)
     np.testing.assert_allclose(np.abs([q.x, q.y, q.z, q.w]), [*axis, 0], atol=1e-12)
 
 
-def test_metadata_says_what_was_run(tmp_path: Path) -> None:
+def test_metadata_describe_the_run(tmp_path: Path) -> None:
     records = metadata(write_result(tmp_path))
     assert records["octoreplay"]["format_version"] == "2"
     assert json.loads(records["octoreplay"]["robots"]) == ["alpha", "beta"]
@@ -166,7 +164,7 @@ def test_metadata_says_what_was_run(tmp_path: Path) -> None:
 
 def test_hash_fingerprints_the_whole_input(tmp_path: Path) -> None:
     config = team(tmp_path).with_parameters({"hash": True})
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     assert json.loads(metadata(tmp_path / "out.mcap")["inputs"]["alpha.bag"])["method"] == "sha256"
 
@@ -180,7 +178,7 @@ def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
 def test_the_result_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     out.write_text("the result of yesterday")
-    with ResultWriter(out, team(tmp_path), CLASSES) as writer:
+    with ResultWriter(out, team(tmp_path)) as writer:
         writer.write_metrics(tick_metrics(1))
         assert out.read_text() == "the result of yesterday"
         assert partial_path(out).exists()
@@ -189,7 +187,7 @@ def test_the_result_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     assert not partial_path(out).exists()
 
 
-def test_an_error_leaves_no_half_result(tmp_path: Path) -> None:
+def test_an_error_leaves_no_incomplete_result(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     with pytest.raises(ZeroDivisionError):
         write_until(ZeroDivisionError, out, [tick_metrics(1)])
@@ -224,7 +222,7 @@ def test_an_output_that_cannot_be_written_is_refused_at_once(tmp_path: Path, nam
     config = team(tmp_path)
     (tmp_path / "none").mkdir() if name.startswith("none/..") else None
     with pytest.raises(OutputError, match=sentence):
-        ResultWriter(tmp_path / name, config, CLASSES)
+        ResultWriter(tmp_path / name, config)
     assert (tmp_path / "alpha.bag").read_bytes() == b"log of alpha"
 
 
@@ -232,21 +230,21 @@ def test_a_missing_input_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
     config = team(tmp_path)
     (tmp_path / "beta.bag").unlink()
     with pytest.raises(InputError, match=r"beta\.bag: cannot be read"):
-        ResultWriter(tmp_path / "out.mcap", config, CLASSES)
+        ResultWriter(tmp_path / "out.mcap", config)
     assert [path.name for path in tmp_path.iterdir()] == ["alpha.bag"]
 
 
 def test_logs_below_the_results_folder_are_stored_relative_to_it(tmp_path: Path) -> None:
     config = team(tmp_path)
     (tmp_path / "out").mkdir()
-    with ResultWriter(tmp_path / "out" / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out" / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     text = metadata(tmp_path / "out" / "out.mcap")["config"]["team_file"]
     assert str(tmp_path.resolve() / "alpha.bag") in text
 
 
-def test_the_class_table_is_stored_even_where_the_configuration_has_none(tmp_path: Path) -> None:
-    config = dataclasses.replace(team(tmp_path), classes=None)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+def test_the_class_table_is_stored(tmp_path: Path) -> None:
+    config = team(tmp_path)
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     assert "name: ground" in metadata(tmp_path / "out.mcap")["config"]["team_file"]
