@@ -6,6 +6,7 @@ links to other files of the repository, such as scripts, into plain text.
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 from collections.abc import Iterator
@@ -72,18 +73,13 @@ def _command(command: click.Command, path: str) -> Iterator[str]:
     """Markdown lines that describe one command: usage, text, and a table of options for each section."""
     context = click.Context(command, info_name=path)
     usage = " ".join([path, *command.collect_usage_pieces(context)])
-    yield from (f"## {path}", "", "```text", usage, "```", "", _escaped(command.help or ""), "")
+    yield from (f"## {path}", "", "```text", usage, "```", "", _escaped(inspect.cleandoc(command.help or "")), "")
     for section, records in option_groups(command, context).items():
         yield from (f"**{section}**", "", "| option | meaning |", "|---|---|")
-        yield from (f"| `{_cell(option)}` | {_escaped(_cell(text))} |" for option, text in records)
+        yield from (f"| `{option}` | {_escaped(text)} |" for option, text in records)
         yield ""
 
 
 def _escaped(text: str) -> str:
-    """Text whose brackets, stars, underscores and angle brackets are no markup."""
-    return re.sub(r"([\[\]*_<>])", r"\\\1", text)
-
-
-def _cell(text: str) -> str:
-    """Text that fits into one cell of a table."""
-    return " ".join(text.split()).replace("|", "\\|")
+    """Text without markup: brackets, stars, underscores, pipes and angle brackets are escaped."""
+    return re.sub(r"([\[\]*_|<>])", r"\\\1", text)
