@@ -1,0 +1,56 @@
+"""Results of the committed teams, which one worker makes and all workers read."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
+
+SharedFile = Callable[[str, Callable[[Path], object]], Path]
+
+
+@pytest.fixture(scope="session")
+def shared_file(tmp_path_factory: pytest.TempPathFactory) -> SharedFile:
+    """A function that returns the path of a named file, after ``make(path)`` in the first worker that asks for it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder = folder / "shared"
+    folder.mkdir(exist_ok=True)
+
+    def shared(name: str, make: Callable[[Path], object]) -> Path:
+        path = folder / name
+        with (folder / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not path.exists():
+                make(path)
+        return path
+
+    return shared
+
+
+@pytest.fixture(scope="session")
+def pair_result(shared_file: SharedFile) -> Path:
+    """Result of the team of two robots, with a stored map every second."""
+    return shared_file("pair.mcap", lambda path: _replay(PAIR_TEAM, path, state_every=1.0, view_every=2.0))
+
+
+@pytest.fixture(scope="session")
+def trio_result(shared_file: SharedFile) -> Path:
+    """Result of the team of three robots by rule bayes, with a stored map every second."""
+    return shared_file("trio.mcap", lambda path: _replay(TRIO_TEAM, path, rule="bayes", state_every=1.0))
+
+
+def _replay(team: Path, path: Path, **parameters: object) -> None:
+    """Replay a committed team into ``path``."""
+    # Imported at first use: most files of tests need no replay.
+    from octoreplay.config.team_file import load_team_file
+    from octoreplay.io.robots.discover import resolve
+    from octoreplay.replay.session import replay_team
+
+    replay_team(resolve(load_team_file(team).with_parameters(parameters)), path)

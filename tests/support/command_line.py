@@ -1,0 +1,58 @@
+"""The command line, called in this process or started as a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+from octoreplay import cli
+
+# Tables depend on the width of the terminal.
+ENVIRONMENT = {"COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}
+
+
+def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Call the command line in this process, 100 columns wide; exceptions that no exit code covers are raised."""
+    words = [str(argument) for argument in arguments]
+    out, err = io.StringIO(), io.StringIO()
+    log = logging.StreamHandler(err)
+    logger = logging.getLogger("octoreplay")
+    logger.addHandler(log)
+    try:
+        with (
+            mock.patch.dict(os.environ, ENVIRONMENT),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+            contextlib.chdir(folder or Path.cwd()),
+        ):
+            code = cli._exit_code(words)
+    finally:
+        logger.removeHandler(log)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def octoreplay_process(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a process, 100 columns wide."""
+    return subprocess.run(
+        command(*arguments), text=True, capture_output=True, check=False, timeout=300,
+        env={**os.environ, **ENVIRONMENT, **environment},
+    )  # fmt: skip
+
+
+def command(*arguments: object) -> list[str]:
+    """The words that start the command line as a process."""
+    return [sys.executable, "-m", "octoreplay", *map(str, arguments)]
+
+
+def assert_fails(code: int, sentence: str, *arguments: object) -> None:
+    """Check that a command ends with an exit code and with a message on stderr that matches ``sentence``."""
+    done = octoreplay(*arguments)
+    assert done.returncode == code, done.stderr
+    assert re.search(sentence, done.stderr), done.stderr
