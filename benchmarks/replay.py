@@ -29,7 +29,8 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import RunSummary
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.session import Progress, Session, replay_team
+from octoreplay.replay.run import Progress, replay_team
+from octoreplay.replay.session import Session
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 NUM_THREADS = 2

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
-    from octoreplay.replay.session import Progress, replay_team
+    from octoreplay.replay.run import Progress, replay_team
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.simulate.team import SimulationConfig, simulate_team
@@ -38,7 +38,7 @@ _HOMES = {
     "OutputError": "errors",
     "PacketError": "errors",
     "PointQuery": "result",
-    "Progress": "replay.session",
+    "Progress": "replay.run",
     "Result": "result",
     "ResultComparison": "evaluate.comparison",
     "RobotConfig": "config.robot",
@@ -58,7 +58,7 @@ _HOMES = {
     "load_team_file": "config.team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
-    "replay_team": "replay.session",
+    "replay_team": "replay.run",
     "resolve": "io.robots.discover",
     "run_sweep": "study.sweep",
     "simulate_team": "simulate.team",

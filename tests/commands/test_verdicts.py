@@ -13,7 +13,7 @@ import pytest
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.io.robots.discover import resolve
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.report import verdict_tables
 from support.result_factory import tick_metrics, write_until
 

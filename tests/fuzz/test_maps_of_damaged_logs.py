@@ -9,7 +9,7 @@ import pytest
 
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from support.hostile_logs import (
     FIXTURES,
     LOGS,

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from octoreplay.mapping.consensus import Evidence, Step, gamma_at, sum_of_evidence, team_step
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.replay.session import CONVERGED, Session
+from octoreplay.records import CONVERGED
+from octoreplay.replay.session import Session
 from reference import rules
 from reference.hand_made import team_config
 from reference.scenarios import TeamShape, make_scenario

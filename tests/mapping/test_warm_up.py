@@ -20,7 +20,7 @@ import json, sys
 from pathlib import Path
 from octoreplay.config.team_file import load_team_file
 from octoreplay.mapping import warm_up
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 if sys.argv[1:]:
     team, result = map(Path, sys.argv[1:])
     replay_team(load_team_file(team), result)

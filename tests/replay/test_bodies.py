@@ -11,7 +11,8 @@ from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.records import ClassTable, SemanticClass
-from octoreplay.replay.session import Session, replay_team
+from octoreplay.replay.run import replay_team
+from octoreplay.replay.session import Session
 from support.log_factory import robot_entries, write_mcap
 
 CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))

@@ -16,7 +16,9 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping import codec
 from octoreplay.replay import session as session_module
 from octoreplay.replay.exchange.messages import Source
-from octoreplay.replay.session import Session, _rule_warnings, replay_team
+from octoreplay.replay.run import replay_team
+from octoreplay.replay.session import Session
+from octoreplay.replay.warnings import rule_warnings
 from octoreplay.result import open_result
 from reference.comparison import compare_map
 from reference.scenarios import START_NS, TeamShape, make_scenario
@@ -320,7 +322,7 @@ def test_a_run_says_what_its_rule_cannot_do(parameters, sentence):
 
 @pytest.mark.parametrize("rule", ["bayes", "ratio", "flood", "gradient"])
 def test_a_run_without_faults_warns_of_no_rule(rule):
-    assert _rule_warnings(_config(rule=rule), is_symmetric=True) == ()
+    assert rule_warnings(_config(rule=rule), is_symmetric=True) == ()
 
 
 @pytest.mark.parametrize(
@@ -335,9 +337,9 @@ def test_a_run_without_faults_warns_of_no_rule(rule):
     ],
 )  # fmt: skip
 def test_bayes_is_warned_of_by_its_cause(parameters, cause):
-    (warning,) = _rule_warnings(_config(rule="bayes", **parameters), is_symmetric=True)
+    (warning,) = rule_warnings(_config(rule="bayes", **parameters), is_symmetric=True)
     assert f"with {cause} it drifts" in warning
-    assert _rule_warnings(_config(rule="natural", **parameters), is_symmetric=True) == ()
+    assert rule_warnings(_config(rule="natural", **parameters), is_symmetric=True) == ()
 
 
 @pytest.mark.parametrize(
@@ -356,7 +358,7 @@ def test_bayes_is_warned_of_links_that_do_not_carry_the_same_both_ways(parameter
     for _ in session.ticks():
         pass
     assert session.is_symmetric == is_symmetric
-    assert len(_rule_warnings(config, session.is_symmetric)) == (not is_symmetric)
+    assert len(rule_warnings(config, session.is_symmetric)) == (not is_symmetric)
 
 
 @pytest.mark.parametrize("rule", ["flood", "bayes"])

@@ -7,7 +7,7 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"

@@ -14,10 +14,12 @@ from octoreplay.config.presets import PRESETS
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
+from octoreplay.records import CONVERGED
 from octoreplay.replay import session as session_module
 from octoreplay.replay.robots import consensus as consensus_module
 from octoreplay.replay.robots import robot as robot_module
-from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
+from octoreplay.replay.session import Session
+from octoreplay.replay.settling import NO_SETTLING, SETTLE_MAX
 from reference import rules
 from reference.comparison import compare_map
 from reference.hand_made import cloud, ray, team_config

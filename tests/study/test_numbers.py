@@ -12,7 +12,7 @@ import pytest
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
 from octoreplay.records import RunSummary, TickMetrics
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import numbers
 from octoreplay.study.numbers import (

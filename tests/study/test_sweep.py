@@ -17,7 +17,7 @@ import pytest
 import octoreplay
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError, OutputError
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import local
 from octoreplay.study.folder import SweepFolder

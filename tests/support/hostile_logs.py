@@ -30,7 +30,7 @@ from octoreplay.io.robots.discover import describe, discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import ClassTable, SemanticClass
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from support import room
 from support.log_damage import MUTATIONS, damage_log, reseal_chunk
 from support.log_factory import Row, write_rows

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from octoreplay.records import FrameCounts, RunSummary
-    from octoreplay.replay.session import Progress
+    from octoreplay.replay.run import Progress
 
 
 def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
     """Run with a progress bar; says where the finished part is when interrupted."""
     from octoreplay.io.results.result_writer import partial_path
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
 
     with replay_bar() as show:
         try:

@@ -45,25 +45,32 @@ class ScheduleEntry:
 class NetworkConfig:
     """The simulated communication graph: who can hear whom, and when."""
 
-    topology: str = parameter("complete", "communication graph", choices=TOPOLOGIES)
+    topology: str = parameter(
+        "complete",
+        "communication graph: complete, ring, line, star, grid, nearest (neighbours), range (radio range), random"
+        " (Erdos-Renyi) or edges (edge list)",
+        choices=TOPOLOGIES,
+    )
     edges: tuple[tuple[str, str, float | None], ...] = field(default=())
     one_way: tuple[tuple[str, str], ...] = field(default=())
     schedule: tuple[ScheduleEntry, ...] = field(default=())
-    num_nearest: int = parameter(2, "topology nearest: links to so many nearest robots", minimum=1)
-    radio_range: float = parameter(30.0, "topology range: robots nearer than this get a link [m]", above=0.0)
+    num_nearest: int = parameter(2, "topology nearest: number of nearest robots that a robot has links to", minimum=1)
+    radio_range: float = parameter(30.0, "topology range: distance below which two robots get a link [m]", above=0.0)
     range_hysteresis: float = parameter(
-        3.0, "topology range: a link breaks this much beyond radio_range [m]", minimum=0.0
+        3.0, "topology range: additional distance at which a link breaks [m]", minimum=0.0
     )
-    prob_link: float = parameter(
-        0.5, "topology random: probability of each link (Erdos-Renyi)", minimum=0.0, maximum=1.0
+    prob_link: float = parameter(0.5, "topology random: probability of each link", minimum=0.0, maximum=1.0)
+    network_seed: int = parameter(0, "seed of the random graph, packet losses, corruption and jitter", minimum=0)
+    weights: str = parameter(
+        "metropolis",
+        "link weights: metropolis, degree (1 / degree), max-degree, or given in the edge list",
+        choices=WEIGHTS,
     )
-    network_seed: int = parameter(0, "seed of the random graph, losses and jitter", minimum=0)
-    weights: str = parameter("metropolis", "weights A_ij of the links", choices=WEIGHTS)
     publish_period: float = parameter(
-        1.0, "every robot publishes its map every so often [s]", above=0.0, maximum=86_400.0
+        1.0, "period between a robot's published maps, the length of a tick [s]", above=0.0, maximum=86_400.0
     )
     after_end: str = parameter(
-        "stay", "after a robot's last scan it stays in the team or leaves", choices=("stay", "leave")
+        "stay", "after its last scan a robot keeps exchanging maps (stay) or not (leave)", choices=("stay", "leave")
     )
 
     def __post_init__(self) -> None:
@@ -93,20 +100,26 @@ class LinkConfig:
     ``burst_end``. Without ``burst_start`` they are independent (Bernoulli).
     """
 
-    latency: float = parameter(0.0, "mean delay of a packet [s]", minimum=0.0)
-    jitter: float = parameter(0.0, "the delay varies evenly by up to this much both ways [s]", minimum=0.0)
-    loss: float = parameter(0.0, "probability that a packet is lost (in the good state)", minimum=0.0, maximum=1.0)
+    latency: float = parameter(0.0, "mean packet delay [s]", minimum=0.0)
+    jitter: float = parameter(
+        0.0, "largest deviation from the mean packet delay, uniformly distributed [s]", minimum=0.0
+    )
+    loss: float = parameter(0.0, "probability that a packet is lost, outside bursts", minimum=0.0, maximum=1.0)
     burst_start: float = parameter(
-        0.0, "probability that a burst of losses starts with a packet (Gilbert-Elliott)", minimum=0.0, maximum=1.0
+        0.0, "probability per packet that a burst of losses starts (Gilbert-Elliott model)", minimum=0.0, maximum=1.0
     )
-    burst_end: float = parameter(0.5, "probability that a burst ends with a packet", above=0.0, maximum=1.0)
-    burst_loss: float = parameter(1.0, "probability that a packet is lost in a burst", minimum=0.0, maximum=1.0)
-    corruption: float = parameter(0.0, "probability that a packet arrives damaged", minimum=0.0, maximum=1.0)
-    rate: float | None = parameter(None, "what a link carries [bytes/s] (default: no limit)", above=0.0)
+    burst_end: float = parameter(0.5, "probability per packet that a burst ends", above=0.0, maximum=1.0)
+    burst_loss: float = parameter(1.0, "probability that a packet is lost within a burst", minimum=0.0, maximum=1.0)
+    corruption: float = parameter(
+        0.0, "probability that a packet arrives damaged and is dropped", minimum=0.0, maximum=1.0
+    )
+    rate: float | None = parameter(None, "link capacity [bytes/s] (default: no limit)", above=0.0)
     queue: str = parameter(
-        "newest", "a busy link keeps the newest packet waiting, or all that fit", choices=("newest", "drop-tail")
+        "newest",
+        "packets waiting for a busy link: the newest, or all that fit into queue_bytes (drop-tail)",
+        choices=("newest", "drop-tail"),
     )
-    queue_bytes: int = parameter(1_000_000, "what fits in the queue of a link, for drop-tail [bytes]", minimum=1)
+    queue_bytes: int = parameter(1_000_000, "queue drop-tail: capacity of a link's queue [bytes]", minimum=1)
 
     def __post_init__(self) -> None:
         check_ranges(self)

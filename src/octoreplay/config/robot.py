@@ -32,62 +32,61 @@ class RobotConfig:
 
     robot_id: str
     logs: tuple[Path, ...]
-    depth_topic: str | None = field(default=None, metadata=help_text("depth images, raw or compressed"))
+    depth_topic: str | None = field(default=None, metadata=help_text("topic of the depth images, raw or compressed"))
     label_topic: str | None = field(
-        default=None, metadata=help_text("label images, ids or colours; '' to map without labels")
+        default=None, metadata=help_text("topic of the label images, ids or colours; '' to map without labels")
     )
-    confidence_topic: str | None = field(default=None, metadata=help_text("images that say how sure the labels are"))
-    camera_info_topic: str | None = field(default=None, metadata=help_text("CameraInfo of the depth images"))
+    confidence_topic: str | None = field(
+        default=None, metadata=help_text("topic of the images with the labels' confidences")
+    )
+    camera_info_topic: str | None = field(default=None, metadata=help_text("topic of the depth images' CameraInfo"))
     cloud_topic: str | None = field(
-        default=None, metadata=help_text("point clouds or laser scans, in place of depth_topic")
+        default=None, metadata=help_text("topic of point clouds or laser scans, instead of depth_topic")
     )
-    label_field: str | None = field(
-        default=None, metadata=help_text("field of the points that holds their labels, such as rgb")
+    label_field: str | None = field(default=None, metadata=help_text("point field with the labels, such as rgb"))
+    confidence_field: str | None = field(default=None, metadata=help_text("point field with the labels' confidences"))
+    pose_topic: str | None = field(
+        default=None, metadata=help_text("topic of the poses: odometry, stamped poses, a path or TF")
     )
-    confidence_field: str | None = field(
-        default=None, metadata=help_text("field of the points that says how sure the labels are")
-    )
-    pose_topic: str | None = field(default=None, metadata=help_text("odometry, stamped poses, a path or TF"))
     pose_file: Path | None = field(
-        default=None, metadata=help_text("a trajectory in place of pose_topic: TUM or KITTI format")
+        default=None, metadata=help_text("trajectory file in TUM or KITTI format, instead of pose_topic")
     )
     pose_times: Path | None = field(
-        default=None, metadata=help_text("times of a KITTI trajectory, one in each line [s]")
+        default=None, metadata=help_text("file with the times of a KITTI trajectory, one a line [s]")
     )
-    label_info_topic: str | None = field(default=None, metadata=help_text("LabelInfo that names the labels"))
-    map_frame: str | None = field(default=None, metadata=help_text("the frame that the poses are in"))
+    label_info_topic: str | None = field(
+        default=None, metadata=help_text("topic of the LabelInfo with the classes' names")
+    )
+    map_frame: str | None = field(default=None, metadata=help_text("reference frame of the poses"))
     sensor_frame: str | None = field(
-        default=None, metadata=help_text("the sensor's frame, if not the one that its messages name")
+        default=None, metadata=help_text("frame of the sensor (default: frame_id of its messages)")
     )
     intrinsics: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("[fx, fy, cx, cy] in place of CameraInfo [pixels]")
+        default=None, metadata=help_text("[fx, fy, cx, cy], instead of CameraInfo [pixels]")
     )
     rectified: bool | None = field(
-        default=None, metadata=help_text("true: CameraInfo's P holds; false: K and the distortion")
+        default=None, metadata=help_text("true: use CameraInfo's P; false: use K and the distortion")
     )
     depth_unit: float | None = field(
-        default=None, metadata=help_text("metres per depth value, in place of the encoding's")
+        default=None, metadata=help_text("metres per depth value (default: that of the encoding)")
     )
-    clock_offset: float = field(default=0.0, metadata=help_text("added to this robot's stamps [s]"))
+    clock_offset: float = field(default=0.0, metadata=help_text("offset added to the robot's stamps [s]"))
     T_team_map: tuple[float, ...] = field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        metadata=help_text("its map frame in the team's: x y z [m], quaternion x y z w"),
+        metadata=help_text("transform from map_frame to the team's frame: x y z [m], quaternion x y z w"),
     )
     T_body_sensor: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("the sensor in the frame that the poses are of, in place of TF")
+        default=None,
+        metadata=help_text("transform from the sensor to the frame that the poses describe, instead of TF"),
     )
     body_frame: str | None = field(
-        default=None, metadata=help_text("the frame of body_box, if not the one that the poses are of")
+        default=None, metadata=help_text("frame of body_box (default: the frame that the poses describe)")
     )
     body_box: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("the robot itself: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
+        default=None, metadata=help_text("box around the robot: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
     )
-    publish_period: float | None = field(
-        default=None, metadata=help_text("publishes its map every so often, in place of the team's [s]")
-    )
-    publish_phase: float = field(
-        default=0.0, metadata=help_text("and so much after the ticks that are multiples of it [s]")
-    )
+    publish_period: float | None = field(default=None, metadata=help_text("the robot's own publish_period [s]"))
+    publish_phase: float = field(default=0.0, metadata=help_text("delay after the multiples of publish_period [s]"))
 
     def __post_init__(self) -> None:
         if not self.robot_id or "/" in self.robot_id:

@@ -116,7 +116,8 @@ def _check_rule(config: RunConfig) -> None:
     rule, packet = config.consensus.traits, config.packet
     if config.consensus.mode not in rule.modes:
         raise ConfigError(
-            f"mode: rule '{rule.name}' does not support '{config.consensus.mode}'; use {' or '.join(map(repr, rule.modes))}"
+            f"mode: rule '{rule.name}' does not support '{config.consensus.mode}';"
+            f" use {' or '.join(map(repr, rule.modes))}"
         )
     is_exact = packet.is_exact and config.map.prune_tolerance == 0
     if packet.packets not in rule.packets or (rule.needs_exact_packets and not is_exact):

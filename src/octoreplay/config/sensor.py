@@ -13,18 +13,22 @@ from octoreplay.errors import ConfigError
 class SensorConfig:
     """The inverse sensor model: log-odds increments, clamping and ranges."""
 
-    hit: float = parameter(1.0, "log-odds added to a hit cell's class (psi)", above=0.0)
-    miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray passes (phi)", maximum=0.0)
-    hit_other: float | None = parameter(None, "log-odds added to a hit cell's other classes (default: miss)")
-    clamp_min: float = parameter(-5.0, "least log-odds of a class", maximum=0.0)
-    clamp_max: float = parameter(5.0, "largest log-odds of a class", minimum=0.0)
-    min_range: float = parameter(0.0, "points nearer than this carry no information [m]", minimum=0.0)
-    max_range: float = parameter(10.0, "rays are cut here [m]", above=0.0)
-    rays: str = parameter("cells", "one ray per distinct end cell, or per measured point", choices=("cells", "all"))
-    hide_robots: bool = parameter(False, "points in another robot's body_box free their ray and hit nothing")
-    invalid_depth: tuple[float, ...] = parameter((), "raw depth values that carry no information")
+    hit: float = parameter(1.0, "log-odds added to the observed class of the cell where a ray ends (psi)", above=0.0)
+    miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray crosses (phi)", maximum=0.0)
+    hit_other: float | None = parameter(
+        None, "log-odds added to the other classes of the cell where a ray ends (default: miss)"
+    )
+    clamp_min: float = parameter(-5.0, "lower limit of a class's log-odds", maximum=0.0)
+    clamp_max: float = parameter(5.0, "upper limit of a class's log-odds", minimum=0.0)
+    min_range: float = parameter(0.0, "minimum range of a measured point; nearer points are ignored [m]", minimum=0.0)
+    max_range: float = parameter(10.0, "maximum length of a ray; farther points only mark free space [m]", above=0.0)
+    rays: str = parameter(
+        "cells", "one ray for each end cell (cells) or for each measured point (all)", choices=("cells", "all")
+    )
+    hide_robots: bool = parameter(False, "treat points inside another robot's body_box as free space")
+    invalid_depth: tuple[float, ...] = parameter((), "raw depth values to ignore")
     no_return_depth: tuple[float, ...] = parameter(
-        (), "raw depth values that mean 'no return' and free their ray up to max_range"
+        (), "raw depth values that mean 'no return': free space up to max_range"
     )
 
     def __post_init__(self) -> None:
@@ -44,15 +48,17 @@ class SensorConfig:
 class MapConfig:
     """The map's geometry and prior."""
 
-    resolution: float = parameter(0.2, "edge of the finest leaf [m]", above=0.0)
+    resolution: float = parameter(0.2, "edge length of the finest cell [m]", above=0.0)
     bounds: tuple[float, ...] = parameter(
-        (), "mapped region: ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m]"
+        (), "mapped region, ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m] (default: no limit)"
     )
     prob_free: float | None = parameter(
-        None, "prior probability of free space (default: uniform over all classes)", above=0.0, maximum=0.999999
+        None, "prior probability of free space (default: the same as of every class)", above=0.0, maximum=0.999999
     )
     prune_tolerance: float = parameter(
-        0.0, "siblings whose log-odds differ by at most this are one leaf when published (0: lossless)", minimum=0.0
+        0.0,
+        "largest log-odds difference between siblings that published maps merge into one leaf (0: lossless)",
+        minimum=0.0,
     )
 
     def __post_init__(self) -> None:

@@ -24,6 +24,7 @@ class Recorder:
     def __init__(self, config: RunConfig, writer: ResultWriter | None, threads: Executor) -> None:
         self.start_ns = 0
         self.last: Tick | None = None
+        self.num_known_cells = 0
         self._config = config
         self._writer = writer
         self._threads = threads
@@ -94,6 +95,7 @@ class Recorder:
 
     def _add_up(self, metrics: TickMetrics) -> None:
         """Sums and peaks over the ticks."""
+        self.num_known_cells = metrics.num_known_cells
         self._num_settling += metrics.settling
         self._peak = max(self._peak, metrics.total_distance)
         self._peak_all = max(self._peak_all, metrics.total_distance_all)

@@ -49,13 +49,16 @@ class Timeline:
         """Stamp of the earliest frame that has not been given; None when every frame has."""
         return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
 
-    def has_ended(self, robot_index: int) -> bool:
-        """True when a robot's last frame has been given (at once for a robot without any)."""
-        return self._next[robot_index] is None
+    def active(self, leave_ns: int | None) -> list[bool]:
+        """Whether each robot takes part (N,): from its first frame on.
 
-    def last_stamp_ns(self, robot_index: int) -> int | None:
-        """Stamp of the latest frame that a robot has given; None before its first."""
-        return self._last_ns[robot_index]
+        With ``leave_ns`` robots whose last frame is before that stamp have left.
+        """
+        pairs = zip(self._next, self._last_ns, strict=True)
+        return [
+            last_ns is not None and (leave_ns is None or following is not None or last_ns >= leave_ns)
+            for following, last_ns in pairs
+        ]
 
     def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
         """A robot's frames not given yet with stamps below ``stamp_ns``."""

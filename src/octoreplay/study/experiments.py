@@ -13,7 +13,7 @@ from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study.folder import table_csv
 from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep

@@ -22,7 +22,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.text_files import json_text, write_whole
 from octoreplay.records import TickMetrics, UInt8Array
-from octoreplay.replay.session import Progress
+from octoreplay.replay.run import Progress
 from octoreplay.report import map_view, paper_plots, plots
 from octoreplay.report.figures import save_figures
 from octoreplay.result import Result, StoredMap, open_result

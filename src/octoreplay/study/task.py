@@ -75,7 +75,7 @@ def run_task(task: Task) -> Row:
 
 def _run(task: Task) -> Row:
     from octoreplay.config.team_file import parse_team
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
     from octoreplay.result import open_result
     from octoreplay.study.numbers import run_numbers, truth_numbers
 

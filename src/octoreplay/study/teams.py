@@ -17,7 +17,7 @@ from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import partial_path
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.replay.session import Progress, replay_team
+from octoreplay.replay.run import Progress, replay_team
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 SETTINGS_FILE = "simulation.json"

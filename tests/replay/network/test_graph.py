@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import NetworkConfig, ScheduleEntry
 from octoreplay.errors import ConfigError
-from octoreplay.replay.network.graph import TeamNetwork, build_graph, check_team_graph, settle_ticks_max, step_size
+from octoreplay.replay.network.graph import TeamNetwork, build_graph, check_team_graph, step_size
+from octoreplay.replay.settling import settle_ticks_max
 from reference import graph as reference
 
 NAMES = ("husky_1", "husky_2", "husky_3", "husky_4", "husky_5", "husky_6", "husky_7")

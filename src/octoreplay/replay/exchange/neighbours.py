@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -35,12 +36,21 @@ class Exchange:
     """
 
     def __init__(self, config: PacketConfig, encoder: PacketEncoder) -> None:
-        self.held: dict[Source, HeldMap] = {}
+        self._held: dict[Source, HeldMap] = {}
         self._config = config
         self._encoder = encoder
         self._known: dict[tuple[int, Source], int] = {}
         self._num_sent: dict[int, int] = {}
         self._epochs: dict[int, int] = {}
+
+    @property
+    def held(self) -> Mapping[Source, HeldMap]:
+        """Newest state of each map that is here, the robot's own published one included; read-only."""
+        return MappingProxyType(self._held)
+
+    def hold(self, source: Source, held: HeldMap) -> None:
+        """Store a state of the robot's own map, to be sent by ``outbox``."""
+        self._held[source] = held
 
     def outbox(
         self, receivers: Sequence[int], sources: Sequence[Source], *, keep_alive: bool
@@ -68,7 +78,7 @@ class Exchange:
             outgoing.append((tuple(group), message))
             if self._config.packets == "delta" and not self._config.acknowledge:
                 for receiver in group:
-                    self._known.update({(receiver, p.source): self.held[p.source].version for p in message.parts})
+                    self._known.update({(receiver, p.source): self._held[p.source].version for p in message.parts})
         return outgoing
 
     def receive(self, sender: int, message: MapMessage) -> tuple[Receipt, Acknowledgement | None]:
@@ -78,13 +88,13 @@ class Exchange:
         for part in message.parts:
             try:
                 source, version, base = self._stamp(part)
-                mine = self.held.get(source)
+                mine = self._held.get(source)
                 if mine is not None and mine.version >= version:
                     receipt.num_stale += 1
                 elif base is not None and (mine.version if mine else NOTHING) < base:
                     receipt.num_gaps += 1
                 else:
-                    self.held[source] = part.held or self._decoded(part.data, version, mine)
+                    self._held[source] = part.held or self._decoded(part.data, version, mine)
                     receipt.fresh.append(source)
             except PacketError:
                 receipt.num_damaged += 1
@@ -96,7 +106,7 @@ class Exchange:
             if source.origin != sender or source.epoch == self.epoch_of(sender):
                 # Who sends a state has it.
                 self._learn(sender, source, version)
-            held = self.held.get(source)
+            held = self._held.get(source)
             answers[source] = Possession(*source, held.version if held else None)
         if not answers or self._config.packets != "delta" or not self._config.acknowledge:
             return receipt, None
@@ -129,8 +139,8 @@ class Exchange:
             if known is None or not is_delta or is_key_frame:
                 bases[source] = None
             else:
-                bases[source] = min(known, self.held[source].version)
-            is_there = known is not None and known >= self.held[source].version
+                bases[source] = min(known, self._held[source].version)
+            is_there = known is not None and known >= self._held[source].version
             if is_there and not keep_alive and not (is_delta and is_key_frame):
                 del bases[source]
         return bases
@@ -148,7 +158,7 @@ class Exchange:
         """The packets of a message; where a budget leaves room for some only, the sources take turns."""
         if self._config.budget is None:
             return [
-                MapPart(self._encoder.packet(source, self.held[source], base), source, base, self.held[source])
+                MapPart(self._encoder.packet(source, self._held[source], base), source, base, self._held[source])
                 for source, base in bases
             ]
         parts: list[MapPart] = []
@@ -166,7 +176,7 @@ class Exchange:
 
         Bricks that got their values in the same tick stay together; they fitted into a packet when they were published.
         """
-        held = self.held[source]
+        held = self._held[source]
         fitting = self._encoder.packet(source, held, base)
         if len(fitting) <= size:
             return fitting

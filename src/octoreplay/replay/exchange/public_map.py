@@ -6,6 +6,7 @@ import numpy as np
 
 from octoreplay.config.packets import PacketConfig
 from octoreplay.config.run import RunConfig
+from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
@@ -28,6 +29,16 @@ def least_budget(packet: PacketConfig, num_classes: int) -> int:
     number_bytes = {"float32": 5, "float16": 3, "int8": 1}[packet.content]
     per_cell = number_bytes * (num_classes + 1) + mask_bytes(num_classes)
     return codec.HEADER_BYTES + 2 * (BRICK_DEPTH + 9) + BRICK_CELLS * per_cell + ZSTD_FRAME_BYTES
+
+
+def check_budget(packet: PacketConfig, num_classes: int) -> None:
+    """Raise ConfigError where a brick could need more than the budget."""
+    least = least_budget(packet, num_classes)
+    if packet.budget is not None and packet.budget < least:
+        raise ConfigError(
+            f"budget: {packet.budget} bytes may not hold one brick of {num_classes} classes; give at least {least}, or"
+            " a smaller content"
+        )
 
 
 class PublicMap:

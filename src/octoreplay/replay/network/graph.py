@@ -26,9 +26,6 @@ from octoreplay.replay.network.topology import POSITION_TOPOLOGIES, Topology
 
 Link: TypeAlias = tuple[int, int]
 
-STEP_SIZE_RULES = ("gradient", "bayes", "natural")
-"""The rules that mix maps with a step size; the others have no bound to keep."""
-
 _ROUNDING = 1e-9  # eigenvalues below this are zero; sums and bounds are compared with this much room
 
 
@@ -206,7 +203,7 @@ def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
         always_stable = graph.network.weights in ("metropolis", "max-degree")
         return 0.5 if always_stable else min(0.5, 0.9 * graph.epsilon_bound)
     # No bound is below 0.5, so smaller steps need no eigenvalues.
-    has_bound = consensus.rule in STEP_SIZE_RULES and consensus.epsilon >= 0.5 * (1.0 - _ROUNDING)
+    has_bound = consensus.traits.has_step_size and consensus.epsilon >= 0.5 * (1.0 - _ROUNDING)
     if has_bound and not consensus.epsilon < graph.epsilon_bound * (1.0 - _ROUNDING):
         raise ConfigError(
             f"epsilon: {consensus.epsilon} is not below {graph.epsilon_bound:.6g}, the bound of this graph (topology"
@@ -214,20 +211,6 @@ def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
             f" '{graph.network.weights}'); use {0.9 * graph.epsilon_bound:.3g} or leave epsilon out"
         )
     return consensus.epsilon
-
-
-def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsilon: float) -> int:
-    """The most settling ticks on a graph: ``settle_max``, or ``settle`` + 12 / -log10 lambda_2 rounded up; 0 without
-    settling.
-
-    So many ticks after gamma's ramp shrink the disagreement by 1e12.
-    """
-    if consensus.settle == 0:
-        return 0
-    if consensus.settle_max is not None:
-        return consensus.settle_max
-    rate = min(max(graph.lambda_2(epsilon), 1e-12), 1.0 - 1e-9)  # one tick at least, and a finite number of them
-    return consensus.settle + math.ceil(12.0 / -math.log10(rate))
 
 
 def check_team_graph(network: NetworkConfig, consensus: ConsensusConfig, robot_ids: Sequence[str]) -> None:

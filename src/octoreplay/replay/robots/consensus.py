@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Self
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from octoreplay.records import Float64Array
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 
 class ConsensusRobot(Robot):
@@ -24,7 +23,7 @@ class ConsensusRobot(Robot):
 
     def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
         super().__init__(index, config, num_classes, encoder, epoch)
-        self._rule = config.consensus.rule
+        self._rule = config.consensus.traits
         self._public = PublicMap(config, encoder, self.source)
         self._published: HeldMap | None = None
         self._has_budget = config.packet.budget is not None
@@ -36,26 +35,8 @@ class ConsensusRobot(Robot):
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """The robot's map, for its neighbours; an empty packet where nothing changed says that it is still there."""
         self._published = self._public.advance(self.map, self.map.revisions, tick, streams=self.streams)
-        self.exchange.held[self.source] = self._published
+        self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
-
-    @classmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """One iteration with all that arrived, which the team does brick by brick; on-arrival one for each map."""
-        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
-        is_sync = config.consensus.mode == "sync"
-        together = [turn for turn in turns if is_sync or not turn.arrived]
-        alone = [turn for turn in turns if not is_sync and turn.arrived]
-        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, factor, tick), together))
-        changes = team_step(
-            steps, rule=config.consensus.rule, revision=tick, clamp=config.sensor.clamp, threads=threads
-        )
-        list(threads.map(lambda turn: turn.robot.end_step(tick), together))
-        return changes + list(
-            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, factor, tick), alone)
-        )
 
     def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> Step:
         """The one iteration of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
@@ -83,14 +64,14 @@ class ConsensusRobot(Robot):
         """One iteration for each of the maps that ``arrived``, in their order; the largest change of a log-odds."""
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
-        # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
-        needs_base = self._rule == "bayes" or not self._public.is_exact
+        # The sum over robots is kept only when both ends of a link exchange the same difference.
+        needs_base = self._rule.needs_symmetric_links or not self._public.is_exact
         base = self._published_octree(tick) if needs_base else None
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], rule=self._rule, revision=tick, clamp=self._config.sensor.clamp)
+            team_step([step], rule=self._rule.name, revision=tick, clamp=self._config.sensor.clamp)
             self._finish_step(tick)
         self._update_streams()
         # What one arrival changes another may undo; what counts is the change over the tick.
@@ -102,7 +83,7 @@ class ConsensusRobot(Robot):
     ) -> Step:  # fmt: skip
         """An iteration with some neighbours' maps; bricks at rest ``since`` the last one are skipped."""
         neighbours = [held.octree for _, held in arrived]
-        if self._rule == "merge":
+        if not self._rule.mixes_differences:
             base = self._nothing
         elif base is not None and self._has_budget:
             neighbours = [self._used_once(base, source, held) for source, held in arrived]
@@ -135,8 +116,31 @@ class ConsensusRobot(Robot):
     def _finish_step(self, tick: int) -> None:
         """Count an iteration, and keep the evidence that it used."""
         self.num_iterations += 1
-        if self._rule in ("bayes", "merge"):
+        if self._rule.keeps_last_evidence:
             self._keep_log_likelihood(tick)
+
+
+class ConsensusTeam(Team[ConsensusRobot]):
+    """Robots that mix maps."""
+
+    def _new_robot(self, index: int, epoch: int) -> ConsensusRobot:
+        return ConsensusRobot(index, self._config, self._num_classes, self._encoder, epoch)
+
+    def iterate(
+        self, turns: Sequence[Turn[ConsensusRobot]], gamma_factor: float, tick: int, threads: Executor
+    ) -> list[float]:
+        """One iteration per robot, all robots brick by brick; in mode 'on-arrival' one iteration per arrived map."""
+        consensus, clamp = self._config.consensus, self._config.sensor.clamp
+        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
+        is_sync = consensus.mode == "sync"
+        together = [turn for turn in turns if is_sync or not turn.arrived]
+        alone = [turn for turn in turns if not is_sync and turn.arrived]
+        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, gamma_factor, tick), together))
+        changes = team_step(steps, rule=consensus.rule, revision=tick, clamp=clamp, threads=threads)
+        list(threads.map(lambda turn: turn.robot.end_step(tick), together))
+        return changes + list(
+            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, gamma_factor, tick), alone)
+        )
 
 
 def _from_neighbours(turn: Turn[Robot]) -> list[Arrival]:

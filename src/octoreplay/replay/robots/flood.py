@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Self
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 
 class FloodRobot(Robot):
@@ -43,16 +42,8 @@ class FloodRobot(Robot):
             # A scan of this tick is in before it is published: what changed after the last version is newer by one.
             new = self._public.advance(evidence, evidence.revisions - 1, tick, num_shares=max(len(held), 1))
             if mine is None or (new.octree.revisions >= mine.version).any():
-                held[self.source] = new
+                self.exchange.hold(self.source, new)
         return self.exchange.outbox(receivers, sorted(held), keep_alive=False)
-
-    @classmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """Every robot sums up what it has."""
-        del factor, config
-        return list(threads.map(lambda turn: turn.robot.sum_up(turn.arrived, tick), turns))
 
     def sum_up(self, arrived: Sequence[Arrival], tick: int) -> float:
         """Sum up what is there, where it changed; the largest change of a log-odds."""
@@ -81,3 +72,17 @@ class FloodRobot(Robot):
 
     def _octrees(self) -> list[SemanticOctree]:
         return [*super()._octrees(), *(held.octree for held in self.exchange.held.values())]
+
+
+class FloodTeam(Team[FloodRobot]):
+    """Robots that forward and sum evidence."""
+
+    def _new_robot(self, index: int, epoch: int) -> FloodRobot:
+        return FloodRobot(index, self._config, self._num_classes, self._encoder, epoch)
+
+    def iterate(
+        self, turns: Sequence[Turn[FloodRobot]], gamma_factor: float, tick: int, threads: Executor
+    ) -> list[float]:
+        """Sum the evidence that each robot holds; the rule has no gamma."""
+        del gamma_factor
+        return list(threads.map(lambda turn: turn.robot.sum_up(turn.arrived, tick), turns))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Self
 
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
@@ -13,7 +12,7 @@ from octoreplay.mapping.consensus import Step, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
-from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 REST = 8.0
 """Units by which a map may be off: rounding moves masses by up to six in every tick for ever."""
@@ -31,7 +30,6 @@ class RatioRobot(Robot):
 
     def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
         super().__init__(index, config, num_classes, encoder, epoch)
-        _check_range(config)
         self.mass = SemanticOctree(config.map.resolution, num_classes)
         self._weight = running_sums.WHOLE_WEIGHT
         self._total = SemanticOctree(config.map.resolution, num_classes)
@@ -52,23 +50,12 @@ class RatioRobot(Robot):
         running_sums.share_out(self.mass, self._total, num_shares, tick - 1)
         share, self._weight = running_sums.share_weight(self._weight, num_shares)
         self._total_weight += share
-        held = self.exchange.held
         outgoing = []
         together = tuple(receiver for receiver in receivers if receiver not in self._offsets)
         for group in filter(None, (together, *((receiver,) for receiver in receivers if receiver in self._offsets))):
-            held[self.source] = self._sum_for(group[0], tick)
+            self.exchange.hold(self.source, self._sum_for(group[0], tick))
             outgoing += self.exchange.outbox(group, [self.source], keep_alive=True)
         return outgoing
-
-    @classmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """Every robot takes in what the sums that arrived grew by, and its own new evidence."""
-        del factor, config
-        masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
-        running_sums.team_take_in(masses, tick, threads)
-        return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
 
     def growths(self, arrived: Sequence[Arrival]) -> list[running_sums.Arrival]:
         """The newest sums that arrived, each with the one that was there before; their weights are taken in."""
@@ -127,6 +114,26 @@ class RatioRobot(Robot):
     def _octrees(self) -> list[SemanticOctree]:
         kept = [*self._offsets.values(), *self._paused.values(), *self._taken.values()]
         return [*super()._octrees(), self.mass, self._total, *(held.octree for held in kept)]
+
+
+class RatioTeam(Team[RatioRobot]):
+    """Robots that exchange running sums."""
+
+    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+        _check_range(config)
+        super().__init__(config, num_classes, encoder)
+
+    def _new_robot(self, index: int, epoch: int) -> RatioRobot:
+        return RatioRobot(index, self._config, self._num_classes, self._encoder, epoch)
+
+    def iterate(
+        self, turns: Sequence[Turn[RatioRobot]], gamma_factor: float, tick: int, threads: Executor
+    ) -> list[float]:
+        """Add the growth of the received sums and the new evidence to each robot's mass; the rule has no gamma."""
+        del gamma_factor
+        masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
+        running_sums.team_take_in(masses, tick, threads)
+        return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
 
 
 def _check_range(config: RunConfig) -> None:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Self, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -34,14 +34,19 @@ class Arrival(NamedTuple):
     held: HeldMap
 
 
-RobotT = TypeVar("RobotT", bound="Robot", covariant=True)
+RobotT = TypeVar("RobotT", bound="Robot")
+RobotT_co = TypeVar("RobotT_co", bound="Robot", covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Turn(Generic[RobotT]):
-    """A robot's turn to iterate: what arrived, in order, and the 2 epsilon A_ij of its links, ``step_weights`` (N,)."""
+class Turn(Generic[RobotT_co]):
+    """A robot's iterations in one tick.
 
-    robot: RobotT
+    ``arrived`` are the states that arrived, in order; ``step_weights`` (N,) float64 are the 2 epsilon A_ij of its
+    links.
+    """
+
+    robot: RobotT_co
     arrived: Sequence[Arrival]
     step_weights: Float64Array
 
@@ -154,6 +159,16 @@ class Robot(ABC):
 
     # --- exchange -----------------------------------------------------------------------------------------------------
 
+    def is_due(self, tick: int) -> bool:
+        """True when the robot publishes in a tick, by its publish_period and publish_phase."""
+        robot, period = self._config.robots[self.index], self._config.network.publish_period
+        every = round((robot.publish_period or period) / period)
+        return tick % every == round(robot.publish_phase / period) % every
+
+    def publication(self, receivers: Sequence[int], tick: int, *, with_unpruned: bool) -> Publication:
+        """The robot's messages to its receivers in one tick, and the sizes of its map."""
+        return Publication(self.publish(receivers, tick), self.map_sizes(with_unpruned=with_unpruned))
+
     def map_sizes(self, *, with_unpruned: bool) -> MapSizes:
         """Sizes of the robot's map. Those without pruning are 0 unless ``with_unpruned``: they take as long as it."""
         unpruned = self.map.streams(prune=False) if with_unpruned else None
@@ -181,16 +196,6 @@ class Robot(ABC):
 
     # --- iterations ---------------------------------------------------------------------------------------------------
 
-    @classmethod
-    @abstractmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """One tick's iterations of several robots; returns each one's largest change of a log-odds.
-
-        ``factor`` scales gamma. The result does not depend on ``threads``.
-        """
-
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """The largest change of a log-odds since ``before``, which is overwritten."""
         return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
@@ -198,3 +203,47 @@ class Robot(ABC):
     def _update_streams(self) -> None:
         """The map's streams, with its leaves merged."""
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
+
+
+class Team(ABC, Generic[RobotT]):
+    """The robots of one family of rules, and their iterations together.
+
+    ``robots`` are in the order of ``config.robots``.
+    """
+
+    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+        self._config = config
+        self._num_classes = num_classes
+        self._encoder = encoder
+        self._past_evidence: list[Evidence] = []
+        self.robots = [self._new_robot(index, 0) for index in range(len(config.robots))]
+
+    def restart(self, index: int) -> None:
+        """Replace a robot by one without memory, in the next restart epoch; ``evidence()`` keeps its old evidence."""
+        old = self.robots[index]
+        self._past_evidence.append(old.evidence)
+        self.robots[index] = self._new_robot(index, old.source.epoch + 1)
+        self.robots[index].T_team_sensor = old.T_team_sensor
+
+    def evidence(self) -> list[Evidence]:
+        """Evidence of all robots, that of earlier restart epochs included."""
+        return [*(robot.evidence for robot in self.robots), *self._past_evidence]
+
+    def positions(self) -> Float64Array:
+        """Sensor positions, (N, 3) float64 in metres in the team's frame; NaN before a robot's first scan."""
+        positions = np.full((len(self.robots), 3), np.nan)
+        for row, robot in zip(positions, self.robots, strict=True):
+            if robot.T_team_sensor is not None:
+                row[:] = robot.T_team_sensor[:3, 3]
+        return positions
+
+    @abstractmethod
+    def _new_robot(self, index: int, epoch: int) -> RobotT:
+        """A robot without evidence, in a restart epoch."""
+
+    @abstractmethod
+    def iterate(self, turns: Sequence[Turn[RobotT]], gamma_factor: float, tick: int, threads: Executor) -> list[float]:
+        """Iterations of one tick at several robots; each robot's largest change of a log-odds.
+
+        ``gamma_factor`` scales gamma. The result does not depend on ``threads``.
+        """
