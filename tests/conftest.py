@@ -16,7 +16,7 @@ SharedFile = Callable[[str, Callable[[Path], object]], Path]
 
 @pytest.fixture(scope="session")
 def shared_file(tmp_path_factory: pytest.TempPathFactory) -> SharedFile:
-    """A function that returns the path of a named file, after ``make(path)`` in the first worker that asks for it."""
+    """Function that returns the path of a file or folder, made by ``make(path)`` in the worker that asks first."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
@@ -25,10 +25,12 @@ def shared_file(tmp_path_factory: pytest.TempPathFactory) -> SharedFile:
 
     def shared(name: str, make: Callable[[Path], object]) -> Path:
         path = folder / name
-        with (folder / f"{name}.lock").open("w") as lock:
+        with (folder / f"{name}.lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            if not path.exists():
+            # The lock file stays empty where ``make`` fails.
+            if not lock.tell():
                 make(path)
+                lock.write("made")
         return path
 
     return shared
@@ -51,6 +53,6 @@ def _replay(team: Path, path: Path, **parameters: object) -> None:
     # Imported at first use: most files of tests need no replay.
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.robots.discover import resolve
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
 
     replay_team(resolve(load_team_file(team).with_parameters(parameters)), path)

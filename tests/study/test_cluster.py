@@ -19,6 +19,8 @@ from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
 from support.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("distributed")
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)

@@ -14,6 +14,8 @@ from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_ex
 from octoreplay.study.grid import check_variations, combinations, parse_variation
 from octoreplay.study.questions import QUESTIONS
 
+pytestmark = pytest.mark.long
+
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 
 NUM_RUNS = {

@@ -20,6 +20,8 @@ from octoreplay.result import Result, open_result
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study import paper
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("open3d", exc_type=ImportError)
 
 FIGURES = ("agreement.png", "maps.png", "packet_size.png", "total_distance.png")

@@ -27,6 +27,8 @@ from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
 from support.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
 
+pytestmark = pytest.mark.long
+
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 SETTINGS = {"resolution": 0.6, "duration": 2.0}
 

@@ -56,3 +56,10 @@ def assert_fails(code: int, sentence: str, *arguments: object) -> None:
     done = octoreplay(*arguments)
     assert done.returncode == code, done.stderr
     assert re.search(sentence, done.stderr), done.stderr
+
+
+def output_of(code: int, *arguments: object) -> str:
+    """Return what a command prints: stderr after wrong usage or where stdout is empty, else stdout."""
+    done = octoreplay(*arguments)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stderr if code == 2 or not done.stdout else done.stdout
