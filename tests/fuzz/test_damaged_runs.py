@@ -10,9 +10,8 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from support.fixture_paths import PAIR
 from support.log_damage import mcap_chunks
-
-PAIR = Path(__file__).resolve().parents[1] / "fixtures" / "pair"
 
 
 def rewrite_in_small_chunks(source: Path, target: Path) -> None:

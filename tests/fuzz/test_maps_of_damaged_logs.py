@@ -23,24 +23,25 @@ from support.hostile_logs import (
 )
 from support.log_factory import write_rows
 
-CASES = 12
+CASES = [pytest.param(range(4), id="few"), pytest.param(range(4, 40), id="many", marks=pytest.mark.long)]
 
 
+@pytest.mark.parametrize("cases", CASES)
 @pytest.mark.parametrize("name", LOGS)
-def test_a_map_or_a_sentence_never_a_traceback(tmp_path, name):
+def test_a_damaged_log_gives_a_map_or_a_sentence(tmp_path, name, cases):
     good = map_of_log(FIXTURES / name, is_run=False)
     assert good.refusal is None
     assert good.num_frames >= 4
     num_maps = 0
-    for case in range(CASES):
+    for case in cases:
         path, what = write_hostile_log(name, tmp_path, random.Random(f"maps of {name} {case}"))
         try:
-            outcome = map_of_log(path, is_run=case == 0)
+            outcome = map_of_log(path, is_run=case % 10 == 0)
         except Exception as error:
             raise AssertionError(f"case {case}: {what}") from error
         num_maps += outcome.num_frames > 0
-    # Something is left of most logs, or they are given up too early; a file compressed as a whole is one block of zstd.
-    assert num_maps >= 2 or name.endswith("file_zstd")
+    # Most damage leaves something of a log; a file compressed as a whole is one block of zstd.
+    assert num_maps >= len(cases) // 6 or name.endswith("file_zstd")
 
 
 @pytest.mark.parametrize("mutation", dict.fromkeys(MESSAGE_MUTATIONS))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +22,9 @@ from octoreplay.result import open_result
 from reference.comparison import compare_map
 from reference.scenarios import START_NS, TeamShape, make_scenario
 from reference.twin import Twin, record
-
-FIXTURES = Path(__file__).parent.parent / "fixtures"
+from support.fixture_paths import PAIR_TEAM
+from support.long_suite import one_in
+from support.sessions import FrameList, frame_lists, sent_packets
 
 SHAPE = TeamShape(num_robots=4, num_ticks=14, image=(12, 9), resolution=0.4, scan_period=0.5, sensors="mixed")
 """The last robot comes in tick 4, the last but one ends in tick 8."""
@@ -48,16 +48,6 @@ BAD_RADIO = {"loss": 0.5, "latency": 1.2, "jitter": 1.0}
 ONE_WAY_RING = tuple((f"robot_{i}", f"robot_{(i + 1) % 4}") for i in range(4))
 
 
-@dataclasses.dataclass(frozen=True)
-class FrameList:
-    """Frames from memory."""
-
-    content: tuple
-
-    def frames(self):
-        return iter(self.content)
-
-
 @functools.cache
 def _scenario():
     return make_scenario(1, SHAPE)
@@ -77,7 +67,7 @@ def _config(*, robots=None, link_overrides=(), **parameters):
 
 def _session(config, num_threads=1):
     frames = _scenario().frames
-    sources = [FrameList(tuple(f for f in frames if f.robot_id == robot.robot_id)) for robot in config.robots]
+    sources = frame_lists([robot.robot_id for robot in config.robots], frames)
     return Session(config, sources, num_threads=num_threads)
 
 
@@ -117,12 +107,6 @@ def _assert_all_have_the_oracle(tick, tolerance):
 def _evidence(session):
     """Every robot's own evidence now, (N, M, C)."""
     return np.array([_dense(robot.evidence.octree) for robot in session._robots])
-
-
-def _packets(tick):
-    """Every packet that was sent in a tick."""
-    messages = [message for published in tick.published if published for _, message in published.outbox]
-    return [part.data for message in messages for part in message.parts]
 
 
 # --- flood -----------------------------------------------------------------------------------------------------------
@@ -297,8 +281,6 @@ def test_bayes_loses_where_links_carry_one_way_and_ratio_does_not():
 
 # --- bayes and merge are warned of -----------------------------------------------------------------------------------
 
-PAIR = FIXTURES / "pair" / "team.yaml"
-
 
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
@@ -315,7 +297,7 @@ PAIR = FIXTURES / "pair" / "team.yaml"
     ],
 )
 def test_a_run_says_what_its_rule_cannot_do(parameters, sentence):
-    config = load_team_file(PAIR).with_parameters({"settle": 0, **parameters})
+    config = load_team_file(PAIR_TEAM).with_parameters({"settle": 0, **parameters})
     summary = replay_team(config, None)
     assert sum(sentence in warning for warning in summary.warnings) == 1
 
@@ -365,7 +347,7 @@ def test_bayes_is_warned_of_links_that_do_not_carry_the_same_both_ways(parameter
 def test_what_is_stored_of_a_robot_that_forgot_is_what_it_has(rule, tmp_path):
     """A delta takes no bricks away: the first state of a new life is a whole map, and its metrics are its own."""
     schedule = (ScheduleEntry(2.0, 3.0, robots_off=("husky_1",), forget=True),)
-    config = load_team_file(PAIR)
+    config = load_team_file(PAIR_TEAM)
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, schedule=schedule))
     config = config.with_parameters({"rule": rule, "state_every": 1.0, "loss": 1.0, "settle": 0})
     replay_team(config, tmp_path / "result.mcap")
@@ -411,7 +393,7 @@ RANDOM_RADIO = {"loss": 0.3, "latency": 1.1, "jitter": 0.9, "corruption": 0.1, "
 def test_the_same_seed_gives_the_same_run_in_any_number_of_threads(rule, packets):
     def run(seed, num_threads):
         config = _config(rule=rule, topology="ring", network_seed=seed, **RANDOM_RADIO, **PACKETS[packets])
-        return [(t.metrics, _packets(t)) for t in _session(config, num_threads).ticks()]
+        return [(t.metrics, sent_packets(t)) for t in _session(config, num_threads).ticks()]
 
     one = run(0, 1)
     assert run(0, 1) == one
@@ -456,18 +438,21 @@ def test_deltas_give_the_very_maps_of_whole_packets(rule, mode):
             expected, *others = [(octree.leaves().centers.tobytes(), octree.leaves().log_odds.tobytes())
                                  for octree in maps]  # fmt: skip
             assert others == [expected, expected]
-    kinds = [{codec.read_header(data).kind for data in _packets(tick)} for tick in ticks]
+    kinds = [{codec.read_header(data).kind for data in sent_packets(tick)} for tick in ticks]
     assert kinds[:2] == [{codec.FULL}, {codec.DELTA}]
 
 
 # --- the budget ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("radio", [{}, {"loss": 0.4, "network_seed": 2}], ids=["good", "bad"])
 @pytest.mark.parametrize(
-    "packets", [{"budget": 2200}, {"budget": 640, "content": "int8", "int8_step": 0.1}], ids=["float32", "int8"]
-)
-@pytest.mark.parametrize("topology", ["complete", "line"])
+    ("topology", "packets", "radio"),
+    one_in(
+        3, ["complete", "line"], [{"budget": 2200}, {"budget": 640, "content": "int8", "int8_step": 0.1}],
+        [{}, {"loss": 0.4, "network_seed": 2}],
+    ),
+    ids=str,
+)  # fmt: skip
 def test_within_a_budget_all_evidence_floods_in_the_end(topology, packets, radio):
     session = _session(_config(rule="flood", topology=topology, packets="delta", **packets, **radio))
     whole = _session(_config(rule="flood", topology=topology))
@@ -483,8 +468,11 @@ def test_within_a_budget_all_evidence_floods_in_the_end(topology, packets, radio
     _assert_all_have_the_oracle(tick, 1e-4)
 
 
-@pytest.mark.parametrize("rule", ["bayes", "natural", "gradient"])
-@pytest.mark.parametrize("packets", [{"budget": 2200}, {"budget": 640, "content": "int8"}], ids=["float32", "int8"])
+@pytest.mark.parametrize(
+    ("packets", "rule"),
+    one_in(2, [{"budget": 2200}, {"budget": 640, "content": "int8"}], ["bayes", "natural", "gradient"]),
+    ids=str,
+)
 def test_a_budget_does_not_drive_maps_apart(packets, rule):
     """What waits makes the others' maps older, not wrong: nobody goes far beyond the evidence, and all come closer."""
     session = _session(_config(rule=rule, packets="delta", settle_max=50, **packets))

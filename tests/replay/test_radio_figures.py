@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from pathlib import Path
 
 import pytest
 
@@ -12,13 +11,12 @@ from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
-
-TRIO = Path(__file__).parents[1] / "fixtures" / "trio" / "team.yaml"
+from support.fixture_paths import TRIO_TEAM
 
 
 @functools.lru_cache(maxsize=16)
 def _replayed(**parameters):
-    return replay_team(load_team_file(TRIO).with_parameters(parameters), None)
+    return replay_team(load_team_file(TRIO_TEAM).with_parameters(parameters), None)
 
 
 def _worst(summary):
@@ -47,6 +45,7 @@ def test_ratio_stands_losses_and_delays_on_a_ring():
     assert _worst(summary) >= 0.999
 
 
+@pytest.mark.long
 def test_flood_stands_99_of_100_packets_lost():
     assert _worst(_replayed(rule="flood", loss=0.99)) >= 0.999
 
@@ -54,7 +53,7 @@ def test_flood_stands_99_of_100_packets_lost():
 @pytest.mark.parametrize("rule", ["bayes", "ratio"])
 def test_a_merged_team_agrees_within_ten_ticks(rule, tmp_path):
     """The logs end with the partition, so that nothing new hides what was left of it."""
-    config = load_team_file(TRIO).with_parameters({"rule": rule, "settle_max": 10})
+    config = load_team_file(TRIO_TEAM).with_parameters({"rule": rule, "settle_max": 10})
     robot_ids = [robot.robot_id for robot in config.robots]
     whole = replay_team(config, None)
     merge = whole.num_ticks - whole.num_settling_ticks - 1

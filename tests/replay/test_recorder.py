@@ -9,12 +9,11 @@ from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
-
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
+from support.fixture_paths import PAIR_TEAM
 
 
 def test_the_centralised_map_is_the_sum_of_what_the_robots_saw(tmp_path: Path) -> None:
-    config = load_team_file(PAIR).with_parameters({"rule": "local", "state_every": 1.0, "prob_free": 0.7})
+    config = load_team_file(PAIR_TEAM).with_parameters({"rule": "local", "state_every": 1.0, "prob_free": 0.7})
     replay_team(config, tmp_path / "result.mcap")
     with open_result(tmp_path / "result.mcap") as result:
         num_stored = 0

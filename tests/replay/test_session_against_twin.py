@@ -25,7 +25,9 @@ from reference.comparison import compare_map
 from reference.hand_made import cloud, ray, team_config
 from reference.scenarios import TeamShape, make_scenario
 from reference.twin import STOPPED_CONVERGED, STOPPED_MAX, STOPPED_OFF, Twin, record
+from support.long_suite import long, one_in
 from support.octree_factory import class_rows
+from support.sessions import frame_lists, sent_packets
 
 TOLERANCE = 5e-5
 """Largest |log-odds difference| of any class in any cell."""
@@ -54,16 +56,6 @@ EDGES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class FrameList:
-    """Frames from memory."""
-
-    content: tuple
-
-    def frames(self):
-        return iter(self.content)
-
-
 @dataclass
 class Outcome:
     """What a comparison went through: ticks, the last of both, and the largest difference of any log-odds."""
@@ -89,7 +81,7 @@ def _recording(seed, shape, sensor_parameters):
 
 
 def _sources(config, frames):
-    return [FrameList(tuple(f for f in frames if f.robot_id == robot.robot_id)) for robot in config.robots]
+    return frame_lists([robot.robot_id for robot in config.robots], frames)
 
 
 def _configured(scenario, topology, **parameters):
@@ -202,6 +194,7 @@ def _near_ties(deviation, prior):
 # --- large teams: at least 100 ticks and 20,000 cells ----------------------------------------------------------------
 
 
+@long
 @pytest.mark.parametrize(
     ("rule", "mode", "topology"),
     [
@@ -218,6 +211,7 @@ def test_four_robots(rule, mode, topology):
     assert outcome.num_compared_maps >= 20
 
 
+@long
 @pytest.mark.parametrize(
     ("rule", "mode", "topology"),
     [("gradient", "sync", "complete"), ("bayes", "on-arrival", "ring"), ("natural", "sync", "line")],
@@ -234,9 +228,7 @@ def test_six_robots(rule, mode, topology):
 # --- every rule, mode and topology, with settling and metrics --------------------------------------------------------
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(3, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above float32's rounding, so that both stop settling in the same tick."""
     outcome = _compare(
@@ -257,9 +249,7 @@ def test_settling_ends_at_its_maximum(settle_max, num_settling_ticks):
 # --- readings, priors, regions, sensors, schedules -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("evidence", ["time-average", "cell-average"])
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("rule", "evidence", "mode"), one_in(3, RULES, ["time-average", "cell-average"], MODES))
 def test_average_readings(rule, evidence, mode):
     _compare(SMALL, topology="line", rule=rule, mode=mode, evidence=evidence, settle=0, with_metrics=True, every=5)
 
@@ -288,8 +278,7 @@ SENSOR_VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("rule", ["gradient", "bayes"])
-@pytest.mark.parametrize("variant", SENSOR_VARIANTS)
+@pytest.mark.parametrize(("rule", "variant"), one_in(2, ["gradient", "bayes"], SENSOR_VARIANTS))
 def test_sensor_models(variant, rule):
     outcome = _compare(SMALL, rule=rule, settle=0, every=8, sensor_parameters=SENSOR_VARIANTS[variant])
     assert outcome.twin_tick.known.any()
@@ -301,9 +290,7 @@ def test_kinds_of_sensors(sensors):
     _compare(shape, seed=4, topology="line", rule="gradient", settle=0, every=8)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("topology", ["complete", "star"])
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("rule", "topology", "mode"), one_in(3, RULES, ["complete", "star"], MODES))
 def test_robots_that_leave(rule, topology, mode):
     outcome = _compare(
         SMALL, topology=topology, rule=rule, mode=mode, after_end="leave", settle=4, settle_tolerance=1e-3, every=3,
@@ -312,16 +299,14 @@ def test_robots_that_leave(rule, topology, mode):
     assert outcome.twin_tick.active == (True, True, False, True)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "parameters",
-    [
-        {"weights": "degree"}, {"weights": "degree", "epsilon": 0.21}, {"epsilon": 0.9}, {"gamma": 1.0},
-        {"gamma": 0.9, "gamma_power": 1.0, "gamma_decay": 3.0}, {"gamma_per_arrival": "full"}, {"publish_period": 0.37},
-        {"publish_period": 5.0}, {"packet_compression": "none"},
-    ],
-    ids=str,
+STEPS_AND_SCHEDULES = (
+    {"weights": "degree"}, {"weights": "degree", "epsilon": 0.21}, {"epsilon": 0.9}, {"gamma": 1.0},
+    {"gamma": 0.9, "gamma_power": 1.0, "gamma_decay": 3.0}, {"gamma_per_arrival": "full"}, {"publish_period": 0.37},
+    {"publish_period": 5.0}, {"packet_compression": "none"},
 )  # fmt: skip
+
+
+@pytest.mark.parametrize(("mode", "parameters"), one_in(2, MODES, STEPS_AND_SCHEDULES), ids=str)
 def test_steps_and_schedules(parameters, mode):
     _compare(SMALL, topology="star", rule="natural", mode=mode, settle=0, every=9, **parameters)
     _compare(SMALL, topology="star", rule="gradient", mode=mode, settle=0, every=9, **parameters)
@@ -387,16 +372,10 @@ def test_threads_do_not_change_a_byte(rule, mode):
         session = Session(config, _sources(config, scenario.frames), num_threads=num_threads)
         run = []
         for tick in session.ticks():
-            run.append((tick.metrics, _packets(tick)))
+            run.append((tick.metrics, sent_packets(tick)))
         runs.append((run, [octree.leaves().log_odds.tobytes() for octree in tick.maps]))
     assert any(packets for _, packets in runs[0][0]) == (rule != "local")
     assert runs[0] == runs[1] == runs[2]
-
-
-def _packets(tick):
-    """Every packet that was sent in a tick."""
-    messages = [message for published in tick.published if published for _, message in published.outbox]
-    return [part.data for message in messages for part in message.parts]
 
 
 @pytest.mark.parametrize("rule", ["gradient", "bayes", "natural"])
@@ -417,7 +396,7 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
     for function in (recorded, whole):
         monkeypatch.setattr(consensus_module, "team_step", function)
         session = Session(config, _sources(config, scenario.frames))
-        runs.append([_packets(tick) for tick in session.ticks()])
+        runs.append([sent_packets(tick) for tick in session.ticks()])
     assert runs[0] == runs[1]
     assert sum(since is not None for since in since_of_steps) > len(since_of_steps) / 3
 
