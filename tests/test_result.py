@@ -38,7 +38,7 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Result:
 def test_the_result_tells_what_was_run(result: Result, tmp_path: Path) -> None:
     assert result.robots == ("alpha", "beta")
     assert result.class_table == CLASSES
-    assert result.config == team(tmp_path)
+    assert result.config == team(tmp_path).to_config()
     assert result.metrics == [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
     assert result.summary.stop_reason == summary(result.metrics).stop_reason
     assert result.stored_ticks("alpha") == [1, 2, 4]
@@ -140,7 +140,7 @@ def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.Mo
     leaf_list.install(monkeypatch)
     config = team(tmp_path).with_parameters({"prob_free": 0.6})
     prior = np.log(0.4 / 2 / 0.6)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         fill(writer)
         writer.complete(summary([tick_metrics(1)]))
     with open_result(str(tmp_path / "out.mcap")) as opened:

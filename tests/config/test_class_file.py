@@ -27,12 +27,12 @@ LIST = "classes: [{name: road, raw_labels: 1}, {name: car, raw_labels: [2, 5]}, 
 
 
 def _parsed(text, folder=Path("/team")):
-    return parse_team(ROBOTS + text, source="team.yaml", folder=folder)
+    return parse_team(ROBOTS + text, name="team.yaml", folder=folder)
 
 
 def _there_and_back(config):
     text = dump_team(config, Path("/team"))
-    again = parse_team(text, source="again", folder=Path("/team"))
+    again = parse_team(text, name="again", folder=Path("/team"))
     assert again == config
     assert dump_team(again, Path("/team")) == text
     return text
@@ -231,7 +231,7 @@ def test_classes_of_the_logs_are_merged_and_ignored(tmp_path):
     assert config.classes.names == ("both", *rest)
     assert team.classes.classes[0].raw_labels[0] in config.classes.ignored_raw_labels
     assert (config.merge_classes, config.ignore_hits) == ((), ())
-    _there_and_back(config)
+    _there_and_back(config.to_config())
 
 
 def test_run_takes_classes_from_a_table_or_a_file(tmp_path, capsys):

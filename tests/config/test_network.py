@@ -21,7 +21,7 @@ ROBOTS = "robots: [{id: husky, log: husky.mcap}, {id: jackal, log: jackal.mcap},
 
 
 def _parsed(text, robots=ROBOTS):
-    return parse_team(robots + text, source="team.yaml", folder=FOLDER)
+    return parse_team(robots + text, name="team.yaml", folder=FOLDER)
 
 
 def _robots(**fields):
@@ -82,8 +82,8 @@ CONFIGS = {
 def test_a_team_file_gives_the_configuration_that_it_was_written_from(name):
     config = RunConfig(**{"robots": _robots(), **CONFIGS[name]})
     text = dump_team(config, FOLDER)
-    assert parse_team(text, source="team.yaml", folder=FOLDER) == config
-    assert dump_team(parse_team(text, source="team.yaml", folder=FOLDER), FOLDER) == text
+    assert parse_team(text, name="team.yaml", folder=FOLDER) == config
+    assert dump_team(parse_team(text, name="team.yaml", folder=FOLDER), FOLDER) == text
 
 
 def test_every_parameter_of_links_and_packets_goes_there_and_back():

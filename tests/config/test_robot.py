@@ -29,7 +29,7 @@ def test_a_team_file_gives_back_every_field(folder):
     config = RunConfig(robots=(FULL, CLOUD)).with_parameters({"hide_robots": True, "start": 2.0, "every": 3})
     config = config.with_parameters({"duration": 10.5, "rate_limit": 2.0})
     text = dump_team(config, folder)
-    assert parse_team(text, source="team", folder=folder or Path("/nowhere")) == config
+    assert parse_team(text, name="team", folder=folder or Path("/nowhere")) == config
     assert ("pose_file: a.txt" in text) == (folder == Path("/logs"))
     assert "pose_times: /elsewhere/times.txt" in text
 
@@ -81,7 +81,7 @@ def test_what_contradicts_itself_is_refused(fields, sentence):
 )  # fmt: skip
 def test_values_of_the_wrong_type_are_refused_by_name(line, sentence):
     with pytest.raises(ConfigError, match=sentence):
-        parse_team(f"robots:\n- id: r\n  log: a.mcap\n  {line}\n", source="team.yaml", folder=Path("/x"))
+        parse_team(f"robots:\n- id: r\n  log: a.mcap\n  {line}\n", name="team.yaml", folder=Path("/x"))
 
 
 def test_the_files_of_a_robot_are_its_inputs(tmp_path, monkeypatch):

@@ -11,7 +11,8 @@ from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.config.team_file import _TEAM_KEYS, dump_team, parse_team, team_template
+from octoreplay.config.team_file import _TEAM_KEYS, dump_team, parse_team
+from octoreplay.config.team_template import team_template
 
 CLASSES = class_table(
     [
@@ -34,7 +35,7 @@ PLAIN = RobotConfig("r2", (Path("/logs/r2.bag"),), cloud_topic="/points", label_
     "values",
     [{}, {"resolution": 0.35, "no_return_depth": (float("inf"), 1.0), "rule": "flood", "duration": 3.0, "hash": True}],
 )
-def test_what_is_written_is_read_again(write, values):
+def test_a_written_team_file_gives_the_same_configuration(write, values):
     config = RunConfig((ROBOT, PLAIN), classes=CLASSES).with_parameters(values)
     config = dataclasses.replace(config, link_overrides=(("yes", "r2", (("loss", 0.5),)),))
     network = dataclasses.replace(
@@ -42,10 +43,10 @@ def test_what_is_written_is_read_again(write, values):
         schedule=(ScheduleEntry(start=1.0, end=2.5, robots_off=("yes",), forget=True),),
     )  # fmt: skip
     config = dataclasses.replace(config, network=network)
-    assert parse_team(write(config, Path("/logs")), source="team.yaml", folder=Path("/logs")) == config
+    assert parse_team(write(config, Path("/logs")), name="team.yaml", folder=Path("/logs")) == config
 
 
-def test_the_template_has_every_key_and_says_what_is_missing():
+def test_the_template_has_every_key_and_names_missing_data():
     text = team_template(RunConfig((PLAIN,)), {"r2": ["no poses", "two depth images:\n    depth_topic: /a"]})
     keys = {item.name for item in dataclasses.fields(RobotConfig)} - {"robot_id", "logs"}
     for key in (*keys, *PARAMETERS, *_TEAM_KEYS):
@@ -53,23 +54,29 @@ def test_the_template_has_every_key_and_says_what_is_missing():
     assert "    # missing: no poses\n    # missing: two depth images:\n    # depth_topic: /a\n" in text
 
 
-def test_every_default_of_the_template_holds_when_its_mark_is_taken_away():
+def test_commented_defaults_of_the_template_are_the_defaults():
     config = RunConfig((PLAIN,), classes=CLASSES)
     text = team_template(config, {})
     names = "|".join([*PARAMETERS, "clock_offset", "T_team_map", "publish_phase"])
     uncommented, count = re.subn(rf"^( *)# ((?:{names}): .*)$", r"\1\2", text, flags=re.MULTILINE)
     assert count > 40
-    assert parse_team(uncommented, source="team.yaml", folder=Path()) == config
+    assert parse_team(uncommented, name="team.yaml", folder=Path()) == config
 
 
-def test_a_pose_file_stands_beside_the_team_file():
+def test_every_choice_of_a_parameter_is_in_its_help():
+    for parameter in PARAMETERS.values():
+        for choice in parameter.choices or ():
+            assert re.search(rf"\b{choice}\b", parameter.help), (parameter.name, choice)
+
+
+def test_a_pose_file_is_relative_to_the_team_file():
     text = "robots: [{id: a, log: a.mcap, cloud_topic: /p, pose_file: poses.txt, pose_times: t/times.txt}]"
-    robot = parse_team(text, source="team.yaml", folder=Path("/team")).robots[0]
+    robot = parse_team(text, name="team.yaml", folder=Path("/team")).robots[0]
     assert (robot.pose_file, robot.pose_times) == (Path("/team/poses.txt"), Path("/team/t/times.txt"))
     assert robot.files == (Path("/team/a.mcap"), Path("/team/poses.txt"), Path("/team/t/times.txt"))
 
 
 @pytest.mark.parametrize("write", [dump_team, lambda config: team_template(config, {})])
-def test_edits_of_the_logs_own_classes_are_kept(write):
+def test_edits_of_the_logs_own_classes_are_written_and_read(write):
     config = RunConfig((PLAIN,), merge_classes=(("a", ("b", "c")),), ignore_hits=("d",))
-    assert parse_team(write(config), source="team.yaml", folder=Path()) == config
+    assert parse_team(write(config), name="team.yaml", folder=Path()) == config

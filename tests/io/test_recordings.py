@@ -11,7 +11,8 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
-from octoreplay.io.robots.discover import describe, discover, resolve
+from octoreplay.io.robots.describe import describe
+from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.trajectories import read_rows, trajectory
 from support.recordings import RECORDINGS, needs_recordings

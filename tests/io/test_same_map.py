@@ -41,6 +41,7 @@ from fixtures.make_containers import (
     scan_ranges,
     write_mcap,
 )
+from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -66,12 +67,12 @@ def names_its_classes(name: str) -> bool:
     return not (name.startswith(("foxglove", "ros1")) or name.endswith(".bag"))
 
 
-def resolved(path: Path, classes: ClassTable | None) -> RunConfig:
+def resolved(path: Path, classes: ClassTable | None) -> ResolvedRun:
     """What is found in a log of which only the path is given, and the classes where it does not name them."""
     return octoreplay.resolve(RunConfig(octoreplay.discover([path]), classes=classes))
 
 
-def frames_of(robot: RobotConfig, classes: ClassTable | None) -> list[Frame]:
+def frames_of(robot: ResolvedRobot, classes: ClassTable | None) -> list[Frame]:
     """All frames of a robot, of which nothing may be lost."""
     with RobotLog(robot, TimeConfig(), classes) as log:
         frames = list(log.frames())
@@ -118,7 +119,7 @@ def test_no_container_is_missing() -> None:
 @pytest.mark.parametrize("name", LOGS)
 def test_robot_and_topics_are_found_without_a_word(name: str) -> None:
     [robot] = octoreplay.discover([CONTAINERS / name])
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         Path(name).stem,
         (CONTAINERS / name,),
         depth_topic=DEPTH,

@@ -15,8 +15,9 @@ from octoreplay.mapping import codec
 from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.kernels import packets, storage
-from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, quantised
+from octoreplay.mapping.streams import leaf_list, leaf_values
 from support.octree_factory import brick_code, cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
@@ -29,14 +30,14 @@ VALUES = st.sampled_from([0.0, -5.0, 5.0, -0.3, 1.0, 1e-30, -3e38, float(np.floa
 
 @st.composite
 def octrees(draw, num_classes=None):
-    """Octrees of single cells and cubes, near the origin (both signs) and at the ends of the key space."""
+    """Octrees of single cells and cubes, near the origin (keys of both signs) and at the ends of the key space."""
     num_classes = num_classes or draw(st.sampled_from([1, 2, 5, 9, 20]))
     corners = st.sampled_from([-LIMIT, -LIMIT + 64, -64, -17, -8, -1, 0, 3, 8, 40, LIMIT - 64])
     cells = {}
     for _ in range(draw(st.integers(0, 6))):
         edge = draw(st.sampled_from([1, 1, 2, 3, 4, 8, 16]))
         corner = [draw(corners) for _ in range(3)]
-        # As many values as classes, or a few that several classes share.
+        # One value for each class, or a few values shared by several classes.
         palette = [draw(VALUES) for _ in range(draw(st.integers(1, 3)))]
         values = [draw(VALUES if draw(st.booleans()) else st.sampled_from(palette)) for _ in range(num_classes)]
         values = [palette[0]] * num_classes if draw(st.booleans()) else values
@@ -46,24 +47,24 @@ def octrees(draw, num_classes=None):
 
 @settings(max_examples=60, deadline=None)
 @given(octree=octrees(), level=st.sampled_from([None, 1, 3, 22]), prune=st.booleans())
-def test_a_packet_gives_the_map_back_bit_for_bit(octree, level, prune):
+def test_decoding_restores_the_map_bit_for_bit(octree, level, prune):
     packet = codec.encode_packet(octree, packet_format=PacketFormat(zstd_level=level), prune=prune)
     decoded = codec.decode_packet(packet)
     assert (decoded.resolution, decoded.num_classes) == (octree.resolution, octree.num_classes)
     assert cells_of(decoded) == cells_of(octree)
-    # The octree is canonical, so the same map gives the same bytes, however it was pruned before.
+    # Pruned streams are canonical: the same map gives the same bytes, however it was pruned before.
     assert codec.encode_packet(decoded) == codec.encode_packet(octree)
 
 
 @settings(max_examples=60, deadline=None)
 @given(octree=octrees(), prune=st.booleans())
-def test_the_streams_read_as_the_format_says(octree, prune):
+def test_streams_follow_the_documented_format(octree, prune):
     streams = octree.streams(prune=prune)
     assert _naive_cells(streams.words.tolist(), streams, octree.num_classes) == cells_of(octree)
 
 
 def _naive_cells(words, streams, num_classes):
-    """{key: bytes of its values} read recursively, as docs/packet-format.md says it; None for words that are no octree.
+    """{key: bytes of its values} read recursively after docs/packet-format.md; None for words that are no octree.
 
     Leaves larger than 32 cells are left out.
     """
@@ -102,7 +103,7 @@ def _naive_cells(words, streams, num_classes):
 
 @settings(max_examples=60, deadline=None)
 @given(octree=octrees())
-def test_a_leaf_holds_the_value_of_most_classes_and_those_that_differ(octree):
+def test_leaf_stores_the_value_of_most_classes_and_the_others(octree):
     streams = octree.streams(prune=False)
     _, _, is_vector = leaf_list(streams)
     values = leaf_values(streams, is_vector, octree.num_classes)
@@ -115,7 +116,7 @@ def test_a_leaf_holds_the_value_of_most_classes_and_those_that_differ(octree):
 
 @settings(max_examples=40, deadline=None)
 @given(before=octrees(num_classes=2), after=octrees(num_classes=2), data=st.data())
-def test_a_delta_replaces_the_bricks_that_it_holds(before, after, data):
+def test_delta_replaces_its_bricks(before, after, data):
     after.resolution = before.resolution
     chosen = np.array(sorted(data.draw(st.sets(st.integers(0, max(after.num_bricks - 1, 0))))), np.int64)
     chosen = chosen[chosen < after.num_bricks]
@@ -144,7 +145,7 @@ def test_large_uniform_cubes_are_one_leaf():
     assert cells_of(codec.decode_packet(codec.encode_packet(hit))) == cells_of(hit)
 
 
-def test_the_corners_of_the_key_space():
+def test_corners_of_the_key_space():
     ends = (-LIMIT, LIMIT - 1)
     cells = {(x, y, z): [float(x > 0), float(y > 0) + 2 * (z > 0)] for x in ends for y in ends for z in ends}
     octree = octree_of(cells)
@@ -152,7 +153,7 @@ def test_the_corners_of_the_key_space():
     assert cells_of(codec.decode_packet(codec.encode_packet(octree))) == cells_of(octree)
 
 
-def test_an_empty_map():
+def test_empty_map():
     octree = SemanticOctree(0.2, 3)
     packet = codec.encode_packet(octree, packet_format=PLAIN)
     assert len(packet) == codec.HEADER_BYTES == 68
@@ -169,7 +170,7 @@ def test_bricks_without_a_known_cell_take_no_words():
     assert octree.streams().words.size == octree.streams(prune=False).words.size == 0
 
 
-def test_equal_maps_are_equal_bytes_whatever_the_sign_of_0_and_the_order_of_bricks():
+def test_equal_maps_give_equal_bytes_with_any_sign_of_0_and_order_of_bricks():
     cells = cube((-9, 0, 3), 12, [0.0, 1.0]) | cube((0, 0, 0), 4, [0.0, 0.0]) | {(50, 0, 0): [0.0, 0.0]}
     packet = codec.encode_packet(octree_of(cells))
     signed = {key: [-value if value == 0 else value for value in values] for key, values in reversed(cells.items())}
@@ -178,13 +179,13 @@ def test_equal_maps_are_equal_bytes_whatever_the_sign_of_0_and_the_order_of_bric
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("tolerance", [0.0, 0.5])
-def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
-    """They never come from scans, but may from a packet: nothing else may change, and nothing is written outside."""
+def test_nan_and_infinity_are_kept(value, tolerance):
+    """Packets may contain them, unlike scans. Other values must not change, and no write may be out of bounds."""
     octree = SemanticOctree(0.25, 3)
     octree.find_or_add(np.arange(64))
     masks = np.repeat([0, 0x0001_0507_0203_0004, 0], [22, 21, 21]).astype(np.uint64)[:, None]
     has_block = np.repeat([True, False], [43, 21])
-    octree.raise_bricks(np.arange(64), masks, np.full(64, storage.ALL_CELLS), has_block)
+    octree.expand_bricks(np.arange(64), masks, np.full(64, storage.ALL_CELLS), has_block)
     for array in (octree.bricks.values, octree.bricks.rows):
         array[:] = value
     streams = octree.streams(tolerance=tolerance)
@@ -195,8 +196,8 @@ def test_values_that_are_no_numbers_keep_their_place(value, tolerance):
     assert len(cells_of(decoded)) == 64 * 64
 
 
-def test_the_bytes_by_hand():
-    """A root with a single cell at key (0, 0, 0): child 7 of the root, then child 0 of each; one vector leaf."""
+def test_bytes_by_hand():
+    """One vector leaf at key (0, 0, 0): child 7 of the root, then child 0 of each node."""
     octree = octree_of({(0, 0, 0): [1.5, -2.0]})
     words = struct.pack("<19H", *(state << (2 * child) for state, child in [(1, 7)] + [(1, 0)] * 17 + [(3, 0)]))
     numbers = {"float32": ("f", 1.5, -2.0), "float16": ("e", 1.5, -2.0), "int8": ("b", 3, -4)}
@@ -213,7 +214,7 @@ def test_the_bytes_by_hand():
         assert codec.read_header(packet).raw_bytes == len(payload)
 
 
-def test_tolerance_merges_within_its_bound():
+def test_merging_with_tolerance_stays_within_its_bound():
     cells = cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [1.25, -0.25]}
     octree = octree_of(cells)
     assert codec.read_header(codec.encode_packet(octree, tolerance=0.2)).num_vectors == 8
@@ -237,13 +238,13 @@ def test_grid_bytes():
     octree=octrees(), content=st.sampled_from(CONTENTS), step=st.sampled_from([0.05, 0.3, 1e-3]), level=st.booleans(),
     every=st.integers(1, 3),
 )  # fmt: skip
-def test_a_quantised_map_comes_back_bit_for_bit_in_its_content(octree, content, step, level, every):
+def test_quantised_maps_are_restored_bit_for_bit(octree, content, step, level, every):
     octree = quantised(octree, content, step)
     packet_format = PacketFormat(content, step, 1 if level else None)
     packet = codec.encode_packet(octree, packet_format=packet_format)
     decoded = codec.decode_packet(packet)
     assert cells_of(decoded) == cells_of(octree)
-    # Equal maps are equal bytes, whatever they were before.
+    # Equal maps give equal bytes, whatever they were quantised from.
     assert codec.encode_packet(decoded, packet_format=packet_format) == packet
     chosen = np.arange(0, octree.num_bricks, every)
     receiver = SemanticOctree(octree.resolution, octree.num_classes)
@@ -252,7 +253,7 @@ def test_a_quantised_map_comes_back_bit_for_bit_in_its_content(octree, content, 
     assert cells_of(receiver) == {key: value for key, value in cells_of(octree).items() if _code(key) in codes}
 
 
-def test_what_a_content_cannot_hold_is_refused():
+def test_values_that_a_content_cannot_represent_are_refused():
     octree = octree_of({(0, 0, 0): [0.1, 0.15]})
     for content in ("float16", "int8"):
         packet_format = PacketFormat(content, step=0.2)
@@ -265,7 +266,7 @@ def test_what_a_content_cannot_hold_is_refused():
             codec.encode_packet(SemanticOctree(0.25, 2), packet_format=PacketFormat(content, step))
 
 
-def test_the_middle_of_merged_values_is_refused_where_it_is_no_step():
+def test_midpoints_of_merged_values_that_are_no_steps_are_refused():
     octree = octree_of(cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [1.5, 0.0]})
     packet_format = PacketFormat("int8", step=0.5)
     assert codec.encode_packet(octree, packet_format=packet_format, tolerance=0.4)
@@ -273,7 +274,7 @@ def test_the_middle_of_merged_values_is_refused_where_it_is_no_step():
         codec.encode_packet(octree, packet_format=packet_format, tolerance=0.5)
 
 
-def test_siblings_that_become_equal_are_one_leaf():
+def test_siblings_made_equal_by_quantisation_are_one_leaf():
     """Across rows, octets, bricks and classes."""
     rng = np.random.default_rng(5)
     cells = {key: rng.uniform(0.96, 1.04, 3) for key in cube((0, 0, 0), 8, 0.0)}
@@ -291,7 +292,7 @@ def test_siblings_that_become_equal_are_one_leaf():
 
 
 def _naive_codes(numbers):
-    """The codes of numbers (bytes of each), then their literals byte by byte, as docs/packet-format.md says it."""
+    """Codes of numbers (bytes of each), then their literals byte by byte, after docs/packet-format.md."""
     slots, codes, literals = {}, [], []
     for number in numbers:
         bits = int.from_bytes(number, "little")
@@ -306,7 +307,7 @@ def _naive_codes(numbers):
 
 
 def _coded_payload(payload, counts, width=4, num_classes=2):
-    """What is compressed in place of a payload with these counts."""
+    """Content of the compressed payload with these counts."""
     ends = np.cumsum([2 * counts[0], width * counts[1], counts[2] * -(-num_classes // 8)]).tolist()
     words, values, masks, own = (payload[a:b] for a, b in zip([0, *ends], [*ends, None], strict=True))
 
@@ -322,7 +323,7 @@ def _counts(header):
 
 @settings(max_examples=60, deadline=None)
 @given(octree=octrees(), content=st.sampled_from(CONTENTS), prune=st.booleans())
-def test_what_is_compressed_reads_as_the_format_says(octree, content, prune):
+def test_compressed_payload_follows_the_documented_format(octree, content, prune):
     octree = quantised(octree, content, 0.05)
     plain = codec.encode_packet(octree, packet_format=PacketFormat(content, zstd_level=None), prune=prune)
     packet = codec.encode_packet(octree, packet_format=PacketFormat(content), prune=prune)
@@ -340,7 +341,7 @@ def test_what_is_compressed_reads_as_the_format_says(octree, content, prune):
     numbers=st.lists(st.sampled_from([0, 1, 2, 255, 256, 2**16 - 1, 2**31, 2**32 - 1, 0xC0A00000, 377, 754, 1131])),
     width=st.sampled_from([2, 4]),
 )
-def test_codes_and_literals_against_the_naive_ones_both_ways(numbers, width):
+def test_codes_and_literals_equal_the_naive_ones_in_both_directions(numbers, width):
     numbers = np.array([number % 2 ** (8 * width) for number in numbers], np.uint32)
     codes, literals = np.empty(numbers.size, np.uint8), np.empty((4, numbers.size), np.uint8)
     num_literals = packets.write_codes(numbers, np.zeros(256, np.uint32), codes, literals)
@@ -358,9 +359,9 @@ def _slot(value):
     return max((int.from_bytes(struct.pack("<f", value), "little") * 2654435761 % 2**32) // 2**24, 1)
 
 
-def test_any_codes_are_read_as_the_format_says():
-    """A slot in which nothing stands holds 0; only literals enter a slot, also one in which they stand already."""
-    first = next(value for value in range(2, 10000) if _slot(value) == 1)  # in the slot of 0
+def test_arbitrary_codes_follow_the_documented_format():
+    """Empty slots hold 0. Literals are written to their slot, even if it already holds the same number."""
+    first = next(value for value in range(2, 10000) if _slot(value) == 1)  # same slot as 0
     codes = bytes([255, 0, 0, _slot(1.0), 0, 9, 1, _slot(1.0)])
     literals = b"".join(bytes(plane) for plane in zip(*(struct.pack("<f", n) for n in (1.0, 1.0, first)), strict=True))
     packet = _compressed(_words(*CHAIN, 0xAAAA) + codes + literals, (19, 8, 0, 0))
@@ -389,7 +390,7 @@ def _compressed(payload, counts):
 
 @pytest.fixture(scope="module")
 def noisy():
-    """A map with a few hundred different values, in no order that zstd could follow."""
+    """A map with a few hundred different values in random order, which zstd cannot predict."""
     rng = np.random.default_rng(3)
     palette = rng.normal(0, 2, 300).astype(np.float32)
     cells = {}
@@ -399,7 +400,7 @@ def noisy():
     return octree_of(cells)
 
 
-def test_codes_and_blocks_make_packets_smaller(noisy):
+def test_codes_and_separate_blocks_make_packets_smaller(noisy):
     plain = codec.encode_packet(noisy, packet_format=PLAIN)[codec.HEADER_BYTES :]
     packet = codec.encode_packet(noisy)
     coded = _coded_payload(plain, _counts(codec.read_header(packet)))
@@ -407,7 +408,7 @@ def test_codes_and_blocks_make_packets_smaller(noisy):
     assert len(packet) < 0.98 * len(in_one_piece) < 0.8 * len(zstandard.ZstdCompressor(level=1).compress(plain))
 
 
-def test_a_level_changes_the_bytes_and_not_what_is_compressed(noisy):
+def test_level_does_not_change_the_decompressed_payload(noisy):
     packets_of_levels = [codec.encode_packet(noisy, packet_format=PacketFormat(zstd_level=n)) for n in (1, 3, 19)]
     assert len(set(packets_of_levels)) == 3
     assert packets_of_levels[0] == codec.encode_packet(noisy)
@@ -435,7 +436,7 @@ def _refused(packet, sample):
 @pytest.mark.parametrize("level", [1, None])
 @pytest.mark.parametrize("content", CONTENTS)
 @pytest.mark.parametrize("kind", ["packet", "delta"])
-def test_every_single_damaged_byte_is_seen(sample, kind, content, level):
+def test_every_damaged_byte_is_detected(sample, kind, content, level):
     options = {"packet_format": PacketFormat(content, zstd_level=level), "map_version": MapVersion(1, 2, 3, 0, 5)}
     sample = quantised(sample, content, 0.05)
     packet = codec.encode_packet(sample, **options)
@@ -460,7 +461,7 @@ def test_cut_and_longer_packets_are_refused(sample, level):
         _refused(packet + tail, sample)
 
 
-def test_kinds_are_not_mixed_up(sample):
+def test_key_frames_and_deltas_are_not_interchangeable(sample):
     with pytest.raises(PacketError, match="is a delta"):
         codec.decode_packet(codec.encode_delta(sample, np.arange(2)))
     with pytest.raises(PacketError, match="not a delta"):
@@ -477,7 +478,7 @@ def _forged(
     payload, *, version=3, kind=0, content=0, compression=0, num_classes=2, resolution=0.25, map_version=(0, 0, 0, 0),
     weight=0, step=0.0, counts,
 ):  # fmt: skip
-    """A packet with a good checksum and any content."""
+    """A packet with arbitrary content and a valid checksum."""
     fields = (
         b"OCTM", version, kind, content, compression, resolution, weight, num_classes, *map_version, step, *counts,
         len(payload),
@@ -506,7 +507,7 @@ def test_unknown_headers_are_refused(fields):
         codec.decode_packet(_forged(b"", **good | fields))
 
 
-def test_packets_of_other_versions_are_named_also_where_their_header_is_shorter():
+def test_packets_of_other_versions_are_refused_with_their_version():
     with pytest.raises(PacketError, match="format version 2, this octoreplay reads version 3"):
         codec.read_header(b"OCTM\x02" + bytes(39))
     with pytest.raises(PacketError, match="cut: 67 bytes"):
@@ -516,7 +517,7 @@ def test_packets_of_other_versions_are_named_also_where_their_header_is_shorter(
             codec.read_header(data)
 
 
-def test_a_delta_goes_from_a_base_to_no_earlier_state():
+def test_base_of_a_delta_is_not_later_than_its_version():
     octree = octree_of({(0, 0, 0): [1.0, 2.0]})
     packet = _forged(b"", kind=1, map_version=(1, 0, 5, 5), counts=(0, 0, 0, 0))
     assert codec.read_header(packet).map_version == MapVersion(origin=1, version=5, base=5)
@@ -539,7 +540,7 @@ def test_a_delta_goes_from_a_base_to_no_earlier_state():
     step=st.sampled_from([0.05, 1e-3, 2.0]),
     level=st.sampled_from([None, 1]),
 )  # fmt: skip
-def test_the_header_gives_back_what_was_written(map_version, base, content, step, level):
+def test_header_round_trip(map_version, base, content, step, level):
     octree = quantised(octree_of({(0, 0, 0): [0.1, -0.1]}, resolution=0.3), content, step)
     options = {"packet_format": PacketFormat(content, step, level)}
     header = codec.read_header(codec.encode_packet(octree, map_version=map_version, **options))
@@ -551,7 +552,7 @@ def test_the_header_gives_back_what_was_written(map_version, base, content, step
     assert (header.kind, header.map_version) == (codec.DELTA, map_version)
 
 
-def test_int8_has_no_number_below_its_range():
+def test_int8_below_its_range_is_refused():
     words = _words(*CHAIN, 2)
     packet = _forged(words + b"\x81", content=2, step=0.5, counts=(19, 1, 0, 0))
     expected = np.full(2, -63.5, np.float32).tobytes()
@@ -593,14 +594,14 @@ CHAIN = (1,) * 18
     ],
 )
 @pytest.mark.parametrize("compression", [0, 1])
-def test_payloads_that_are_no_octree_are_refused_and_take_no_memory(payload, counts, compression):
+def test_malformed_payloads_are_refused_without_allocating_memory(payload, counts, compression):
     if compression:
         payload = zstandard.ZstdCompressor().compress(_coded_payload(payload, counts))
     _refused_without_memory(_forged(payload, counts=counts, compression=compression))
 
 
 def _refused_without_memory(packet, limit=20_000_000):
-    # Compiling takes memory, too.
+    # The first call compiles kernels, which also takes memory.
     codec.decode_packet(codec.encode_packet(octree_of({(0, 0, 0): [1.0, 2.0]})))
     tracemalloc.start()
     try:
@@ -614,7 +615,7 @@ def _refused_without_memory(packet, limit=20_000_000):
 @pytest.mark.parametrize("num_classes", [2, 254, 65535])
 @pytest.mark.parametrize("compression", [0, 1])
 @pytest.mark.parametrize("counts", [*np.diag([2**32 - 1] * 4).tolist(), (2**32 - 1,) * 4])
-def test_hostile_counts_take_no_memory(counts, compression, num_classes):
+def test_hostile_counts_allocate_no_memory(counts, compression, num_classes):
     compressor = zstandard.ZstdCompressor()
     unsized = zstandard.ZstdCompressor(write_content_size=False)
     for payload in (compressor.compress(bytes(100)), unsized.compress(bytes(100)), b"", b"garbage"):
@@ -622,20 +623,20 @@ def test_hostile_counts_take_no_memory(counts, compression, num_classes):
 
 
 @pytest.mark.parametrize("write_content_size", [True, False])
-def test_a_payload_that_unpacks_to_more_than_its_counts_is_refused(write_content_size):
+def test_payload_larger_than_its_counts_is_refused(write_content_size):
     bomb = zstandard.ZstdCompressor(write_content_size=write_content_size).compress(bytes(100_000_000))
     _refused_without_memory(_forged(bomb, counts=(1, 1, 1, 1), compression=1))
 
 
-def test_a_frame_that_says_it_holds_more_than_it_can_takes_no_memory():
-    """A frame of one empty block, whose header names a gigabyte."""
+def test_frame_with_an_impossible_content_size_allocates_no_memory():
+    """A frame of one empty block with a content size of 1 GB in its header."""
     frame = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**30) + b"\1\0\0"
     assert zstandard.get_frame_parameters(frame).content_size == 2**30
     _refused_without_memory(_forged(frame, counts=(0, 2**28, 0, 0), compression=1))
 
 
-def test_bytes_behind_the_compressed_payload_are_refused():
-    """The checksum holds, yet the payload is not the one zstd frame that it should be."""
+def test_bytes_after_the_compressed_payload_are_refused():
+    """The checksum is valid, but the payload is not exactly one zstd frame."""
     octree = octree_of({(0, 0, 0): [1.0, 2.0]})
     packet = codec.encode_packet(octree)
     header = codec.read_header(packet)
@@ -666,8 +667,8 @@ def test_any_words_give_an_octree_or_a_packet_error(words, leaves, masks, data):
 
 @settings(max_examples=200, deadline=None)
 @given(octree=octrees(num_classes=2), prune=st.booleans(), data=st.data())
-def test_damaged_words_give_what_the_format_says_or_a_packet_error(octree, prune, data):
-    """A few wrong words, or some too many or missing, deep in a real octree; the checksum holds."""
+def test_damaged_words_follow_the_format_or_give_a_packet_error(octree, prune, data):
+    """Some wrong, additional or missing words deep in a real octree, with a valid checksum."""
     streams = octree.streams(prune=prune)
     words = streams.words.tolist()
     for _ in range(data.draw(st.integers(1, 3))):
@@ -692,5 +693,5 @@ def test_damaged_words_give_what_the_format_says_or_a_packet_error(octree, prune
     elif decoded.num_cells == len(expected):
         assert cells_of(decoded) == expected
     else:
-        # Leaves that are too large to be written out here.
+        # Leaves that are too large to be expanded here.
         assert decoded.num_cells > len(expected)

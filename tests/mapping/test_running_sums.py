@@ -1,4 +1,4 @@
-"""Ratio consensus on octrees against the twin on dense arrays, bit for bit, and what a team of such robots keeps."""
+"""Ratio consensus on octrees against the reference on dense arrays, bit for bit, and invariants of teams."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from octoreplay.mapping.running_sums import (
     WHOLE_WEIGHT,
     add_evidence,
     difference,
-    recovered,
+    receive,
+    receive_team,
+    recover_map,
     share_out,
     share_weight,
-    take_in,
-    team_take_in,
 )
 from reference import ratio
 from reference.ratio import RatioRobot, quantised
@@ -40,12 +40,12 @@ def _octree(cells):
 
 
 def _mass(cells):
-    """An octree that holds integers (C,) of any size modulo MODULUS as bits."""
+    """Octree of integers (C,) of any size, stored modulo MODULUS as bits."""
     return _octree({key: np.asarray(units % MODULUS, np.int32).view(np.float32) for key, units in cells.items()})
 
 
 def _units(octree):
-    """{key: integers (C,)} of a mass, from -MODULUS / 2 on."""
+    """{key: integers (C,)} of a mass, in [-MODULUS / 2, MODULUS / 2)."""
     bits = {key: np.frombuffer(value, np.int32).astype(np.int64) for key, value in cells_of(octree).items()}
     assert all(((value >= 0) & (value < MODULUS)).all() for value in bits.values())
     return {key: _signed(value) for key, value in bits.items()}
@@ -56,7 +56,7 @@ def _signed(units):
 
 
 def _random_cells(rng, *, of_log_odds=False):
-    """Whole bricks, smaller cubes and single cells, with one value or one for each class, some of them overlapping."""
+    """Whole bricks, smaller cubes and single cells, with one value or one for each class; some overlap."""
     cells = {}
     most = rng.choice([1.0, 5.0, 900.0]) if of_log_odds else rng.choice([3, 1 << 17, MAX_MASS])
     for _ in range(rng.integers(0, 5)):
@@ -73,7 +73,7 @@ def _value(cells, key):
 
 
 def _sum(*terms):
-    """{key: sum of factor x cells} of the cells known in any of the terms (factor, cells), signed."""
+    """{key: signed sum of factor x cells} of the cells known in any of the terms (factor, cells)."""
     keys = set().union(*(cells for _, cells in terms))
     return {key: _signed(sum(factor * _value(cells, key) for factor, cells in terms)) for key in keys}
 
@@ -84,7 +84,7 @@ def _assert_equal(found, expected):
 
 
 def _changed_bricks(before, after):
-    """Codes of the bricks with a cell that has another value, or has become known."""
+    """Codes of the bricks with a cell that has another value or became known."""
     changed = {key for key in after if key not in before or (before[key] != after[key]).any()}
     return {int(storage.key_to_code(*key)) >> storage.CELL_BITS for key in changed}
 
@@ -100,7 +100,7 @@ seeds = st.integers(0, 1_000_000)
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, num_receivers=st.integers(0, 7), is_first=st.booleans())
-def test_sharing_out_is_that_of_the_twin(seed, num_receivers, is_first):
+def test_share_out_equals_the_reference(seed, num_receivers, is_first):
     rng = np.random.default_rng(seed)
     masses, totals = _random_cells(rng), {} if is_first else _random_cells(rng)
     mass, total = _mass(masses), _mass(totals)
@@ -116,7 +116,7 @@ def test_sharing_out_is_that_of_the_twin(seed, num_receivers, is_first):
 
 
 @pytest.mark.parametrize("num_receivers", [1, 2, 3, 5, 6, 9, 49])
-def test_shares_are_rounded_to_nearest_everywhere(num_receivers):
+def test_shares_are_rounded_to_nearest(num_receivers):
     """At the ends of the range, around 0, and at halves."""
     parts = num_receivers + 1
     units = np.arange(-40, 41)
@@ -131,19 +131,19 @@ def test_shares_are_rounded_to_nearest_everywhere(num_receivers):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, num_senders=st.integers(0, 4))
-def test_taking_in_is_that_of_the_twin(seed, num_senders):
+def test_receive_equals_the_reference(seed, num_senders):
     rng = np.random.default_rng(seed)
     masses = _random_cells(rng)
     mass = _mass(masses)
     arrivals, terms = [], [(1, masses)]
     for _ in range(num_senders):
         old = _random_cells(rng)
-        # Some of the old cells have grown.
+        # Some of the old cells changed.
         new = {key: value + rng.integers(0, 2) * rng.integers(MODULUS) for key, value in old.items()}
         new |= _random_cells(rng)
         arrivals.append((_mass(new), _mass(old) if rng.random() < 0.7 else None))
         terms += [(1, new), (-1, old if arrivals[-1][1] else {})]
-    take_in(mass, arrivals, 7)
+    receive(mass, arrivals, 7)
     _assert_equal(_units(mass), _sum(*terms))
     assert _revised(mass, 7) >= _changed_bricks(masses, _units(mass))
     assert _revised(mass, 7) <= {code for new, _ in arrivals for code in new.codes.tolist()}
@@ -151,21 +151,21 @@ def test_taking_in_is_that_of_the_twin(seed, num_senders):
 
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, with_threads=st.booleans())
-def test_a_team_takes_in_what_its_robots_do_one_by_one(seed, with_threads):
+def test_receive_team_equals_receive_robot_by_robot(seed, with_threads):
     rng = np.random.default_rng(seed)
     masses = [_mass(_random_cells(rng)) for _ in range(4)]
     old = [_mass(_random_cells(rng)) for _ in range(4)]
     new = [octree.copy() for octree in old]
     for octree in new:
-        take_in(octree, [(_mass(_random_cells(rng)), None)], 5)
+        receive(octree, [(_mass(_random_cells(rng)), None)], 5)
     arrivals = [
         [(new[j], old[j] if rng.random() < 0.7 else None) for j in range(4) if rng.random() < 0.6] for _ in range(4)
     ]
     alone = [mass.copy() for mass in masses]
     for mass, heard in zip(alone, arrivals, strict=True):
-        take_in(mass, heard, 7)
+        receive(mass, heard, 7)
     with ThreadPoolExecutor(3) as threads:
-        team_take_in(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
+        receive_team(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
     for mass, other in zip(masses, alone, strict=True):
         assert cells_of(mass) == cells_of(other)
         assert _revised(mass, 7) == _revised(other, 7)
@@ -173,7 +173,7 @@ def test_a_team_takes_in_what_its_robots_do_one_by_one(seed, with_threads):
 
 @pytest.mark.parametrize("num_classes", [1, 11])
 def test_maps_of_any_number_of_classes(num_classes):
-    """One class has no rows of single classes, more than eight take more than one word of their masks."""
+    """One class has no class rows; more than eight classes have more than one mask word."""
     rng = np.random.default_rng(num_classes)
     keys = [*cube((0, 0, 0), 3, 0), (4, 0, 0), (9, 2, 1)]
     new, old = (rng.integers(-9, 9, (len(keys), num_classes)) * rng.integers(0, 1 << 20, num_classes) for _ in range(2))
@@ -184,9 +184,9 @@ def test_maps_of_any_number_of_classes(num_classes):
         for values in (new, old)
     ]
     mass, total, octree = (octree_of({}, num_classes=num_classes) for _ in range(3))
-    take_in(mass, [(octrees[0], octrees[1]), (octrees[0], None)], 1)
+    receive(mass, [(octrees[0], octrees[1]), (octrees[0], None)], 1)
     share_out(mass, total, 3, 1)
-    recovered(mass, WHOLE_WEIGHT, octree, 1)
+    recover_map(mass, WHOLE_WEIGHT, octree, 1)
     masses = 2 * new - old
     shares = ratio.share_of(masses, 3)
     for found, expected in ((mass, masses - 3 * shares), (total, shares)):
@@ -196,13 +196,13 @@ def test_maps_of_any_number_of_classes(num_classes):
     np.testing.assert_allclose(log_odds, (masses - 3 * shares) * UNIT, rtol=1e-6)
 
 
-def test_a_team_of_nobody_takes_nothing_in():
-    team_take_in([], 1)
+def test_receive_team_without_robots():
+    receive_team([], 1)
 
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds)
-def test_evidence_is_added_as_the_twin_does(seed):
+def test_add_evidence_equals_the_reference(seed):
     rng = np.random.default_rng(seed)
     masses, last = _random_cells(rng), _random_cells(rng, of_log_odds=True)
     now = last | _random_cells(rng, of_log_odds=True)
@@ -223,18 +223,18 @@ def test_evidence_is_added_as_the_twin_does(seed):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds)
-def test_a_difference_added_again_gives_the_sum(seed):
+def test_difference_added_to_the_old_sum_gives_the_new_sum(seed):
     rng = np.random.default_rng(seed)
     old = _random_cells(rng)
     new = old | _random_cells(rng)
     grown = difference(_mass(new), _mass(old))
     _assert_equal(_units(grown), _sum((1, new), (-1, old)))
     total = _mass(old)
-    take_in(total, [(grown, None)], 2)
+    receive(total, [(grown, None)], 2)
     assert cells_of(total) == cells_of(_mass(new))
 
 
-def test_a_weight_is_shared_without_a_rest():
+def test_shares_of_a_weight_add_up_to_it():
     for weight in (WHOLE_WEIGHT, 7, 3, 1, 6 * WHOLE_WEIGHT - 1):
         for num_receivers in (0, 1, 2, 5):
             share, rest = share_weight(weight, num_receivers)
@@ -248,14 +248,14 @@ def test_a_weight_is_shared_without_a_rest():
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, weight=st.integers(LEAST_WEIGHT, 6 * WHOLE_WEIGHT), tolerance=st.sampled_from([0.0, 1e-3]))
-def test_the_map_is_the_mass_over_the_weight(seed, weight, tolerance):
+def test_recovered_map_is_mass_over_weight(seed, weight, tolerance):
     rng = np.random.default_rng(seed)
     before, after = _random_cells(rng), _random_cells(rng)
     after = before | {key: value for key, value in after.items() if rng.random() < 0.7}
     octree = _octree({})
-    recovered(_mass(before), weight, octree, 3, tolerance)
+    recover_map(_mass(before), weight, octree, 3, tolerance)
     old = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
-    change = recovered(_mass(after), weight, octree, 7, tolerance)
+    change = recover_map(_mass(after), weight, octree, 7, tolerance)
     found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
     expected = {key: (value * UNIT / (weight / WHOLE_WEIGHT)).astype(np.float32) for key, value in after.items()}
     assert found.keys() == expected.keys()
@@ -270,34 +270,34 @@ def test_the_map_is_the_mass_over_the_weight(seed, weight, tolerance):
 def test_a_map_of_one_value_is_pruned():
     mass = _mass(cube((0, 0, 0), 8, np.full(NUM_CLASSES, 5 << 17)) | {(1, 1, 1): np.full(NUM_CLASSES, 9 << 17)})
     octree = _octree({})
-    assert recovered(mass, WHOLE_WEIGHT, octree, 1) == 9.0
+    assert recover_map(mass, WHOLE_WEIGHT, octree, 1) == 9.0
     assert len(octree.leaves()) == 7 + 7 + 8
     grown = _mass({(1, 1, 1): np.full(NUM_CLASSES, -4 << 17)})
-    take_in(mass, [(grown, None)], 2)
-    assert recovered(mass, 2 * WHOLE_WEIGHT, octree, 2) == 9.0 - 2.5
+    receive(mass, [(grown, None)], 2)
+    assert recover_map(mass, 2 * WHOLE_WEIGHT, octree, 2) == 9.0 - 2.5
     assert len(octree.leaves()) == 1
     assert (octree.bricks.blocks[: octree.num_bricks] == -1).all()
-    assert recovered(mass, 2 * WHOLE_WEIGHT, octree, 3) == 0.0
+    assert recover_map(mass, 2 * WHOLE_WEIGHT, octree, 3) == 0.0
     assert (octree.revisions == 2).all()
 
 
-def test_a_map_within_the_tolerance_rests():
+def test_changes_within_the_tolerance_are_not_written():
     cells = cube((0, 0, 0), 3, np.array([1, 2, 3]) << 17)
     octree = _octree({})
-    recovered(_mass(cells), WHOLE_WEIGHT, octree, 1)
+    recover_map(_mass(cells), WHOLE_WEIGHT, octree, 1)
     before = cells_of(octree)
     moved = {key: value + np.array([2, -2, 0]) for key, value in cells.items()}
-    assert recovered(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=2 * UNIT) == 0.0
+    assert recover_map(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=2 * UNIT) == 0.0
     assert cells_of(octree) == before
     assert (octree.revisions == 1).all()
-    assert recovered(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=UNIT) == pytest.approx(2 * UNIT, rel=0.1)
+    assert recover_map(_mass(moved), WHOLE_WEIGHT, octree, 2, tolerance=UNIT) == pytest.approx(2 * UNIT, rel=0.1)
 
 
 # --- masses as bits of floats -----------------------------------------------------------------------------------------
 
 
-def test_every_kind_of_bits_passes_through_copies_and_packets():
-    """Denormals, normal numbers and the largest: what moves octrees does not compute with their values."""
+def test_copies_and_packets_keep_all_bits():
+    """Denormals, normal numbers and the largest number: copying does not compute with the values."""
     kinds = [0, 1, 2, (1 << 23) - 1, 1 << 23, (1 << 23) + 1, 1 << 29, (1 << 29) - 1, MODULUS - 1]
     cells = {
         (n, k, 0): np.array([value, (value + k) % MODULUS, value]) for n, value in enumerate(kinds) for k in (0, 1)
@@ -311,11 +311,11 @@ def test_every_kind_of_bits_passes_through_copies_and_packets():
         _assert_equal(_units(octree), signed)
 
 
-def test_a_brick_of_two_denormals_is_not_one_value():
+def test_brick_of_two_different_denormals_is_not_pruned():
     cells = cube((0, 0, 0), 4, np.full(NUM_CLASSES, 1)) | {(3, 3, 3): np.full(NUM_CLASSES, 2)}
     mass = _mass(cells)
     assert mass.bricks.blocks[0] >= 0
-    storage.collapse(mass.bricks, 0)
+    storage.prune_brick(mass.bricks, 0)
     assert mass.bricks.blocks[0] >= 0
     assert len(mass.leaves()) == 7 + 8
 
@@ -326,7 +326,7 @@ KEYS = (*cube((0, 0, 0), 2, 0), (2, 2, 2), (5, 1, 0), (9, 9, 9), (-3, 0, 4))
 
 
 def _dense(octree):
-    """Integers (M, C) of a mass at KEYS, 0 where it knows nothing."""
+    """Integers (M, C) of a mass at KEYS, 0 where it is unknown."""
     cells = _units(octree)
     return np.array([_value(cells, key) for key in KEYS])
 
@@ -337,7 +337,7 @@ def _of_dense(values):
 
 
 class Robot:
-    """What a session would keep of a robot, with the twin beside it."""
+    """State of a robot as in a session, and of its reference."""
 
     def __init__(self):
         self.mass, self.total, self.map = (_octree({}) for _ in range(3))
@@ -359,22 +359,22 @@ class Robot:
         self.twin.share_out(num_receivers)
 
     def sums(self):
-        """What a packet carries: sigma and eta, and the twin's."""
+        """Content of a packet: sigma and eta, and those of the reference."""
         return self.total.copy(), self.total_weight, self.twin.total, self.twin.total_weight
 
     def start_hearing(self, sender, sums):
-        """A link comes up: what was summed up before is not for this receiver."""
+        """A link comes up: earlier shares are not for this receiver."""
         self.heard[sender], self.twin.heard[sender] = sums[:2], sums[2:]
 
-    def take_in(self, sender, sums):
+    def receive(self, sender, sums):
         old, old_weight = self.heard.get(sender, (None, 0))
-        take_in(self.mass, [(sums[0], old)], 0)
+        receive(self.mass, [(sums[0], old)], 0)
         self.weight += sums[1] - old_weight
         self.heard[sender] = sums[:2]
-        self.twin.take_in(sender, *sums[2:])
+        self.twin.receive(sender, *sums[2:])
 
     def recover(self):
-        recovered(self.mass, self.weight, self.map, 0)
+        recover_map(self.mass, self.weight, self.map, 0)
         return _map(self.map)
 
 
@@ -385,7 +385,7 @@ def _map(octree):
 
 
 def _team(rng, size):
-    """Robots with evidence like clamped log-odds, and its mean."""
+    """Robots with evidence in the range of clamped log-odds, and its mean."""
     robots = [Robot() for _ in range(size)]
     evidence = [np.clip(rng.normal(size=(len(KEYS), NUM_CLASSES)) * 5, -5, 5).astype(np.float32) for _ in robots]
     for robot, log_odds in zip(robots, evidence, strict=True):
@@ -394,13 +394,13 @@ def _team(rng, size):
 
 
 def _tick(robots, receivers, rng=None, loss=0.0):
-    """Everybody shares out, then the packets that are not lost arrive."""
+    """One tick: all robots share out, then the packets arrive that are not lost."""
     for robot, others in zip(robots, receivers, strict=True):
         robot.share_out(len(others))
     for sender, others in enumerate(receivers):
         for other in others:
             if rng is None or rng.random() >= loss:
-                robots[other].take_in(sender, robots[sender].sums())
+                robots[other].receive(sender, robots[sender].sums())
 
 
 def _ring(size):
@@ -408,11 +408,11 @@ def _ring(size):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_nothing_is_lost_over_links_that_lose_delay_repeat_and_reorder(seed):
-    """At every tick, with changing evidence: masses and what is under way are the evidence, exactly."""
+def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
+    """At every tick, with changing evidence, masses and shares under way add up to the evidence exactly."""
     rng = np.random.default_rng(seed)
     robots, _ = _team(rng, 5)
-    # A ring one way, so that everybody hears of everybody, and some more.
+    # A one-way ring, which connects all robots, and some more links.
     receivers = [sorted({(i + 1) % 5, *rng.choice(5, 2).tolist()} - {i}) for i in range(5)]
     packets, newest = [], {}
     for tick in range(30):
@@ -428,7 +428,7 @@ def test_nothing_is_lost_over_links_that_lose_delay_repeat_and_reorder(seed):
         for due, sent, sender, receiver, sums in packets:
             if due == tick and sent > newest.get((sender, receiver), -1):
                 newest[sender, receiver] = sent
-                robots[receiver].take_in(sender, sums)
+                robots[receiver].receive(sender, sums)
         packets = [packet for packet in packets if packet[0] > tick]
         masses, weight = sum(_dense(robot.mass) for robot in robots), sum(robot.weight for robot in robots)
         for sender, robot in enumerate(robots):
@@ -445,7 +445,7 @@ def test_nothing_is_lost_over_links_that_lose_delay_repeat_and_reorder(seed):
             assert (robot.weight, robot.total_weight) == (robot.twin.weight, robot.twin.total_weight)
 
 
-def test_a_ring_that_loses_a_third_of_its_packets_agrees_on_the_mean():
+def test_ring_with_a_third_of_the_packets_lost_converges_to_the_mean():
     rng = np.random.default_rng(0)
     robots, mean = _team(rng, 6)
     num_compared = 0
@@ -461,7 +461,7 @@ def test_a_ring_that_loses_a_third_of_its_packets_agrees_on_the_mean():
     assert max(abs(robot.recover() - mean).max() for robot in robots) < 1e-4
 
 
-def test_a_team_follows_evidence_that_changes():
+def test_team_follows_changing_evidence():
     rng = np.random.default_rng(1)
     robots, first = _team(rng, 4)
     for _ in range(10):
@@ -476,10 +476,10 @@ def test_a_team_follows_evidence_that_changes():
     assert max(abs(robot.recover() - mean).max() for robot in robots) < 1e-4
 
 
-def test_a_day_of_ticks_drifts_by_nothing():
-    """The twin goes through 86,400 ticks; at its start, in the middle and at its end octrees go along for a while.
+def test_no_drift_over_a_day_of_ticks():
+    """The reference runs for 86,400 ticks; octrees are compared for a while at the start, in the middle and at the end.
 
-    Its integers have no limit. Evidence of hundreds makes the octrees' sums wrap around within a few dozen ticks.
+    The reference uses Python integers. With evidence of hundreds, the octrees' sums wrap around every few dozen ticks.
     """
     rng = np.random.default_rng(3)
     evidence = rng.uniform(200, 400, (3, len(KEYS), NUM_CLASSES)).astype(np.float32) * rng.choice([-1, 1], NUM_CLASSES)
@@ -496,14 +496,14 @@ def test_a_day_of_ticks_drifts_by_nothing():
             twin.share_out(1)
         for i in np.flatnonzero(arrives):
             sender = twins[i - 1]
-            twins[i].take_in(i - 1, sender.total, sender.total_weight)
+            twins[i].receive(i - 1, sender.total, sender.total_weight)
         if octrees is None:
             continue
         for mass, total in octrees:
             share_out(mass, total, 1, tick)
         for i in np.flatnonzero(arrives):
             sums = octrees[i - 1][1].copy()
-            take_in(octrees[i][0], [(sums, heard[i])], tick)
+            receive(octrees[i][0], [(sums, heard[i])], tick)
             heard[i] = sums
         if tick in (39, 43_039, 86_399):
             for twin, (mass, total) in zip(twins, octrees, strict=True):
@@ -523,11 +523,10 @@ def _of_units(values):
     return _mass(dict(zip(KEYS, values, strict=True)))
 
 
-def test_a_newcomer_catches_up_as_fast_as_the_shares_say():
+def test_newcomer_converges_at_the_rate_of_lambda_2():
     """lambda_2 is the second largest |eigenvalue| of the share matrix, column i with 1 / (1 + D_i) at i's receivers.
 
-    One step is a tick of the whole team: everybody shares out, every packet arrives. Its error is counted from before
-    the first one.
+    In one step all robots share out and all packets arrive. The error is relative to that before the first step.
     """
     rng = np.random.default_rng(5)
     robots, mean = _team(rng, 6)
@@ -557,5 +556,5 @@ def test_a_newcomer_catches_up_as_fast_as_the_shares_say():
     assert max(abs(robot.recover() - mean).max() for robot in robots) < 1e-4
 
 
-def test_the_units_are_those_of_the_twin():
+def test_units_are_those_of_the_reference():
     assert (UNIT, WHOLE_WEIGHT, running_sums.WEIGHT_UNIT) == (ratio.UNIT, ratio.WHOLE_WEIGHT, 1 / ratio.WHOLE_WEIGHT)

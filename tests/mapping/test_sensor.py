@@ -32,13 +32,13 @@ MAP = MapConfig(resolution=0.2)
 
 
 def _cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
-    """(freed keys, {hit key: class_id}) of a scan as the caster finds them."""
+    """(freed keys, {hit key: class_id}) of a scan, from the caster."""
     freed, hit = _weighted_cells(frame, sensor, region, num_classes, caster)
     return freed, {key: class_id for key, (class_id, _) in hit.items()}
 
 
 def _weighted_cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
-    """(freed keys, {hit key: (class_id, strength)}) of a scan as the caster finds them."""
+    """(freed keys, {hit key: (class_id, strength)}) of a scan, from the caster."""
     touched = (caster or ScanCaster(sensor, region, num_classes)).cast(frame)
     assert len(set(touched.codes.tolist())) == len(touched.codes)
     marks = touched.marks.reshape(-1, storage.BRICK_CELLS)[touched.touched]
@@ -76,7 +76,7 @@ def _agree(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES):
 
 
 def _random_pose(rng, spread=3.0):
-    """A rotation from a random quaternion, somewhere around the origin."""
+    """A pose with a random rotation near the origin."""
     x, y, z, w = (q := rng.normal(size=4)) / np.linalg.norm(q)
     pose = np.eye(4)
     pose[:3, :3] = [
@@ -147,7 +147,7 @@ def test_bounds_through_cell_centres(resolution, low, high):
     rays=st.sampled_from(["cells", "all"]),
 )
 def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
-    """Everything is a multiple of an eighth and cells are a quarter: walls are met exactly, several at once."""
+    """Coordinates are multiples of 1/8 and cells of 1/4 m: rays cross walls exactly, several at once."""
     pose = np.eye(4)
     pose[:3, 3] = np.array(origin) / 8
     frame = CloudFrame("r", 0, np.array(ends) / 8, None, pose)
@@ -156,7 +156,7 @@ def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
 
 @pytest.mark.parametrize("resolution", [0.1, 0.2, 0.3])
 def test_walls_at_decimal_places(resolution):
-    """Origins at centres and on walls of cells whose edge is no binary fraction; rays to cell centres."""
+    """Origins at centres and on walls of cells with an edge that is no binary fraction; rays to cell centres."""
     places = [k * resolution / 2 for k in range(-5, 6)]
     ends = np.array(list(itertools.product((-1.7, -0.35, 0.0, 0.25, 1.5), repeat=3)))
     for origin in itertools.product(places[::2], places[1::3], places[::5]):
@@ -168,7 +168,7 @@ def test_walls_at_decimal_places(resolution):
 @pytest.mark.parametrize("rays", ["cells", "all"])
 @pytest.mark.parametrize("seed", range(4))
 def test_long_rays(seed, rays):
-    """Hundreds of cells long, so that a ray is walked in several pieces, and some end next to a piece's end."""
+    """Rays of hundreds of cells are traversed in several pieces; some end next to the end of a piece."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(60, 3))
     directions[:6] = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 1, 0], [-1, 1, 1], [0.5, -1, 0.25]]
@@ -189,8 +189,8 @@ def test_long_rays(seed, rays):
     resolution=st.sampled_from([0.1, 0.25, 0.3]),
     rays=st.sampled_from(["cells", "all"]),
 )
-def test_a_ray_is_a_chain_of_neighbours_from_its_origin_to_its_end(origin, point, resolution, rays):
-    """No cell is skipped, none is passed twice, and the end cell is not freed: as many cells as walls are crossed."""
+def test_ray_is_a_path_of_face_neighbours(origin, point, resolution, rays):
+    """No cell is skipped or passed twice, and the end cell is not freed: one cell for each wall crossed."""
     pose = np.eye(4)
     pose[:3, 3] = origin
     frame = CloudFrame("r", 0, np.array([point]), None, pose)
@@ -234,7 +234,7 @@ def test_negative_coordinates_by_hand():
 
 
 @pytest.mark.parametrize("distance", [3.9, np.nextafter(4.0, 0), 4.0, np.nextafter(4.0, 9), 4.1])
-def test_a_point_at_exactly_max_range_is_a_hit(distance):
+def test_point_at_exactly_max_range_is_a_hit(distance):
     for frame in (
         depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2]),
     ):  # fmt: skip
@@ -244,14 +244,14 @@ def test_a_point_at_exactly_max_range_is_a_hit(distance):
         assert len(freed) == int(min(distance, 4.0) + 0.5)
 
 
-def test_a_point_at_exactly_min_range_is_used():
+def test_point_at_exactly_min_range_is_used():
     sensor = dataclasses.replace(SENSOR, min_range=2.0)
     for distance, used in ((2.0, True), (np.nextafter(np.float32(2.0), np.float32(0)), False)):
         for frame in (depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2])):
             assert bool(_agree(frame, sensor, MapConfig(resolution=1.0))[0]) == used
 
 
-def test_a_scan_in_the_origins_own_cell():
+def test_scan_in_the_cell_of_the_origin():
     assert _agree(cloud([[0.01, 0.0, 0.0]], [1])) == (set(), {(2, 2, 2): 1})
     assert _agree(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), {})
     freed, hit = _agree(cloud([[0.01, 0.0, 0.0], [1.0, 0.0, 0.0]], [1, 2]))
@@ -259,7 +259,7 @@ def test_a_scan_in_the_origins_own_cell():
     assert (2, 2, 2) not in freed
 
 
-def test_the_majority_of_points_decides_and_ties_go_to_the_lower_id():
+def test_majority_of_points_wins_and_ties_go_to_the_lower_id():
     near = np.array([[2.0, 0.0, 0.0]]) + np.arange(6)[:, None] * 1e-3
     assert set(_agree(cloud(near, [4, 2, 2, 4, 4, 0]))[1].values()) == {4}
     assert set(_agree(cloud(near, [4, 2, 2, 4, 0, 0]))[1].values()) == {2}
@@ -290,7 +290,7 @@ def test_values_without_information(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-def test_layouts_of_images_do_not_matter(dtype):
+def test_memory_layout_of_images_does_not_change_the_result(dtype):
     frame = _random_depth(np.random.default_rng(1), dtype)
     expected = _cells(frame)
     for layout in (np.asfortranarray, _strided, lambda a: a[::-1][::-1], lambda a: _read_only(a)):
@@ -309,7 +309,7 @@ def test_layouts_of_images_do_not_matter(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_layouts_of_clouds_do_not_matter(dtype):
+def test_memory_layout_of_clouds_does_not_change_the_result(dtype):
     frame = _random_cloud(np.random.default_rng(2), dtype)
     expected = _cells(frame)
     for layout in (np.asfortranarray, _strided, lambda a: a[::-1][::-1], _read_only):
@@ -320,7 +320,7 @@ def test_layouts_of_clouds_do_not_matter(dtype):
 
 
 def _strided(array):
-    """The same values with gaps between them."""
+    """The same values with gaps in memory."""
     wide = np.zeros(tuple(2 * n for n in array.shape), array.dtype)
     view = wide[tuple(slice(None, None, 2) for _ in array.shape)]
     view[...] = array
@@ -333,8 +333,8 @@ def _read_only(array):
     return copy
 
 
-def test_one_caster_gives_the_same_for_every_scan_as_a_new_one():
-    """Its scratch memory grows, shrinks and moves; nothing of a scan may stay behind."""
+def test_reused_caster_equals_a_new_one():
+    """Its scratch grid grows, shrinks and moves; no marks of an earlier scan may remain."""
     scenario = make_scenario(3, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), sensors="mixed"))
     caster = ScanCaster(SENSOR, MAP, NUM_CLASSES)
     rng = np.random.default_rng(0)
@@ -352,7 +352,7 @@ def _with_confidences(frame, confidences):
 
 
 def _random_boxes(rng, frame, count):
-    """Boxes anywhere within the scan's reach, turned any way; some hold the sensor."""
+    """Boxes of any rotation within the range of the scan; some contain the sensor."""
     boxes = []
     for _ in range(count):
         low = rng.uniform(-3.0, 0.2, 3)
@@ -363,7 +363,7 @@ def _random_boxes(rng, frame, count):
 
 
 def _random_slopes(rng, size, holes=0.05):
-    """A lens that bends rays, and pixels through which it sees nothing."""
+    """Slopes of a lens with distortion, NaN at some pixels."""
     v, u = np.mgrid[: size[0], : size[1]]
     slopes = np.stack([(u - size[1] / 2) / 9.0, (v - size[0] / 2) / 8.5])
     slopes *= 1.0 + rng.uniform(-0.3, 0.5) * (slopes**2).sum(axis=0)
@@ -372,10 +372,10 @@ def _random_slopes(rng, size, holes=0.05):
 
 
 def _random_frame(seed, num_classes, kind, *, confident, num_boxes, bent):
-    """A scan whose cells hold several points, with what is asked for, and a sensor that cuts some of its rays."""
+    """A scan with several points in a cell and the requested extras, and a sensor that cuts some of its rays."""
     rng = np.random.default_rng(seed)
     if kind == "cloud":
-        # Clouds are worked on in blocks of 1024 points.
+        # Clouds are processed in blocks of 1024 points.
         frame = _random_cloud(rng, rng.choice([np.float32, np.float64]), size=int(rng.choice([300, 1300])))
     else:
         frame = _random_depth(rng, np.float32 if kind == "depth32" else np.uint16)
@@ -411,7 +411,7 @@ def test_random_scans_with_confidences_boxes_and_lenses(
     _agree(frame, sensor, MapConfig(resolution), num_classes)
 
 
-def test_labels_vote_with_their_confidences():
+def test_labels_are_weighted_by_their_confidences():
     near = np.array([[2.0, 0.0, 0.0]]) + np.arange(5)[:, None] * 1e-3
     for class_ids, confidences, winner in (
         ([4, 4, 2, 0, 0], [50, 60, 111, 255, 255], (2, 111)),
@@ -427,7 +427,7 @@ def test_labels_vote_with_their_confidences():
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
-def test_points_without_confidence_free_their_ray_and_hit_nothing(rays):
+def test_points_with_zero_confidence_free_their_ray_and_hit_nothing(rays):
     sensor = dataclasses.replace(SENSOR, rays=rays)
     for frame in (cloud([[2.0, 0, 0]], [1]), cloud([[2.0, 0, 0]], None), depth_frame(np.array([[2.0]], np.float32))):
         shape = (1,) if isinstance(frame, CloudFrame) else (1, 1)
@@ -436,8 +436,8 @@ def test_points_without_confidence_free_their_ray_and_hit_nothing(rays):
         assert not hit
 
 
-def test_long_sums_of_confidences():
-    """More than 2^31 255ths in one cell, for one class by a single one more."""
+def test_sums_of_confidences_beyond_int32():
+    """Sums of two classes in one cell exceed 2^31 and differ by 1."""
     lengths = np.full(4, 8_000_000, np.int32)
     sums = 255 * lengths
     lengths[3], sums[3] = lengths[3] + 1, sums[3] + 1
@@ -458,7 +458,7 @@ def _box(low, high, *, is_own, pose=None):
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
 def test_points_on_robots_bodies(rays):
-    """The point is at (2.5, 0.5, 0.5): its ray frees ten cells of a quarter metre."""
+    """The point is at (2.5, 0.5, 0.5); its ray passes cells of 0.25 m."""
     sensor = dataclasses.replace(SENSOR, rays=rays)
     other, own = _box([2.5, 0, 0], [3, 0.5, 1], is_own=False), _box([2, 0.5, 0.5], [2.5, 0.5, 0.5], is_own=True)
     beside = _box([2.5 + 1e-9, 0, 0], [3, 1, 1], is_own=True)
@@ -472,16 +472,16 @@ def test_points_on_robots_bodies(rays):
 
 
 @pytest.mark.parametrize("is_own", [True, False])
-def test_cut_rays_are_in_no_box(is_own):
+def test_boxes_do_not_affect_cut_rays(is_own):
     everywhere = _box([-99] * 3, [99] * 3, is_own=is_own)
     for frame in (cloud([[9.0, 0, 0]], [1]), depth_frame(np.array([[9.0]], np.float32))):
         freed, hit = _agree(dataclasses.replace(frame, boxes=(everywhere,)), SENSOR, MapConfig(0.25))
         assert (len(freed), hit) == (16, {})
 
 
-def test_boxes_are_where_their_frame_is():
+def test_boxes_are_transformed_to_their_frame():
     T_box_team = np.linalg.inv(facing_x(2.5, 0.5, 0.5))
-    # The box reaches an eighth along the frame's z, which is the team's x, and nowhere else.
+    # The box is 1/8 m thick along its frame's z, which is the team's x.
     ahead = _box([0, 0, 0], [0, 0, 0.125], is_own=True, pose=T_box_team)
     points = [[2.0, 0, 0], [2.125, 0, 0], [2.0, 0.125, 0], [2.0, 0, 0.125]]
     hits = [_agree(dataclasses.replace(cloud([point], [1]), boxes=(ahead,)))[1] for point in points]
@@ -490,8 +490,8 @@ def test_boxes_are_where_their_frame_is():
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
 @pytest.mark.parametrize("rays", ["cells", "all"])
-def test_a_lens_gives_what_its_points_give_as_a_cloud(dtype, rays):
-    """Every bit of the map is the same, boxes and confidences included."""
+def test_image_with_distortion_equals_the_cloud_of_its_points(dtype, rays):
+    """The maps are equal bit for bit, with boxes and confidences."""
     sensor, region = dataclasses.replace(SENSOR, rays=rays), MapConfig(0.3)
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -511,19 +511,19 @@ def test_a_lens_gives_what_its_points_give_as_a_cloud(dtype, rays):
         assert len(maps[0]) > 300
 
 
-def test_a_pinhole_given_as_slopes():
+def test_slopes_of_a_pinhole_equal_the_pinhole():
     rng = np.random.default_rng(4)
     frame = _random_depth(rng)
     camera = frame.camera
     v, u = np.mgrid[: camera.height, : camera.width]
     slopes = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
-    # What the pinhole says must not matter.
+    # With slopes, the intrinsics are not used.
     bent = dataclasses.replace(frame, camera=CameraModel(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0, slopes))
     assert _cells(bent) == _cells(frame)
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
-def test_layouts_of_confidences_and_slopes_do_not_matter(rays):
+def test_memory_layout_of_confidences_and_slopes_does_not_change_the_result(rays):
     rng = np.random.default_rng(5)
     frame = _random_depth(rng)
     shape = frame.depth_image.shape
@@ -569,7 +569,7 @@ def test_scans_that_leave_the_key_space_are_refused(axis, sign):
             _cells(CloudFrame("r", 0, np.zeros((0, 3)), None, origin), SENSOR, region)
 
 
-def test_a_resolution_too_fine_for_the_range_is_refused():
+def test_resolution_too_fine_for_the_range_is_refused():
     frame = cloud([[100.0, 100.0, 100.0]], [1])
     with pytest.raises(ConfigError, match=r"resolution: 0.01 m is too fine for max_range 500 m"):
         _cells(frame, SensorConfig(max_range=500.0), MapConfig(resolution=0.01))
@@ -587,7 +587,7 @@ def _sums(frames, increments, num_classes=NUM_CLASSES, sensor=SENSOR, region=MAP
 
 
 @pytest.mark.parametrize("increments", ["clamped", "unclamped", "count"])
-def test_sums_of_many_scans_are_those_of_the_reference(increments):
+def test_sums_of_many_scans_equal_the_reference(increments):
     sensor = SensorConfig(max_range=4.0, hit=0.75, miss=-0.5, hit_other=-0.25, clamp_min=-2.0, clamp_max=1.5)
     steps = {
         "clamped": clamped_increments(sensor), "unclamped": unclamped_increments(sensor), "count": COUNT_SCANS,
@@ -608,12 +608,12 @@ def test_sums_of_many_scans_are_those_of_the_reference(increments):
                 else:
                     change[:] = steps.hit
             expected[key] = np.clip(expected.get(key, np.zeros(num_classes)) + change, steps.least, steps.most)
-    # All increments are multiples of a quarter, so that float32 sums are exact.
+    # All increments are multiples of 1/4, so that float32 sums are exact.
     assert cells_of(octree) == {key: value.astype(np.float32).tobytes() for key, value in expected.items()}
 
 
 def _mixed_scenario(confidence):
-    """A team's scans of both kinds; ``confidence`` gives those of a shape, or None for scans that have none."""
+    """Depth and cloud scans of a team; ``confidence`` returns confidences of a shape, or None for none."""
     scenario = make_scenario(2, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), resolution=0.4, sensors="mixed"))
     frames = []
     for frame in scenario.frames:
@@ -623,8 +623,8 @@ def _mixed_scenario(confidence):
     return frames
 
 
-def test_full_confidence_is_none():
-    """Bit for bit, in evidence as in counts."""
+def test_full_confidence_equals_no_confidences():
+    """Bit for bit, in evidence and in counts."""
     sensor, region = SensorConfig(max_range=4.0, hit=0.85, miss=-0.41, hit_other=-0.13), MapConfig(0.4)
     plain, sure = _mixed_scenario(lambda _: None), _mixed_scenario(lambda shape: np.full(shape, 255))
     for num_classes, steps in (
@@ -637,8 +637,8 @@ def test_full_confidence_is_none():
 
 @pytest.mark.parametrize("num_classes", [1, 3, 12])
 @pytest.mark.parametrize("hit_other", [None, -0.2])
-def test_weighted_sums_of_many_scans_are_those_of_the_reference(num_classes, hit_other):
-    """Clamped, unclamped and counted; scans with and without confidences, one after the other."""
+def test_weighted_sums_of_many_scans_equal_the_reference(num_classes, hit_other):
+    """Clamped, unclamped and counted; scans with and without confidences in turn."""
     rng = np.random.default_rng(num_classes)
     sensor = SensorConfig(max_range=4.0, hit=0.9, miss=-0.4, hit_other=hit_other, clamp_min=-2.0, clamp_max=1.5)
     region, frames = MapConfig(0.4), []
@@ -686,7 +686,7 @@ def test_one_class_and_254_classes():
         assert octree.revisions.tolist() == [3]
 
 
-def test_saturated_free_space_becomes_uniform_and_stays_unchanged():
+def test_saturated_free_space_becomes_uniform_and_does_not_change():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(4000, 3))
     points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * 3.9

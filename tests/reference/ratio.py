@@ -49,7 +49,7 @@ class RatioRobot:
         self.total, self.total_weight = self.total + share, self.total_weight + weight
         self.mass, self.weight = self.mass - num_receivers * share, self.weight - num_receivers * weight
 
-    def take_in(self, sender: int, total: Int64Array, total_weight: int) -> None:
+    def receive(self, sender: int, total: Int64Array, total_weight: int) -> None:
         """Y += sigma - sigma heard before, and the same of the weight."""
         heard, heard_weight = self.heard.get(sender, (np.zeros_like(total), 0))
         self.mass, self.weight = self.mass + total - heard, self.weight + total_weight - heard_weight

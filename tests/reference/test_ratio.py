@@ -23,8 +23,8 @@ def test_two_robots_agree_at_once():
     a, b = _pair(3.0, -1.0)
     for robot in (a, b):
         robot.share_out(1)
-    a.take_in(1, b.total, b.total_weight)
-    b.take_in(0, a.total, a.total_weight)
+    a.receive(1, b.total, b.total_weight)
+    b.receive(0, a.total, a.total_weight)
     assert a.log_odds == b.log_odds == 1.0
     assert a.weight == b.weight == WHOLE_WEIGHT
 
@@ -33,8 +33,8 @@ def test_the_next_packet_brings_what_a_lost_one_withheld():
     a, b = _pair(4.0, 0.0)
     a.share_out(1)
     a.share_out(1)
-    b.take_in(0, a.total, a.total_weight)
-    b.take_in(0, a.total, a.total_weight)
+    b.receive(0, a.total, a.total_weight)
+    b.receive(0, a.total, a.total_weight)
     assert b.mass * UNIT == 3.0
     assert b.weight == 1.75 * WHOLE_WEIGHT
     assert a.log_odds == 4.0

@@ -8,7 +8,7 @@ import pytest
 from rich.console import RenderableType
 
 from octoreplay.config.robot import RobotConfig
-from octoreplay.io.robots.discover import LogDescription, LogSummary, RobotSummary, TopicSummary
+from octoreplay.io.robots.describe import LogDescription, LogSummary, RobotSummary, TopicSummary
 from octoreplay.records import RobotMetrics
 from octoreplay.report import tables
 from octoreplay.result import PointQuery

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 
-from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.records import CENTRAL
 
 
 def map_scores(robot_id: str, start: float, *, is_active: bool = True, has_truth: bool = True) -> MapScores:
     """Scores that grow by a thousandth from field to field."""
     values = [start + index / 1000 for index in range(13)]
-    truth = values[3:] if has_truth else [math.nan] * 10
-    tree = math.nan if robot_id == "beta" else truth[9] / 2
-    return MapScores(
-        robot_id, is_active, int(1e5 * start), values[0] + 1, values[1], values[2], (truth[0] / 3, tree), *truth
-    )
+    tree = math.nan if robot_id == "beta" else values[12] / 2
+    truth = TruthScores((values[3] / 3, tree), *values[3:]) if has_truth else None
+    return MapScores(robot_id, is_active, int(1e5 * start), values[0] + 1, values[1], values[2], truth)
 
 
 def evaluation(

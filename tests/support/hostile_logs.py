@@ -26,7 +26,8 @@ from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, OctoreplayError
 from octoreplay.io.containers.log_reader import normalise_type_name
 from octoreplay.io.messages.ros_types import typestore
-from octoreplay.io.robots.discover import describe, discover, resolve
+from octoreplay.io.robots.describe import describe
+from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import ClassTable, SemanticClass

@@ -7,7 +7,8 @@ import itertools
 import numpy as np
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, mask_bytes
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.streams import mask_bytes
 
 BRICK_EDGE = storage.BRICK_EDGE
 
@@ -48,7 +49,7 @@ def _write_brick(octree, index, values):
     for c, e in itertools.product(range(octree.num_classes), range(storage.OCTETS)):
         masks[0, c // 8] |= np.uint64(has_row[c][e] << (8 * e + c % 8))
     known = octree.known[index : index + 1].copy()
-    octree.raise_bricks(np.array([index]), masks, known, np.array([True]))
+    octree.expand_bricks(np.array([index]), masks, known, np.array([True]))
     row = int(octree.bricks.blocks[index])
     for e in range(storage.OCTETS):
         if int(known[0]) >> (8 * e) & 255:
@@ -62,7 +63,7 @@ def _write_brick(octree, index, values):
     storage.share_first_class(
         octree.bricks.rows, int(octree.bricks.blocks[index]), known[0], octree.bricks.masks, index, octree.num_classes
     )
-    storage.collapse(octree.bricks, index)
+    storage.prune_brick(octree.bricks, index)
 
 
 def brick_code(brick):

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from octoreplay.config.class_file import class_table
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import (
     FrameCounts,
@@ -29,7 +28,7 @@ ROBOTS = ("alpha", "beta")
 CLASSES = class_table([{"name": "ground", "color": [10, 20, 30]}, {"name": "tree", "color": [1, 2, 250]}])
 
 
-def team(folder: Path) -> RunConfig:
+def team(folder: Path) -> ResolvedRun:
     """Two robots whose logs are some bytes."""
     logs = []
     for robot_id in ROBOTS:
@@ -37,10 +36,12 @@ def team(folder: Path) -> RunConfig:
         log.write_bytes(f"log of {robot_id}".encode())
         logs.append(log)
     robots = tuple(
-        RobotConfig(robot_id, (log,), depth_topic="/depth", pose_topic="/odom", T_team_map=(1.0, 2.0, 3.0, 0, 0, 0, 1))
+        ResolvedRobot(
+            robot_id, (log,), depth_topic="/depth", pose_topic="/odom", T_team_map=(1.0, 2.0, 3.0, 0, 0, 0, 1)
+        )
         for robot_id, log in zip(ROBOTS, logs, strict=True)
     )
-    return RunConfig(robots=robots, classes=CLASSES)
+    return ResolvedRun(robots=robots, classes=CLASSES)
 
 
 def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> TickMetrics:
@@ -108,7 +109,7 @@ def write_result(folder: Path, fill: Callable[[ResultWriter], None] | None = Non
     """A finished result with metrics, poses and graph of some ticks, the last one settling, and what ``fill`` adds."""
     path = folder / "result.mcap"
     metrics = [tick_metrics(tick, settling=tick == num_ticks) for tick in range(1, num_ticks + 1)]
-    with ResultWriter(path, team(folder), CLASSES) as writer:
+    with ResultWriter(path, team(folder)) as writer:
         for tick in metrics:
             poses = [pose("alpha", float(tick.tick)), pose("beta", 0.0)]
             writer.write_metrics(tick)
@@ -122,7 +123,7 @@ def write_result(folder: Path, fill: Callable[[ResultWriter], None] | None = Non
 
 def write_until(error: type[BaseException], path: Path, metrics: Sequence[TickMetrics]) -> None:
     """Write some ticks, then raise an error in the middle of the run."""
-    with ResultWriter(path, team(path.parent), CLASSES) as writer:
+    with ResultWriter(path, team(path.parent)) as writer:
         for tick in metrics:
             writer.write_metrics(tick)
         raise error

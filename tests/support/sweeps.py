@@ -1,4 +1,4 @@
-"""Small sweeps as commands, for the tests of them."""
+"""Helpers for tests that run small sweeps as processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from octoreplay.study.numbers import TIMING_COLUMNS
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair"
 TEAM = PAIR / "team.yaml"
 QUICK = ("--resolution", "0.6", "--duration", "2")
-"""Settings with which a run takes a moment."""
+"""Options with which a run takes less than a second or two."""
 
 
 def command(*arguments: object) -> list[str]:
@@ -23,7 +23,7 @@ def command(*arguments: object) -> list[str]:
 
 
 def sweep(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Do a sweep as a process."""
+    """Run a sweep as a process and wait for it."""
     return subprocess.run(
         command(*arguments), cwd=folder, text=True, capture_output=True, check=False, timeout=300,
         env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"},
@@ -31,7 +31,7 @@ def sweep(*arguments: object, folder: Path | None = None) -> subprocess.Complete
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    """The table, without the columns that differ when a run is repeated."""
+    """Rows of the table without the columns that differ when a run is repeated."""
     with (folder / "table.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert all(set(TIMING_COLUMNS) <= set(row) for row in rows)
@@ -39,21 +39,21 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait until something is so."""
+    """Wait until a condition holds."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.01)
 
 
-def runs_of(process: subprocess.Popen[str]) -> list[Path]:
-    """The processes that a sweep has started, as folders in /proc."""
+def children(process: subprocess.Popen[str]) -> list[Path]:
+    """Child processes of a sweep, as folders in /proc."""
     lists = Path(f"/proc/{process.pid}/task").glob("*/children")
     return [Path("/proc") / pid for path in lists for pid in path.read_text().split()]
 
 
 def is_running(process: Path) -> bool:
-    """False once a process is gone, or waits to be collected."""
+    """False if a process has ended, also if it is a zombie."""
     try:
         return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

@@ -13,10 +13,7 @@ from octoreplay.commands.progress import progress_bar, replay_bar
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from octoreplay.simulate.team import SimulationConfig
-    from octoreplay.study.paper import PaperNumbers
 
 
 @click.group(short_help="Repeat the experiments of the documentation.")
@@ -38,6 +35,7 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     Takes about three minutes. What DIR holds already is used again where it is complete and of the same settings.
     """
     from octoreplay.report import tables
+    from octoreplay.report.experiment_tables import paper_table
     from octoreplay.study import paper as study
 
     simulation = study.paper_team(robots, duration, seed)
@@ -46,7 +44,7 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     click.echo("drawing", err=True)
     numbers = study.write_paper(folder, simulation)
     out = tables.terminal()
-    tables.show(out, _paper_table(numbers))
+    tables.show(out, paper_table([vars(moment) for moment in numbers.moments]))
     peak = tables.number(numbers.peak_total_distance)
     out.print(
         f"\u03a6 is largest at {numbers.peak_seconds:.0f} s, {peak}; uniform grid / octree is {numbers.mean_ratio:.2f}"
@@ -150,27 +148,3 @@ def result_with_bar(config: RunConfig, output: Path) -> Path:
         replayed_team(config, output, show)
     click.echo(f"used {output} again" if is_there else f"wrote {output}", err=True)
     return output
-
-
-def _paper_table(numbers: PaperNumbers) -> Table:
-    """The experiment's numbers at its two moments."""
-    from octoreplay.report.tables import number, share, size, styled_table
-
-    table = styled_table("The paper's experiment")
-    table.add_column("")
-    for moment in numbers.moments:
-        table.add_column(f"{moment.seconds:.0f} s", justify="right")
-    rows = {
-        "total distance \u03a6": [number(m.total_distance) for m in numbers.moments],
-        "\u03a6 per pair / squared norm of a map": [share(m.relative_distance) for m in numbers.moments],
-        "known cells": [f"{m.num_known_cells:,}" for m in numbers.moments],
-        "cells with different labels": [share(m.label_disagreement) for m in numbers.moments],
-        "agreement, worst robot, all cells": [share(m.agreement) for m in numbers.moments],
-        "agreement, worst robot, occupied cells": [share(m.agreement_occupied) for m in numbers.moments],
-        "map as uniform grid": [size(m.grid_bytes) for m in numbers.moments],
-        "map as octree": [size(m.octree_bytes) for m in numbers.moments],
-        "uniform grid / octree": [f"{m.ratio:.2f}" for m in numbers.moments],
-    }
-    for name, values in rows.items():
-        table.add_row(name, *values)
-    return table

@@ -19,10 +19,10 @@ from octoreplay.io.text_files import write_whole
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
 def info(logs: tuple[Path, ...]) -> int:
     """Show what logs hold: robots, topics, types, rates, spans, and what is missing for a run."""
-    from octoreplay.io.robots import discover
+    from octoreplay.io.robots.describe import describe
     from octoreplay.report import tables
 
-    description = discover.describe(logs)
+    description = describe(logs)
     if any(log.error is None for log in description.logs):
         tables.show(tables.terminal(), tables.description(description))
     errors = [log.error for log in description.logs if log.error is not None]
@@ -40,13 +40,13 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
 
     What a run would still miss stands in it too, and is said.
     """
-    from octoreplay.config.team_file import team_template
-    from octoreplay.io.robots import discover
+    from octoreplay.config.team_template import team_template
+    from octoreplay.io.robots.describe import describe
 
     check_output(output, ".yaml", logs)
     if output.exists() and not force:
         raise OutputError(f"{output}: is there already; name another file, or give --force to write over it")
-    description = discover.describe(logs)
+    description = describe(logs)
     for log in description.logs:
         if log.error is not None:
             raise InputError(log.error)

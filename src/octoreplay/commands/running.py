@@ -43,6 +43,7 @@ def run(
     What was found is shown, and --save-team saves it.
     """
     from octoreplay.io.robots import discover
+    from octoreplay.io.robots.survey import LogSurveys
     from octoreplay.report import tables
 
     if output is None and save_team is None:
@@ -52,14 +53,15 @@ def run(
     if save_team is not None:
         check_output(save_team, ".yaml", inputs)
     out, err = tables.terminal(), tables.terminal(stderr=True)
-    base = base_config(inputs, config_from, err)
-    base = base if classes is None else with_classes(base, classes)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config = discover.resolve(with_network(with_options(base, preset, edges, given), one_way, schedule))
+    with LogSurveys() as surveys:
+        base = base_config(inputs, config_from, err, surveys)
+        base = base if classes is None else with_classes(base, classes)
+        chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
+        config = discover.resolve(chosen, surveys)
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
-        if config.classes is not None:
-            tables.show(out, tables.class_list(config.classes))
+        tables.show(out, tables.class_list(config.classes))
     if save_team is not None:
         save_team_file(config, save_team)
         out.print(f"saved {save_team}", soft_wrap=True)

@@ -17,13 +17,15 @@ from octoreplay.io.text_files import write_whole
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from octoreplay.io.robots.survey import LogSurveys
+
 
 def is_team_file(inputs: Sequence[Path]) -> bool:
     """True where an input is a team file rather than a log."""
     return any(path.suffix.lower() in (".yaml", ".yml") for path in inputs)
 
 
-def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console) -> RunConfig:
+def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console, surveys: LogSurveys) -> RunConfig:
     """The configuration before any option: of a stored result, of a team file, or found in logs."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.results.result_reader import ResultReader
@@ -45,7 +47,7 @@ def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console
     for path in inputs:
         if (path / "team.yaml").is_file():
             raise ConfigError(f"{path}: holds a team file; give {path / 'team.yaml'}, or its logs one by one")
-    return RunConfig(robots=discover.discover(inputs))
+    return RunConfig(robots=discover.discover(inputs, surveys))
 
 
 def with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:

@@ -17,8 +17,9 @@ class ConsensusConfig:
 
     rule: str = parameter(
         "gradient",
-        "consensus rule: gradient (the paper's), bayes (Bayes' rule with averaging), natural (natural gradient), ratio and"
-        " flood (exact in spite of lost packets), merge (baseline that counts evidence repeatedly), local (no exchange)",
+        "consensus rule: gradient (the paper's), bayes (Bayes' rule with averaging), natural (natural gradient), ratio"
+        " and flood (exact in spite of lost packets), merge (baseline that counts evidence repeatedly), local (no"
+        " exchange)",
         choices=tuple(RULES),
     )
     evidence: str = parameter(

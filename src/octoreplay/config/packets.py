@@ -43,6 +43,10 @@ class PacketConfig:
         choices=("unicast", "broadcast"),
     )
 
+    decode_packets: bool = parameter(
+        False, "receivers decode every packet instead of sharing the sender's map: slower, with the same maps"
+    )
+
     def __post_init__(self) -> None:
         check_ranges(self)
         if self.budget is not None and self.packets != "delta":

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 from octoreplay.config.fields import LARGEST, help_text
 from octoreplay.errors import ConfigError
@@ -142,7 +143,7 @@ class RobotConfig:
         """All files and folders that the robot's data come from."""
         return (*self.logs, *(path for path in (self.pose_file, self.pose_times) if path is not None))
 
-    def with_absolute_paths(self) -> RobotConfig:
+    def with_absolute_paths(self) -> Self:
         """This robot with paths that hold from everywhere."""
         logs = tuple(log.resolve() for log in self.logs)
         pose_file, pose_times = (None if path is None else path.resolve() for path in (self.pose_file, self.pose_times))

@@ -9,7 +9,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.consensus import ConsensusConfig
@@ -90,7 +90,7 @@ class RunConfig:
         values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
         return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
 
-    def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
+    def with_parameters(self, values: Mapping[str, Any]) -> Self:
         """This configuration with flat parameters replaced.
 
         Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.

@@ -51,13 +51,13 @@ def replay_team(
 ) -> RunSummary:
     """Replay a team's logs into agreed maps and write the result to ``output`` (None: no result, only the summary).
 
+    A ``ResolvedRun`` is replayed as it is; any other configuration is resolved first.
     ``progress`` is called after every tick. ``num_threads`` (default: one per robot, at most one per processor) does
     not change the result. Raises ConfigError, InputError and OutputError, and then leaves no file; after a
     KeyboardInterrupt the finished part stays in the partial file beside ``output``.
     """
     started = time.monotonic()
     config = resolve(config)
-    assert config.classes is not None
     num_threads = num_threads or min(len(config.robots), os.cpu_count() or 1)
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
@@ -71,9 +71,9 @@ def replay_team(
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
         threads = stack.enter_context(ThreadPoolExecutor(num_threads))
         session = Session(config, sources, threads, bodies=bodies)
-        writer = stack.enter_context(ResultWriter(output, config, config.classes)) if output else None
+        writer = stack.enter_context(ResultWriter(output, config)) if output else None
         recorder = Recorder(config, writer, threads)
-        total_ns = _total_ns(logs, config.time)
+        total_ns = config.total_ns
         _check_num_ticks(config, total_ns)
         with deferred_interrupts() as deliver_interrupts:
             try:
@@ -96,16 +96,6 @@ def replay_team(
             if writer is not None:
                 writer.complete(summary)
         return summary
-
-
-def _total_ns(logs: Sequence[RobotLog], time: TimeConfig) -> int | None:
-    """Length of the replayed part of the logs; None where the logs do not say it."""
-    starts = [log.start_ns for log in logs if log.start_ns is not None]
-    ends = [log.end_ns for log in logs if log.end_ns is not None]
-    if not starts or not ends:
-        return None
-    whole = max(ends) - min(starts) - round(time.start * 1e9)
-    return max(whole, 0) if time.duration is None else max(min(whole, round(time.duration * 1e9)), 0)
 
 
 def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:

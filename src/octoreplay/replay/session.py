@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import TypeVar
 
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
-from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.records import Frame, RobotPose
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import check_budget
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
@@ -35,8 +34,8 @@ class Session:
 
     Parameters
     ----------
-    config : RunConfig
-        Resolved configuration with a class table.
+    config : ResolvedRun
+        Resolved configuration.
     sources : sequence of FrameSource
         Frames of each robot, in the order of ``config.robots``.
     threads : Executor
@@ -46,6 +45,8 @@ class Session:
 
     Attributes
     ----------
+    team : Team
+        The robots.
     stop_reason : str
         Reason for the end, set after the last tick.
     is_symmetric : bool
@@ -61,14 +62,12 @@ class Session:
 
     def __init__(
         self,
-        config: RunConfig,
+        config: ResolvedRun,
         sources: Sequence[FrameSource],
         threads: Executor,
         *,
         bodies: Bodies | None = None,
     ) -> None:
-        if config.classes is None:
-            raise InputError("a session needs a class table")
         self.config = config
         self.stop_reason = ""
         self.is_symmetric = True
@@ -79,12 +78,12 @@ class Session:
         self._timeline = Timeline(sources)
         self._bodies = bodies
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
-        self._encoder = PacketEncoder(config.packet)
-        self._team = make_team(config, config.classes.num_classes, self._encoder)
+        self._packet_codec = PacketCodec(config.packet)
+        self.team = make_team(config, config.classes.num_classes, self._packet_codec)
         self._links: Links[Content] = Links(config)
         self._measurer = TickMeasurer(config, config.classes.num_classes, threads)
         self._period_ns = round(config.network.publish_period * 1e9)
-        self._graph = self._network.at(0.0, [False] * len(robot_ids), self._team.positions())
+        self._graph = self._network.at(0.0, [False] * len(robot_ids), self.team.positions())
 
     def ticks(self) -> Iterator[Tick]:
         """The team after every tick, settling included."""
@@ -116,14 +115,14 @@ class Session:
 
     def _exchange(self, number: int, stamp_ns: int, gamma_factor: float = 1.0, *, settling: bool = False) -> Tick:
         """One tick behind its scans: publish, deliver, iterate, measure."""
-        graph, robots = self._graph, self._team.robots
+        graph, robots = self._graph, self.team.robots
         self.is_symmetric &= graph.is_symmetric
         published = self._publish(graph, number, stamp_ns)
         receipts = self._deliver(graph, stamp_ns)
         max_change = self._iterate(graph, gamma_factor, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
-        metrics = self._measurer.measure(number, stamp_ns, self._team, graph, traffic, max_change, settling=settling)
-        self._encoder.end_tick()
+        metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
+        self._packet_codec.end_tick()
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots), self._measurer.oracle,
             tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in robots if r.T_team_sensor is not None), metrics,
@@ -139,7 +138,7 @@ class Session:
         elapsed, before = number * self._period_ns / 1e9, (number - 1) * self._period_ns / 1e9
         schedule, start_ns = self._network.schedule, stamp_ns - number * self._period_ns
         for index in schedule.forgets(before, elapsed).nonzero()[0].tolist():
-            self._team.restart(index)
+            self.team.restart(index)
             self._measurer.forget()
         if self._bodies is not None:
             self._bodies.advance(stamp_ns - self._period_ns, stamp_ns)
@@ -147,23 +146,23 @@ class Session:
         def integrate(index: int) -> None:
             frames = self._timeline.frames_before(index, stamp_ns)
             kept = (frame for frame in frames if schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, elapsed))
-            self._team.robots[index].integrate((self._with_bodies(index, frame) for frame in kept), number)
+            self.team.robots[index].integrate((self._with_bodies(index, frame) for frame in kept), number)
 
-        self._each(integrate, range(len(self._team.robots)))
+        self._each(integrate, range(len(self.team.robots)))
         leaves = self.config.network.after_end == "leave"
         active = self._timeline.active(stamp_ns - self._period_ns if leaves else None)
-        self._graph = self._network.at(elapsed, active, self._team.positions())
+        self._graph = self._network.at(elapsed, active, self.team.positions())
 
     def _with_bodies(self, index: int, frame: Frame) -> Frame:
         """A robot's frame with the boxes of the other robots."""
         if self._bodies is None:
             return frame
-        return dataclasses.replace(frame, boxes=(*frame.boxes, *self._bodies.seen_by(index, frame.stamp_ns)))
+        return self._bodies.add_to(index, frame)
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Publication of each robot that is active and due in this tick; its packets are handed to the links."""
         self._links.cut(graph.links)
-        robots = self._team.robots
+        robots = self.team.robots
         publishes = self.config.consensus.traits.exchanges is not Exchanged.NOTHING
         due = [index for index in graph.active if publishes and robots[index].is_due(number)]
         with_unpruned = falls_due(number * self._period_ns, self._period_ns, self.config.output.state_every)
@@ -185,7 +184,7 @@ class Session:
         while deliveries := self._links.deliver(stamp_ns, graph.active):
             for delivery in deliveries:
                 sender, receiver, content = delivery.sender, delivery.receiver, delivery.content
-                robot = self._team.robots[receiver]
+                robot = self.team.robots[receiver]
                 if isinstance(content, Acknowledgement):
                     robot.exchange.acknowledged(sender, content)
                     continue
@@ -198,9 +197,9 @@ class Session:
     def _iterate(self, graph: CommunicationGraph, gamma_factor: float, number: int) -> float:
         """Iterate at every active robot with the maps that arrived; the largest change of a log-odds."""
         step_weights = 2.0 * step_size(graph, self.config.consensus) * graph.weights
-        robots = self._team.robots
+        robots = self.team.robots
         turns = [Turn(robots[index], robots[index].take_arrivals(), step_weights[index]) for index in graph.active]
-        return max(self._team.iterate(turns, gamma_factor, number, self._threads), default=0.0)
+        return max(self.team.iterate(turns, gamma_factor, number, self._threads), default=0.0)
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
-from octoreplay.records import BodyBox, Frame
+from octoreplay.records import Frame
 
 
 class FrameSource(Protocol):
@@ -21,8 +21,8 @@ class Bodies(Protocol):
     def advance(self, start_ns: int, end_ns: int) -> None:
         """Make the boxes between two stamps known."""
 
-    def seen_by(self, index: int, stamp_ns: int) -> tuple[BodyBox, ...]:
-        """The boxes at a stamp of all robots but one."""
+    def add_to(self, index: int, frame: Frame) -> Frame:
+        """Return a robot's frame with the boxes of all other robots at its stamp added."""
 
 
 class Timeline:

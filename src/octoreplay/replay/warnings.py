@@ -62,7 +62,7 @@ def log_warnings(logs: Sequence[RobotLog], *, is_empty: bool) -> tuple[str, ...]
             other = owners.setdefault(key, log.robot_id)
             if other != log.robot_id:
                 sentences.append(f"{other} and {log.robot_id} map the same messages of {key[0]}, which count twice")
-    spans = [(log.start_ns, log.end_ns, log.robot_id) for log in logs]
+    spans = [(log.robot.start_ns, log.robot.end_ns, log.robot_id) for log in logs]
     for start, _, robot_id in spans:
         others = [(a, b) for a, b, other in spans if other != robot_id]
         if start is not None and others and all(b is not None and b < start for _, b in others):

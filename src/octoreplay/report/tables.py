@@ -22,7 +22,7 @@ from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
-    from octoreplay.io.robots.discover import LogDescription, LogSummary
+    from octoreplay.io.robots.describe import LogDescription, LogSummary
     from octoreplay.result import PointQuery
 
 _YEAR_2000_NS = 946_684_800_000_000_000

@@ -84,7 +84,7 @@ def is_replayed(config: RunConfig, output: Path) -> bool:
         return False
     with ResultReader(output) as reader:
         is_same = reader.is_complete and reader.description["version"] == __version__ and not reader.changed_inputs()
-        is_same = is_same and _absolute(reader.config) == _absolute(resolve(config))
+        is_same = is_same and _absolute(reader.config) == _absolute(resolve(config).to_config())
     if not is_same:
         raise OutputError(
             f"{output}: is there and was made from other logs, with other settings or by another version; give another"

@@ -20,7 +20,7 @@ def test_what_was_written_comes_back(tmp_path: Path) -> None:
         assert reader.metrics() == METRICS
         assert reader.robots == ("alpha", "beta")
         assert reader.class_table == CLASSES
-        assert reader.config == team(tmp_path)
+        assert reader.config == team(tmp_path).to_config()
         assert reader.prior == 0.0
         written = summary(METRICS)
         read = reader.summary(reader.metrics())
@@ -32,10 +32,10 @@ def test_what_was_written_comes_back(tmp_path: Path) -> None:
 def test_numbers_of_the_configuration_come_back_exactly(tmp_path: Path) -> None:
     values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
     config = team(tmp_path).with_parameters(values)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary(METRICS))
     with ResultReader(tmp_path / "out.mcap") as reader:
-        assert reader.config == config
+        assert reader.config == config.to_config()
         assert reader.prior == config.map.prior(2)
 
 

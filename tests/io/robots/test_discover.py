@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from octoreplay.config.class_file import class_table
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError, OctoreplayError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
-from octoreplay.io.robots.discover import LogDescription, describe, discover, resolve
+from octoreplay.io.robots.describe import LogDescription, describe
+from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from support.log_factory import (
     FOXGLOVE_ENCODINGS,
@@ -48,7 +50,7 @@ def run_of(*robots: RobotConfig, **fields) -> RunConfig:
     return RunConfig(robots=robots, **fields)
 
 
-def count_frames(robot: RobotConfig, table=None) -> int:
+def count_frames(robot: ResolvedRobot, table=None) -> int:
     with RobotLog(robot, TimeConfig(), table) as log:
         return len(list(log.frames()))
 
@@ -76,7 +78,7 @@ def test_a_robot_is_named_by_its_file_and_its_topics_are_found(tmp_path, contain
         path = write_rosbag2(tmp_path / "rover", robot_entries())
     (robot,) = discover([path])
     label_info = None if container == "bag" else "/label_info"
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         "rover", (path,), depth_topic=DEPTH, label_topic=LABELS, camera_info_topic=INFO, pose_topic="/odom",
         label_info_topic=label_info, map_frame="map", sensor_frame="camera",
     )  # fmt: skip
@@ -87,8 +89,9 @@ def test_what_was_found_survives_a_team_file(tmp_path):
     path = write_mcap(tmp_path / "rover.mcap", robot_entries())
     config = resolve(run_of(*discover([path])))
     text = dump_team(config, tmp_path)
-    assert parse_team(text, source="team", folder=tmp_path) == config
-    assert resolve(config) == config
+    assert parse_team(text, name="team", folder=tmp_path) == config.to_config()
+    assert config.robots[0].log_span_ns == (START, START + 5 * SECOND // 4)
+    assert resolve(config) is config
 
 
 def test_several_robots_of_one_log_are_named_by_namespace(tmp_path):
@@ -276,7 +279,7 @@ def test_named_topics_are_kept(tmp_path):
         "r", (path,), label_topic="/other/labels", intrinsics=(1.0, 1.0, 0.0, 0.0), map_frame="here", sensor_frame="eye"
     )
     (robot,) = resolve(run_of(given)).robots
-    assert robot == replace(given, depth_topic=DEPTH, pose_topic="/odom", label_info_topic="/label_info")
+    assert robot.to_config() == replace(given, depth_topic=DEPTH, pose_topic="/odom", label_info_topic="/label_info")
 
 
 def test_the_class_table_is_that_of_the_logs_united_over_robots(tmp_path):
@@ -539,7 +542,7 @@ def foxglove_rows(encoding: str, namespace: str = "") -> list[Row]:
 def test_a_robot_that_speaks_foxgloves_schemas_is_found(tmp_path, encoding):
     path = write_rows(tmp_path / "r.mcap", foxglove_rows(encoding))
     (robot,) = discover([path])
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         "r", (path,), depth_topic="/camera/depth", label_topic="/camera/labels",
         camera_info_topic="/camera/calibration", pose_topic="/camera/tf", map_frame="map", sensor_frame="camera",
     )  # fmt: skip
@@ -575,7 +578,7 @@ def check_nothing_else_is_raised(path) -> LogDescription:
     for step in (
         lambda: discover([path]),
         lambda: resolve(run_of(RobotConfig("r", (path,)))),
-        lambda: [count_frames(summary.robot) for summary in description.robots],
+        lambda: [count_frames(ResolvedRobot.from_config(summary.robot, None)) for summary in description.robots],
     ):
         try:
             step()

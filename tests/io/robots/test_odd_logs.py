@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -16,7 +17,7 @@ from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.io.sensors.labels import class_table_from_names
-from octoreplay.records import FrameCounts
+from octoreplay.records import CloudFrame, FrameCounts
 from support.log_factory import (
     IDENTITY,
     NAMES,
@@ -36,12 +37,12 @@ START = 100 * SECOND
 DEPTH, LABELS, INFO = "/camera/depth/image_raw", "/camera/labels/image_raw", "/camera/depth/camera_info"
 
 
-def robot_of(*paths, **fields) -> RobotConfig:
+def robot_of(*paths, **fields) -> ResolvedRobot:
     known = {"depth_topic": DEPTH, "label_topic": LABELS, "camera_info_topic": INFO, "pose_topic": "/odom"}
-    return RobotConfig("r", paths, **{**known, **fields})
+    return ResolvedRobot("r", paths, **{**known, **fields})
 
 
-def read(robot: RobotConfig, **time):
+def read(robot: ResolvedRobot, **time):
     with RobotLog(robot, TimeConfig(**time), TABLE) as log:
         return [(frame.stamp_ns - START) / SECOND for frame in log.frames()], log.counts
 
@@ -168,7 +169,8 @@ def test_bodies_are_there_where_poses_begin_long_before_the_images(tmp_path):
     with TeamBodies(robots, TimeConfig()) as bodies:
         for tick in range(1, 4):
             bodies.advance(START + (tick - 1) * SECOND, START + tick * SECOND)
-            [box] = bodies.seen_by(0, START + tick * SECOND - SECOND // 2)
+            frame = CloudFrame("r", START + tick * SECOND - SECOND // 2, np.zeros((1, 3), np.float32), None, np.eye(4))
+            [box] = bodies.add_to(0, frame).boxes
             origin = np.linalg.inv(box.T_box_team)[:3, 3]
             np.testing.assert_allclose(origin, [tick - 0.5, 0, 0], atol=1e-9)
 

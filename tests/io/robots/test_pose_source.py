@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
@@ -79,10 +79,8 @@ class Poses:
         self.path = write_rows(tmp_path / "r.mcap", rows)
         with ExitStack() as stack:
             log = stack.enter_context(open_log(self.path))
-            robot = RobotConfig("r", (self.path,), depth_topic=IMAGE, **fields)
-            self.source = PoseSource(
-                robot, [log], sensor_topic=IMAGE, sensor_frame="camera", pose_gap_ns=gap_ns, use_log_time=use_log_time
-            )
+            robot = ResolvedRobot("r", (self.path,), depth_topic=IMAGE, **fields)
+            self.source = PoseSource(robot, [log], sensor_frame="camera", pose_gap_ns=gap_ns, use_log_time=use_log_time)
             self.known_at_first = self.source.is_known(STAMPS[0])
             for message in log.messages(self.source.topics):
                 self.source.take(message)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
@@ -20,7 +20,7 @@ TABLE = class_table_from_names({"r": NAMES})
 @pytest.fixture
 def robot(tmp_path):
     path = write_mcap(tmp_path / "r.mcap", robot_entries(num_frames=20))
-    return RobotConfig(
+    return ResolvedRobot(
         "r", (path,), depth_topic="/camera/depth/image_raw", label_topic="/camera/labels/image_raw",
         camera_info_topic="/camera/depth/camera_info", pose_topic="/odom",
     )  # fmt: skip

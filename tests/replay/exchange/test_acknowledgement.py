@@ -16,17 +16,17 @@ SAMPLE = [Possession(1, 2, 3), Possession(4, 5, None)]
 
 
 @given(ENTRIES)
-def test_what_is_encoded_is_decoded(entries):
+def test_encode_decode_round_trip(entries):
     assert decode_acknowledgement(encode_acknowledgement(entries)) == tuple(entries)
 
 
-def test_the_bytes_are_as_documented():
+def test_bytes_follow_the_documented_format():
     body = b"OCTA" + bytes([1, 0]) + struct.pack("<H", 2)
     body += struct.pack("<HIBI", 1, 2, 1, 3) + struct.pack("<HIBI", 4, 5, 0, 0)
     assert encode_acknowledgement(SAMPLE) == body + struct.pack("<I", zlib.crc32(body))
 
 
-def test_a_flipped_bit_or_a_cut_is_refused():
+def test_flipped_bits_and_cuts_are_refused():
     data = encode_acknowledgement(SAMPLE)
     for place in range(8 * len(data)):
         damaged = bytearray(data)
@@ -41,7 +41,7 @@ def test_a_flipped_bit_or_a_cut_is_refused():
 @pytest.mark.parametrize(
     ("place", "value"), [(4, 2), (5, 1), (6, 3), (14, 2)], ids=["version", "zero", "count", "has a map"]
 )
-def test_what_it_does_not_know_is_refused(place, value):
+def test_unknown_formats_are_refused(place, value):
     body = bytearray(encode_acknowledgement(SAMPLE)[:-4])
     body[place] = value
     with pytest.raises(PacketError, match="format that this octoreplay does not know"):

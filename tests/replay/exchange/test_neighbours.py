@@ -13,9 +13,9 @@ from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknowledgement
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from support.octree_factory import octree_of
 
 NUM_BRICKS = 6
@@ -41,7 +41,7 @@ class Author:
 
     def __init__(self, index, config, random):
         self.source = Source(index, 0)
-        self.exchange = Exchange(config, PacketEncoder(config))
+        self.exchange = Exchange(config, PacketCodec(config))
         self.versions = {}
         self._random = random
         self._cells = {}
@@ -54,7 +54,7 @@ class Author:
         self._cells.update(changes)
         changed = octree_of({key: v for key, v in self._cells.items() if key[0] // 4 in bricks})
         self._octree.overwrite(changed, np.arange(changed.num_bricks), tick - 1)
-        self.exchange.held[self.source] = HeldMap(self._octree.copy(), tick)
+        self.exchange.hold(self.source, HeldMap(self._octree.copy(), tick))
         self.versions[tick] = _content(self._octree)
 
 
@@ -83,7 +83,7 @@ def _run(config, *, seed, num_robots, links, decodes, forwards, num_ticks=40, nu
             if not is_good:
                 robot.publish(tick)
             elif not forwards:
-                robot.exchange.held[robot.source] = dataclasses.replace(robot.exchange.held[robot.source], version=tick)
+                robot.exchange.hold(robot.source, dataclasses.replace(robot.exchange.held[robot.source], version=tick))
                 robot.versions[tick] = robot.versions[tick - 1]
             sources = sorted(robot.exchange.held) if forwards else [robot.source]
             receivers = [b for a, b in links if a == index]
@@ -147,7 +147,7 @@ def test_forwarded_maps_come_through_whole(name, decodes, seed):
 def test_without_acknowledgement_a_loss_is_a_gap_until_the_next_whole_map():
     config = PacketConfig(packets="delta", acknowledge=False, key_frame_every=4)
     author = Author(0, config, np.random.default_rng(0))
-    receiver = Exchange(config, PacketEncoder(config))
+    receiver = Exchange(config, PacketCodec(config))
     fates = []
     for tick in range(1, 10):
         author.publish(tick)
@@ -161,12 +161,12 @@ def test_without_acknowledgement_a_loss_is_a_gap_until_the_next_whole_map():
 
 
 def test_a_receiver_that_lost_everything_gets_a_whole_map_again():
-    author, receiver = Author(0, DELTA, np.random.default_rng(0)), Exchange(DELTA, PacketEncoder(DELTA))
+    author, receiver = Author(0, DELTA, np.random.default_rng(0)), Exchange(DELTA, PacketCodec(DELTA))
     kinds, gaps = [], []
     for tick in range(1, 8):
         author.publish(tick)
         if tick == 4:
-            receiver = Exchange(DELTA, PacketEncoder(DELTA))
+            receiver = Exchange(DELTA, PacketCodec(DELTA))
         ((_, message),) = author.exchange.outbox([1], [author.source], keep_alive=True)
         receipt, answer = receiver.receive(0, message)
         author.exchange.acknowledged(1, answer)
@@ -179,8 +179,8 @@ def test_a_receiver_that_lost_everything_gets_a_whole_map_again():
 def test_a_delta_holds_what_changed_since_what_was_acknowledged():
     octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [3.0, 4.0], (8, 0, 0): [5.0, 6.0]})
     octree.revisions[octree.find(octree_of({(4, 0, 0): 0.0}).codes)] = 5
-    author, source = Exchange(DELTA, PacketEncoder(DELTA)), Source(0, 0)
-    author.held[source] = HeldMap(octree, 6)
+    author, source = Exchange(DELTA, PacketCodec(DELTA)), Source(0, 0)
+    author.hold(source, HeldMap(octree, 6))
     for base, expected in ((None, 3), (1, 3), (2, 1), (5, 1), (6, 0)):
         if base is not None:
             author.acknowledged(1, _acknowledgement(source, base))
@@ -190,7 +190,7 @@ def test_a_delta_holds_what_changed_since_what_was_acknowledged():
 
 
 def test_who_sends_a_map_needs_no_copy_of_it():
-    exchanges = [Exchange(PacketConfig(), PacketEncoder(PacketConfig())) for _ in range(2)]
+    exchanges = [Exchange(PacketConfig(), PacketCodec(PacketConfig())) for _ in range(2)]
     source = Source(7, 0)
     exchanges[0].held[source] = HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3)
     ((_, message),) = exchanges[0].outbox([1], [source], keep_alive=False)
@@ -200,9 +200,9 @@ def test_who_sends_a_map_needs_no_copy_of_it():
 
 
 def test_a_damaged_acknowledgement_is_dropped():
-    exchange = Exchange(DELTA, PacketEncoder(DELTA))
+    exchange = Exchange(DELTA, PacketCodec(DELTA))
     source = Source(0, 0)
-    exchange.held[source] = HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3)
+    exchange.hold(source, HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3))
     exchange.acknowledged(1, _acknowledgement(source, 3).damaged(0.5))
     assert len(exchange.outbox([1], [source], keep_alive=False)) == 1
     exchange.acknowledged(1, _acknowledgement(source, 3))
@@ -221,8 +221,8 @@ def test_within_a_budget_everything_arrives_later(seed, cast):
     random = np.random.default_rng(seed)
     config = dataclasses.replace(BUDGET, cast=cast)
     octree = SemanticOctree(0.25, 2)
-    exchange = Exchange(config, PacketEncoder(config))
-    receivers = {receiver: Exchange(config, PacketEncoder(config)) for receiver in (1, 2)}
+    exchange = Exchange(config, PacketCodec(config))
+    receivers = {receiver: Exchange(config, PacketCodec(config)) for receiver in (1, 2)}
     source = Source(0, 0)
     for tick in range(1, 200):
         if tick <= 60:
@@ -230,7 +230,7 @@ def test_within_a_budget_everything_arrives_later(seed, cast):
             keys = [(4 * brick + x, y, z) for x in range(4) for y in range(2) for z in range(2)]
             changed = octree_of({key: random.normal(size=2) for key in keys})
             octree.overwrite(changed, np.arange(1), tick - 1)
-        exchange.held[source] = HeldMap(octree.copy(), tick)
+        exchange.hold(source, HeldMap(octree.copy(), tick))
         reached = [receiver for receiver in receivers if tick > 60 and random.random() < 0.7]
         for group, message in exchange.outbox(list(receivers), [source], keep_alive=True):
             assert message.num_bytes <= 512
@@ -259,12 +259,12 @@ def test_what_is_forwarded_in_pieces_lacks_nothing_after_a_late_answer():
     """A delta that overlaps what is there must not make a brick look newer than one that changed after it."""
     rng = np.random.default_rng(0)
     source, octree = Source(0, 0), SemanticOctree(0.25, 2)
-    author, forwarder, last = (Exchange(BUDGET, PacketEncoder(BUDGET)) for _ in range(3))
+    author, forwarder, last = (Exchange(BUDGET, PacketCodec(BUDGET)) for _ in range(3))
 
     def publish(brick, version):
         keys = [(4 * brick + x, y, z) for x in range(4) for y in range(2) for z in range(2)]
         octree.overwrite(octree_of({key: rng.normal(size=2) for key in keys}), np.arange(1), version - 1)
-        author.held[source] = HeldMap(octree.copy(), version)
+        author.hold(source, HeldMap(octree.copy(), version))
 
     def send(sender, number, receiver, to):
         for _, message in sender.outbox([to], [source], keep_alive=False):

@@ -12,8 +12,8 @@ from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.quantise import quantised, top_classes
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
 from support.octree_factory import cells_of, octree_of
 
@@ -22,7 +22,7 @@ SOURCE = Source(0, 0)
 
 def _public_map(**parameters):
     config = RunConfig(robots=(RobotConfig("a", (Path("a.mcap"),)),)).with_parameters(parameters)
-    encoder = PacketEncoder(config.packet)
+    encoder = PacketCodec(config.packet)
     return PublicMap(config, encoder, SOURCE), encoder
 
 

@@ -9,7 +9,7 @@ from typing import Self, TypeAlias
 
 import numpy as np
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
 from octoreplay.io.messages.decoders import DamagedMessageError
@@ -66,10 +66,9 @@ class PoseSource:
 
     def __init__(
         self,
-        robot: RobotConfig,
+        robot: ResolvedRobot,
         logs: Sequence[LogReader],
         *,
-        sensor_topic: str,
         sensor_frame: str,
         pose_gap_ns: int,
         use_log_time: bool,
@@ -79,10 +78,9 @@ class PoseSource:
         self._logs = logs
         self._use_log_time = use_log_time
         self._pose_gap_ns = pose_gap_ns
-        self._sensor_topic = sensor_topic
         self._sensor_frame = frame_name(robot.sensor_frame or sensor_frame)
         infos = [topic for log in logs for topic in log.topics]
-        tf = tf_topics(infos, sensor_topic)
+        tf = tf_topics(infos, robot.sensor_topic)
         self._tree = FrameTree(pose_gap_ns)
         self._T_given = None if robot.T_body_sensor is None else transform_of(robot.T_body_sensor)
         load_static_transforms(self._tree, logs, tf)
@@ -240,12 +238,14 @@ class PoseSource:
         elif rows.stamps_ns is not None:
             return trajectory(rows.stamps_ns, rows)
         else:
-            messages = (message for log in self._logs for message in log.messages((self._sensor_topic,)))
+            messages = (message for log in self._logs for message in log.messages((self._robot.sensor_topic,)))
             stamps = np.sort(
                 np.array([m.log_time_ns if self._use_log_time else m.header_stamp_ns() for m in messages], np.int64)
             )
         if stamps.size != len(rows.positions):
-            whose = f"{times} has {stamps.size} times" if times else f"'{self._sensor_topic}' {stamps.size} messages"
+            whose = (
+                f"{times} has {stamps.size} times" if times else f"'{self._robot.sensor_topic}' {stamps.size} messages"
+            )
             raise InputError(
                 f"{path}: has {len(rows.positions)} poses, but {whose}; give pose_times: a file with a time [s] for "
                 f"every pose"

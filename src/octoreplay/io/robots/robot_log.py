@@ -13,13 +13,14 @@ from typing import Self
 
 import numpy as np
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
-from octoreplay.errors import ConfigError, InputError
+from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, first_whole_message
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.body_box import body_box_at
 from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker, FrameMaker
 from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
 from octoreplay.io.robots.pose_source import PoseSource
@@ -27,7 +28,7 @@ from octoreplay.io.robots.stamp_check import StampCheck
 from octoreplay.io.robots.thinning import Thinning
 from octoreplay.io.sensors.labels import LabelLookup
 from octoreplay.records import BodyBox, ClassTable, Float64Array, Frame, FrameCounts
-from octoreplay.transforms import inverse, transform_of
+from octoreplay.transforms import transform_of
 
 # A message that a robot recorded may have been under way for this long, and its poses too.
 _LOG_DELAY_NS = 10_000_000_000
@@ -54,7 +55,7 @@ class RobotLog:
 
     def __init__(
         self,
-        robot: RobotConfig,
+        robot: ResolvedRobot,
         time: TimeConfig,
         class_table: ClassTable | None,
         *,
@@ -67,24 +68,20 @@ class RobotLog:
         self._reach = reach
         self._num_beyond = 0
         self._use_log_time = time.clock == "log"
-        self._offset_ns = round(robot.clock_offset * 1e9)
+        self._offset_ns = robot.clock_offset_ns
         self._stamp_check = StampCheck(self._offset_ns)
         self.T_team_map = transform_of(robot.T_team_map)
         is_labelled = class_table is not None and "" not in (robot.label_topic, robot.label_field)
         self._labels = LabelLookup(class_table, strict=time.strict_labels) if class_table and is_labelled else None
-        sensor_topic = robot.depth_topic or robot.cloud_topic
-        if sensor_topic is None or (robot.pose_topic or robot.pose_file) is None:
-            missing = "depth_topic or cloud_topic" if sensor_topic is None else "pose_topic or pose_file"
-            raise ConfigError(f"robot '{robot.robot_id}': needs a {missing}")
-        self.sensor_topic = sensor_topic
+        self.sensor_topic = robot.sensor_topic
         self._known_poses: PoseSource | None = None
         with ExitStack() as stack:
             if logs is None:
                 logs = [stack.enter_context(open_log(path)) for path in robot.logs]
             self._logs = tuple(logs)
-            first = self._first_of(sensor_topic, _STAMPED_KINDS)
+            first = self._first_of(self.sensor_topic, _STAMPED_KINDS)
             if first is None:
-                raise InputError(f"{self._name}: topic '{sensor_topic}' holds no messages")
+                raise InputError(f"{self._name}: topic '{self.sensor_topic}' holds no messages")
             self._sensor_frame = first.header_frame_id()
             self.first_log_time_ns = first.log_time_ns
             """Log time of the sensor's first message, without the clock offset."""
@@ -99,18 +96,6 @@ class RobotLog:
     def robot_id(self) -> str:
         """The robot's name in the team."""
         return self.robot.robot_id
-
-    @property
-    def start_ns(self) -> int | None:
-        """Log time of the first message of any topic, clock offset applied; None in a log without messages."""
-        starts = [log.start_ns for log in self._logs if log.start_ns is not None]
-        return min(starts) + self._offset_ns if starts else None
-
-    @property
-    def end_ns(self) -> int | None:
-        """Log time of the last message of any topic, clock offset applied; None in a log without messages."""
-        ends = [log.end_ns for log in self._logs if log.end_ns is not None]
-        return max(ends) + self._offset_ns if ends else None
 
     def __enter__(self) -> Self:
         return self
@@ -156,7 +141,6 @@ class RobotLog:
         self._known_poses = PoseSource(
             self.robot,
             self._logs,
-            sensor_topic=self.sensor_topic,
             sensor_frame=self._sensor_frame,
             pose_gap_ns=round(self._time.pose_gap * 1e9),
             use_log_time=self._use_log_time,
@@ -353,8 +337,5 @@ class RobotLog:
         """The robot's own box where it is at a stamp; None where TF does not say it."""
         if self.robot.body_box is None:
             return ()
-        T_body_sensor = poses.T_body_sensor_at(stamp_ns)
-        if T_body_sensor is None:
-            return None
-        corners = np.array(self.robot.body_box).reshape(2, 3)
-        return (BodyBox(corners[0], corners[1], T_body_sensor @ inverse(T_team_sensor), is_own=True),)
+        box = body_box_at(self.robot, poses, stamp_ns, T_team_sensor, is_own=True)
+        return None if box is None else (box,)

@@ -12,7 +12,7 @@ from numpy.polynomial import Polynomial
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Calibration
 from octoreplay.io.sensors.images import MAX_PIXELS
-from octoreplay.records import CameraModel, Float32Array, Float64Array
+from octoreplay.records import CameraModel, Float32Array, Float64Array, read_only
 
 POLYNOMIAL_MODELS = ("plumb_bob", "rational_polynomial")
 FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
@@ -115,9 +115,8 @@ def _rays(
         is_real = (error <= _MAX_ERROR_PIXELS) & (np.hypot(flat[:, 0], flat[:, 1]) <= widest)
         slopes = np.where(is_real[:, None], flat, np.nan).astype(np.float32)
     slopes = np.ascontiguousarray(slopes.T.reshape(2, height, width))
-    # Shared by all who ask for the same lens.
-    slopes.flags.writeable = False
-    return slopes
+    # Cached and shared by all cameras with the same lens.
+    return read_only(slopes)
 
 
 def _grows_up_to(numerator: Polynomial, denominator: Polynomial) -> float:

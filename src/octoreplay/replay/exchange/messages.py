@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.streams import TreeStreams
 
 
 class Source(NamedTuple):
@@ -37,9 +38,9 @@ def _with_flipped_bit(data: bytes, place: int) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
-    """One packet of a message, and what a receiver that can use it has afterwards, decoded once for all receivers.
+    """One packet of a message.
 
-    Without ``held`` the receiver decodes the packet itself.
+    ``held`` is the state of the map after the packet, shared by the sender; None: receivers decode the packet.
     """
 
     data: bytes

@@ -18,11 +18,9 @@ import numpy as np
 
 from octoreplay.config.packets import PacketConfig
 from octoreplay.errors import PacketError
-from octoreplay.mapping import codec
-from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, MapPart, Receipt, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec, PacketStamp
 
 NOTHING = 0
 """The base of a delta that builds on nothing; versions are greater."""
@@ -35,10 +33,10 @@ class Exchange:
     a delta's base is what the last packet to that neighbour held, and every so many packets are whole maps.
     """
 
-    def __init__(self, config: PacketConfig, encoder: PacketEncoder) -> None:
+    def __init__(self, config: PacketConfig, packet_codec: PacketCodec) -> None:
         self._held: dict[Source, HeldMap] = {}
         self._config = config
-        self._encoder = encoder
+        self._codec = packet_codec
         self._known: dict[tuple[int, Source], int] = {}
         self._num_sent: dict[int, int] = {}
         self._epochs: dict[int, int] = {}
@@ -94,7 +92,7 @@ class Exchange:
                 elif base is not None and (mine.version if mine else NOTHING) < base:
                     receipt.num_gaps += 1
                 else:
-                    self._held[source] = part.held or self._decoded(part.data, version, mine)
+                    self._held[source] = part.held or self._codec.state(part.data, mine)
                     receipt.fresh.append(source)
             except PacketError:
                 receipt.num_damaged += 1
@@ -157,10 +155,7 @@ class Exchange:
     def _parts(self, bases: Sequence[tuple[Source, int | None]], turn: int) -> list[MapPart]:
         """The packets of a message; where a budget leaves room for some only, the sources take turns."""
         if self._config.budget is None:
-            return [
-                MapPart(self._encoder.packet(source, self._held[source], base), source, base, self._held[source])
-                for source, base in bases
-            ]
+            return [self._whole_part(source, base) for source, base in bases]
         parts: list[MapPart] = []
         left = self._config.budget
         first = turn % max(len(bases), 1)
@@ -171,13 +166,20 @@ class Exchange:
                 left -= len(data)
         return parts
 
+    def _whole_part(self, source: Source, base: int | None) -> MapPart:
+        """The packet from a base to the newest state of a map."""
+        held = self._held[source]
+        return MapPart(
+            self._codec.packet(source, held, base), source, base, None if self._config.decode_packets else held
+        )
+
     def _within(self, source: Source, base: int, size: int) -> bytes | None:
         """A packet of at most ``size`` bytes: all that changed after version ``base``, or else what changed first.
 
         Bricks that got their values in the same tick stay together; they fitted into a packet when they were published.
         """
         held = self._held[source]
-        fitting = self._encoder.packet(source, held, base)
+        fitting = self._codec.packet(source, held, base)
         if len(fitting) <= size:
             return fitting
         revisions = held.octree.revisions
@@ -188,34 +190,15 @@ class Exchange:
             middle = (fits + fails) // 2
             version = int(steps[middle - 1]) + 1
             chosen = np.flatnonzero((revisions >= base) & (revisions < version))
-            data = self._encoder.encode(source, HeldMap(held.octree, version), base, chosen)
+            data = self._codec.encode(source, HeldMap(held.octree, version), base, chosen)
             if len(data) <= size:
                 best, fits = data, middle
             else:
                 fails = middle
         return best
 
-    @staticmethod
-    def _stamp(part: MapPart) -> tuple[Source, int, int | None]:
-        """Whose state a packet brings, its version, and its base. Raises PacketError for a damaged packet."""
-        if part.held is not None:
-            return part.source, part.held.version, part.base
-        header = codec.read_header(part.data)
-        stamp = header.map_version
-        is_delta = header.kind == codec.DELTA
-        return Source(stamp.origin, stamp.epoch), stamp.version, stamp.base if is_delta else None
-
-    @staticmethod
-    def _decoded(data: bytes, version: int, mine: HeldMap | None) -> HeldMap:
-        """The state that a packet brings. Raises PacketError, and leaves what is here as it was."""
-        header = codec.read_header(data)
-        if header.kind == codec.FULL:
-            octree = codec.decode_packet(data)
-            octree.revisions[:] = version - 1
-        else:
-            octree = mine.octree.copy() if mine else SemanticOctree(header.resolution, header.num_classes)
-            # What is not in the delta did not change after its base, whatever an earlier packet made of it.
-            base = header.map_version.base
-            octree.revisions[octree.revisions >= base] = base - 1
-            codec.apply_delta(octree, data, version - 1)
-        return HeldMap(octree, version, header.map_version.weight)
+    def _stamp(self, part: MapPart) -> PacketStamp:
+        """Stamp of a packet. Raises PacketError for a damaged packet."""
+        if part.held is None:
+            return self._codec.stamp(part.data)
+        return PacketStamp(part.source, part.held.version, part.base)

@@ -8,14 +8,14 @@ from octoreplay.config.packets import PacketConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Step, team_step
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
+from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.mapping.streams import TreeStreams, mask_bytes
 from octoreplay.records import Int64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 
 FIT_TRIES = 6
 """Packets that are encoded at most to find one that fits the budget."""
@@ -47,11 +47,11 @@ class PublicMap:
     ``is_exact`` says that it is the map itself, value by value and at once.
     """
 
-    def __init__(self, config: RunConfig, encoder: PacketEncoder, source: Source) -> None:
+    def __init__(self, config: RunConfig, packet_codec: PacketCodec, source: Source) -> None:
         self.is_exact = config.packet.is_exact and config.map.prune_tolerance == 0
         self._packet = config.packet
         self._tolerance = config.map.prune_tolerance
-        self._encoder = encoder
+        self._packet_codec = packet_codec
         self._source = source
         self._octree: SemanticOctree | None = None
         self._comparer = MapComparer(2, 0.0)
@@ -81,7 +81,7 @@ class PublicMap:
         public = self._octree.copy()
         if self._packet.budget is None:
             # What did not change keeps its revision, so that no delta holds it.
-            team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
+            team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
         else:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(public, target, version, max(self._packet.budget // num_shares, least))
@@ -115,7 +115,7 @@ class PublicMap:
         order = here[waiting[np.argsort(-distances[waiting], kind="stable")]]
         best, wanted = 0, self._guess(order.size, budget)
         for _ in range(FIT_TRIES):
-            size = len(self._encoder.encode(self._source, HeldMap(target, version), version, order[:wanted]))
+            size = len(self._packet_codec.encode(self._source, HeldMap(target, version), version, order[:wanted]))
             self._bytes_per_brick = size / max(wanted, 1)
             # Some room is left: the same bricks may take more when others of their packet have changed again.
             if size <= 0.95 * budget:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import NetworkConfig
 from octoreplay.errors import ConfigError
-from octoreplay.records import BoolArray, Float64Array
+from octoreplay.records import BoolArray, Float64Array, read_only
 from octoreplay.replay.network.schedule import Availability, Schedule
 from octoreplay.replay.network.topology import POSITION_TOPOLOGIES, Topology
 
@@ -72,8 +72,7 @@ class CommunicationGraph:
     def laplacian(self) -> Float64Array:
         """L = diag(row sums of A) - A, (N, N) float64, read-only."""
         matrix: Float64Array = np.diag(self.weights.sum(axis=1)) - self.weights
-        matrix.setflags(write=False)
-        return matrix
+        return read_only(matrix)
 
     @cached_property
     def lambda_max(self) -> float:
@@ -186,8 +185,7 @@ def build_graph(
     indices = tuple(index for index, (_, is_active) in enumerate(zip(robot_ids, active, strict=True)) if is_active)
     weights = _weights(network, robot_ids, hears)
     _check_row_sums(weights, robot_ids)
-    weights.setflags(write=False)
-    return CommunicationGraph(tuple(robot_ids), indices, _links(hears), weights, network)
+    return CommunicationGraph(tuple(robot_ids), indices, _links(hears), read_only(weights), network)
 
 
 def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.errors import ConfigError
-from octoreplay.records import BoolArray
+from octoreplay.records import BoolArray, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +106,7 @@ class Schedule:
                 for a, b in links:
                     i, j = self._indices((a, b))
                     matrix[i, j] = matrix[j, i] = True
-        for array in (off, silent, down, up):
-            array.setflags(write=False)
-        return Availability(off, silent, down, up)
+        return Availability(read_only(off), read_only(silent), read_only(down), read_only(up))
 
     def _indices(self, robot_ids: Sequence[str]) -> list[int]:
         """The indices of some robots."""

@@ -9,11 +9,11 @@ from concurrent.futures import Executor
 import numpy as np
 
 from octoreplay.config.run import RunConfig
-from octoreplay.mapping.consensus import Step, gamma_at, team_step
+from octoreplay.mapping.consensus import Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
@@ -21,10 +21,13 @@ from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 class ConsensusRobot(Robot):
     """A robot that publishes h_i, and iterates on the h_j that arrive from its neighbours."""
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int, update: Update
+    ) -> None:
+        super().__init__(index, config, num_classes, packet_codec, epoch)
         self._rule = config.consensus.traits
-        self._public = PublicMap(config, encoder, self.source)
+        self._update = update
+        self._public = PublicMap(config, packet_codec, self.source)
         self._published: HeldMap | None = None
         self._has_budget = config.packet.budget is not None
         self._used: dict[Source, int] = {}
@@ -71,7 +74,7 @@ class ConsensusRobot(Robot):
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], rule=self._rule.name, revision=tick, clamp=self._config.sensor.clamp)
+            team_step([step], update=self._update, revision=tick, clamp=self._config.sensor.clamp)
             self._finish_step(tick)
         self._update_streams()
         # What one arrival changes another may undo; what counts is the change over the tick.
@@ -121,10 +124,14 @@ class ConsensusRobot(Robot):
 
 
 class ConsensusTeam(Team[ConsensusRobot]):
-    """Robots that mix maps."""
+    """Robots that mix maps; ``update`` is the branch of the kernel that the rule takes."""
+
+    def __init__(self, config: RunConfig, num_classes: int, packet_codec: PacketCodec, *, update: Update) -> None:
+        self._update = update
+        super().__init__(config, num_classes, packet_codec)
 
     def _new_robot(self, index: int, epoch: int) -> ConsensusRobot:
-        return ConsensusRobot(index, self._config, self._num_classes, self._encoder, epoch)
+        return ConsensusRobot(index, self._config, self._num_classes, self._packet_codec, epoch, self._update)
 
     def iterate(
         self, turns: Sequence[Turn[ConsensusRobot]], gamma_factor: float, tick: int, threads: Executor
@@ -136,7 +143,7 @@ class ConsensusTeam(Team[ConsensusRobot]):
         together = [turn for turn in turns if is_sync or not turn.arrived]
         alone = [turn for turn in turns if not is_sync and turn.arrived]
         steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, gamma_factor, tick), together))
-        changes = team_step(steps, rule=consensus.rule, revision=tick, clamp=clamp, threads=threads)
+        changes = team_step(steps, update=self._update, revision=tick, clamp=clamp, threads=threads)
         list(threads.map(lambda turn: turn.robot.end_step(tick), together))
         return changes + list(
             threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, gamma_factor, tick), alone)

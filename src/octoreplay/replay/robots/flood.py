@@ -15,8 +15,8 @@ import numpy as np
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
@@ -27,9 +27,11 @@ class FloodRobot(Robot):
     A robot that forgot gets the evidence of its earlier lives back from the others.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
-        self._public = PublicMap(config, encoder, self.source)
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
+        super().__init__(index, config, num_classes, packet_codec, epoch)
+        self._public = PublicMap(config, packet_codec, self.source)
         self._summed: dict[Source, int] = {}
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
@@ -78,7 +80,7 @@ class FloodTeam(Team[FloodRobot]):
     """Robots that forward and sum evidence."""
 
     def _new_robot(self, index: int, epoch: int) -> FloodRobot:
-        return FloodRobot(index, self._config, self._num_classes, self._encoder, epoch)
+        return FloodRobot(index, self._config, self._num_classes, self._packet_codec, epoch)
 
     def iterate(
         self, turns: Sequence[Turn[FloodRobot]], gamma_factor: float, tick: int, threads: Executor

@@ -8,10 +8,10 @@ from concurrent.futures import Executor
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 REST = 8.0
@@ -28,8 +28,10 @@ class RatioRobot(Robot):
     stands still, and goes on from there when the link is back.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
+        super().__init__(index, config, num_classes, packet_codec, epoch)
         self.mass = SemanticOctree(config.map.resolution, num_classes)
         self._weight = running_sums.WHOLE_WEIGHT
         self._total = SemanticOctree(config.map.resolution, num_classes)
@@ -77,11 +79,11 @@ class RatioRobot(Robot):
             self.mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
         )
         if self._weight >= running_sums.LEAST_WEIGHT:
-            change = running_sums.recovered(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
+            change = running_sums.recover_map(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
         else:
             # Most of the mass is under way: what is left shows its rounding. New evidence is added to the last map.
             step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
-            (change,) = team_step([step], rule="bayes", revision=tick)
+            (change,) = team_step([step], update=Update.BAYES, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
         self._update_streams()
@@ -119,12 +121,12 @@ class RatioRobot(Robot):
 class RatioTeam(Team[RatioRobot]):
     """Robots that exchange running sums."""
 
-    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+    def __init__(self, config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> None:
         _check_range(config)
-        super().__init__(config, num_classes, encoder)
+        super().__init__(config, num_classes, packet_codec)
 
     def _new_robot(self, index: int, epoch: int) -> RatioRobot:
-        return RatioRobot(index, self._config, self._num_classes, self._encoder, epoch)
+        return RatioRobot(index, self._config, self._num_classes, self._packet_codec, epoch)
 
     def iterate(
         self, turns: Sequence[Turn[RatioRobot]], gamma_factor: float, tick: int, threads: Executor
@@ -132,7 +134,7 @@ class RatioTeam(Team[RatioRobot]):
         """Add the growth of the received sums and the new evidence to each robot's mass; the rule has no gamma."""
         del gamma_factor
         masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
-        running_sums.team_take_in(masses, tick, threads)
+        running_sums.receive_team(masses, tick, threads)
         return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Evidence, Step, sum_of_evidence, team_step
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence, team_step
+from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -21,10 +21,11 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
+from octoreplay.mapping.streams import TreeStreams
 from octoreplay.records import Float64Array, Frame, Int64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 
 
 class Arrival(NamedTuple):
@@ -81,14 +82,16 @@ class Robot(ABC):
     ``tick`` numbers, which grow, mark what changed when. Methods of different robots may run in parallel threads.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
+    def __init__(
+        self, index: int, config: RunConfig, num_classes: int, packet_codec: PacketCodec, epoch: int = 0
+    ) -> None:
         self.robot_id = config.robots[index].robot_id
         self.index = index
         self.source = Source(index, epoch)
         self.num_scans = 0
         self.num_iterations = 0
         self.T_team_sensor: Float64Array | None = None
-        self.exchange = Exchange(config.packet, encoder)
+        self.exchange = Exchange(config.packet, packet_codec)
         self._config = config
         self._caster = ScanCaster(config.sensor, config.map, num_classes)
         self._increments = clamped_increments(config.sensor)
@@ -198,7 +201,7 @@ class Robot(ABC):
 
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """The largest change of a log-odds since ``before``, which is overwritten."""
-        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
+        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
 
     def _update_streams(self) -> None:
         """The map's streams, with its leaves merged."""
@@ -211,10 +214,10 @@ class Team(ABC, Generic[RobotT]):
     ``robots`` are in the order of ``config.robots``.
     """
 
-    def __init__(self, config: RunConfig, num_classes: int, encoder: PacketEncoder) -> None:
+    def __init__(self, config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> None:
         self._config = config
         self._num_classes = num_classes
-        self._encoder = encoder
+        self._packet_codec = packet_codec
         self._past_evidence: list[Evidence] = []
         self.robots = [self._new_robot(index, 0) for index in range(len(config.robots))]
 
