@@ -16,9 +16,8 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.result import open_result
-from support.command_line import assert_fails, command, octoreplay, octoreplay_process
+from support.command_line import assert_fails, command, octoreplay, octoreplay_process, wait_for
 from support.fixture_paths import PAIR, PAIR_TEAM, TRIO
-from support.sweeps import wait_for
 
 
 def test_every_parameter_is_an_option() -> None:

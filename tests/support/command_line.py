@@ -9,6 +9,8 @@ import os
 import re
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -49,6 +51,14 @@ def octoreplay_process(*arguments: object, **environment: str) -> subprocess.Com
 def command(*arguments: object) -> list[str]:
     """The words that start the command line as a process."""
     return [sys.executable, "-m", "octoreplay", *map(str, arguments)]
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
+    """Wait until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.01)
 
 
 def assert_fails(code: int, sentence: str, *arguments: object) -> None:
