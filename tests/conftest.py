@@ -1,4 +1,4 @@
-"""Results of the committed teams, which one worker makes and all workers read."""
+"""Results of the committed teams, which one worker makes and all workers read, and kernels as Python for coverage."""
 
 from __future__ import annotations
 
@@ -11,7 +11,20 @@ import pytest
 
 from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
 
+IS_COMPILED = os.environ.get("NUMBA_DISABLE_JIT") != "1"
+
+if not IS_COMPILED:
+    from support import plain_intrinsics
+
+    plain_intrinsics.install()
+
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not IS_COMPILED:
+        # Kernels let integers overflow and divide by 0, of which numpy warns in Python.
+        config.addinivalue_line("filterwarnings", "ignore::RuntimeWarning")
 
 
 @pytest.fixture(scope="session")
