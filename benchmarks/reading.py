@@ -1,4 +1,4 @@
-"""Reading logs: next to a bare loop over the same topics with the same decoders; opening times; memory.
+"""Reading logs: next to a bare loop over the same topics with the same decoders; parts; opening times; memory.
 
 The logs are made on the spot and cached: a 640x480 depth camera at 30 Hz with label images and odometry at 50 Hz, and a
 colour camera that a run does not need. Both sides read in one thread and give arrays to another.
@@ -7,6 +7,7 @@ colour camera that a run does not need. Both sides read in one thread and give a
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import subprocess
 import sys
 import time
@@ -44,12 +45,15 @@ PNG = "sensor_msgs/msg/CompressedImage"
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 WIDTH, HEIGHT, RATE, ODOMETRY_RATE = 640, 480, 30, 50
+PART_SECONDS, PART_RATE = 60.0, 1
+"""Length of the part read from the middle of a log, and the camera's rate [Hz] in that log: it is long, not large."""
 DEPTH, LABELS, COLOR, INFO, ODOM = "/camera/depth", "/camera/labels", "/camera/color", "/camera/camera_info", "/odom"
 TYPES = {
     DEPTH: "sensor_msgs/msg/Image", LABELS: "sensor_msgs/msg/Image", COLOR: "sensor_msgs/msg/Image",
     INFO: "sensor_msgs/msg/CameraInfo", ODOM: "nav_msgs/msg/Odometry",
 }  # fmt: skip
 CLASSES = ClassTable(tuple(SemanticClass(i, f"class {i}", (i, i, i), (i,)) for i in range(1, 9)))
+PART_FORMS = ("mcap-zstd", "mcap-none", "db3", "bag-lz4")
 FORMS = ("mcap-zstd", "mcap-lz4", "mcap-none", "mcap-png", "db3", "bag-lz4", "bag-none")
 READ_MEMORY = """
 import resource, sys
@@ -67,13 +71,17 @@ print(count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 
 
 def main() -> None:
-    """Reading next to the bare loop, then opening times, then memory."""
+    """Reading next to the bare loop, then a part of a log, then opening times, then memory."""
     options = arguments(__doc__ or "", rounds=5, add=_add_options)
     report = Report("reading", vars(options))
-    for form in options.form or FORMS:
-        _compare_reading(report, form, options)
-    _compare_opening(report, options)
-    _measure_memory(report, options)
+    if not options.only_parts:
+        for form in options.form or FORMS:
+            _compare_reading(report, form, options)
+    for form in options.form or PART_FORMS:
+        _compare_parts(report, form, options)
+    if not options.only_parts:
+        _compare_opening(report, options)
+        _measure_memory(report, options)
     report.save(options.json)
 
 
@@ -81,6 +89,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the logs (default: %(default)s)")
     parser.add_argument("--gigabytes", type=float, default=4.0, help="size of the large log (default: %(default)s)")
     parser.add_argument("--form", action="append", choices=FORMS, help="read only these")
+    parser.add_argument("--only-parts", action="store_true", help="read only parts from the middle of long logs")
 
 
 def _compare_reading(report: Report, form: str, options: Any) -> None:
@@ -107,6 +116,57 @@ def _compare_reading(report: Report, form: str, options: Any) -> None:
         ratios = [a / b for a, b in zip(times["ours"], times[name], strict=True)]
         report.add(measured(f"{form}: time / bare loop with {title}", ratios, "x", must=must))
     report.add(measured(f"{form}: frames a second", [num_frames / t for t in times["ours"]], "Hz"))
+
+
+def _compare_parts(report: Report, form: str, options: Any) -> None:
+    """Bytes and time of reading a minute from the middle of a log, next to the whole log and the library's range."""
+    seconds = options.gigabytes * 1e9 / _bytes_per_second(PART_RATE)
+    path = make_log(form, seconds, PART_RATE)
+    config = robot_of(path)
+    first = round(seconds / 2 - PART_SECONDS / 2)
+    part = dataclasses.replace(config.time, start=float(first), duration=PART_SECONDS)
+    span = (START + first * SECOND, START + round(first + PART_SECONDS) * SECOND)
+    num_bytes: dict[str, int] = {}
+
+    def ours(name: str, time_config: Any, num_frames: int) -> float:
+        before, started = _num_bytes_read(), time.perf_counter()
+        with RobotLog(config.robots[0], time_config, CLASSES) as log, ReadAhead(log) as source:
+            assert sum(1 for _ in source.frames()) == num_frames
+        elapsed = time.perf_counter() - started
+        num_bytes[name] = _num_bytes_read() - before
+        return elapsed
+
+    def library() -> float:
+        before, started = _num_bytes_read(), time.perf_counter()
+        items = _in_a_thread(bare_loop(path, Decoders(), *span))
+        assert sum(1 for topic, _ in items if topic == DEPTH) == round(PART_SECONDS * PART_RATE)
+        elapsed = time.perf_counter() - started
+        num_bytes["library"] = _num_bytes_read() - before
+        return elapsed
+
+    times = interleave(
+        {
+            "part": lambda: ours("part", part, round(PART_SECONDS * PART_RATE)),
+            "whole": lambda: ours("whole", config.time, round(seconds * PART_RATE)),
+            "library": library,
+        },
+        options.rounds,
+    )
+    title = f"{form}, {_size_of(path) / 1e9:.2f} GB of {seconds:.0f} s, {PART_SECONDS:.0f} s from the middle"
+    for name, what in (("part", "bytes read"), ("library", "bytes read by the library's own range")):
+        note = f"the whole log: {num_bytes['whole'] / 1e6:.0f} MB"
+        report.add(Row(f"{title}: {what}", num_bytes[name] / 1e6, "MB", note=note))
+    report.add(measured(f"{title}: time", times["part"], "s"))
+    for name, what in (("whole", "the whole log"), ("library", "the library's own range")):
+        ratios = [a / b for a, b in zip(times["part"], times[name], strict=True)]
+        must = 1.5 if name == "library" else 2.0 * (PART_SECONDS + 15.0) / seconds
+        report.add(measured(f"{title}: time / {what}", ratios, "x", must=must))
+
+
+def _num_bytes_read() -> int:
+    """Bytes that this process has read from files so far (Linux)."""
+    line = Path("/proc/self/io").read_text(encoding="ascii").splitlines()[0]
+    return int(line.removeprefix("rchar: "))
 
 
 def _compare_opening(report: Report, options: Any) -> None:
@@ -169,9 +229,9 @@ def _open_library(path: Path) -> None:
         assert reader.message_count
 
 
-def _bytes_per_second() -> float:
+def _bytes_per_second(rate: int = RATE) -> float:
     """Size of one second of an uncompressed log."""
-    return float(WIDTH * HEIGHT * (2 + 1 + 3) * RATE)
+    return float(WIDTH * HEIGHT * (2 + 1 + 3) * rate)
 
 
 def robot_of(path: Path) -> RunConfig:
@@ -180,20 +240,25 @@ def robot_of(path: Path) -> RunConfig:
     return resolve(RunConfig((robot,), classes=CLASSES))
 
 
-def bare_loop(path: Path, decode: Callable[[str, Any], Any]) -> Iterator[tuple[str, Any]]:
-    """The needed messages by the container's own library: topic and what ``decode`` makes of it."""
+def bare_loop(
+    path: Path, decode: Callable[[str, Any], Any], start: int | None = None, stop: int | None = None
+) -> Iterator[tuple[str, Any]]:
+    """The needed messages by the container's own library, in a range of log time: topic and the decoded message."""
     wanted = {DEPTH, LABELS, ODOM}
     store: Any = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
     if path.suffix == ".mcap":
         with path.open("rb") as stream:
-            for schema, channel, message in make_reader(stream).iter_messages(topics=wanted):
+            for schema, channel, message in make_reader(stream).iter_messages(
+                wanted, starting_at=start, ending_before=stop
+            ):
                 assert schema is not None
                 yield channel.topic, decode(channel.topic, store.deserialize_cdr(message.data, schema.name))
         return
     reader: Any = Rosbag1Reader(path) if path.suffix == ".bag" else Rosbag2Reader(path)
     deserialise = store.deserialize_ros1 if path.suffix == ".bag" else store.deserialize_cdr
     with reader:
-        for connection, _, data in reader.messages([c for c in reader.connections if c.topic in wanted]):
+        connections = [c for c in reader.connections if c.topic in wanted]
+        for connection, _, data in reader.messages(connections, start, stop):
             yield connection.topic, decode(connection.topic, deserialise(data, connection.msgtype))
 
 
@@ -241,21 +306,22 @@ def _in_a_thread(items: Iterator[Any]) -> Iterator[Any]:
 # --- logs ------------------------------------------------------------------------------------------------------------
 
 
-def make_log(form: str, seconds: float) -> Path:
-    """The log of one robot in one form, made where it is not there yet."""
+def make_log(form: str, seconds: float, rate: int = RATE) -> Path:
+    """The log of one robot in one form, made where it is not there yet; ``rate`` is the cameras' [Hz]."""
     suffix = {"db": "", "ba": ".bag"}.get(form[:2], ".mcap")
-    path = cache_folder() / f"reading-{form}-{seconds:g}s{suffix}"
+    at_rate = "" if rate == RATE else f"-{rate}Hz"
+    path = cache_folder() / f"reading-{form}-{seconds:g}s{at_rate}{suffix}"
     if not path.exists():
         partial = path.with_name(f"partial-{path.name}")
         if partial.is_file():
             partial.unlink()
         writers = {"db": _write_folder, "ba": _write_bag}
-        writers.get(form[:2], _write_mcap)(partial, form, seconds)
+        writers.get(form[:2], _write_mcap)(partial, form, seconds, rate)
         partial.rename(path)
     return path
 
 
-def _write_mcap(path: Path, form: str, seconds: float) -> None:
+def _write_mcap(path: Path, form: str, seconds: float, rate: int) -> None:
     """An MCAP file with chunks of rosbag2's size."""
     compression = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}.get(form[5:], CompressionType.NONE)
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -263,7 +329,7 @@ def _write_mcap(path: Path, form: str, seconds: float) -> None:
         writer = Writer(stream, chunk_size=786_432, compression=compression)
         writer.start(profile="ros2")
         channels = {}
-        for topic, type_name, stamp, message in _messages(store, seconds, as_png=form == "mcap-png"):
+        for topic, type_name, stamp, message in _messages(store, seconds, rate, as_png=form == "mcap-png"):
             if topic not in channels:
                 definition = store.generate_msgdef(type_name, ros_version=2)[0].encode()
                 schema = writer.register_schema(name=type_name, encoding="ros2msg", data=definition)
@@ -273,18 +339,18 @@ def _write_mcap(path: Path, form: str, seconds: float) -> None:
         writer.finish()
 
 
-def _write_folder(path: Path, _: str, seconds: float) -> None:
+def _write_folder(path: Path, _: str, seconds: float, rate: int) -> None:
     """A rosbag2 folder with a sqlite3 file."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connections = {}
-        for topic, type_name, stamp, message in _messages(store, seconds):
+        for topic, type_name, stamp, message in _messages(store, seconds, rate):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             writer.write(connections[topic], stamp, store.serialize_cdr(message, type_name))
 
 
-def _write_bag(path: Path, form: str, seconds: float) -> None:
+def _write_bag(path: Path, form: str, seconds: float, rate: int) -> None:
     """A ROS 1 bag."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Rosbag1Writer(path)
@@ -292,19 +358,19 @@ def _write_bag(path: Path, form: str, seconds: float) -> None:
         writer.set_compression(Rosbag1Writer.CompressionFormat.LZ4)
     with writer:
         connections = {}
-        for topic, type_name, stamp, message in _messages(store, seconds, ros1=True):
+        for topic, type_name, stamp, message in _messages(store, seconds, rate, ros1=True):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             writer.write(connections[topic], stamp, store.serialize_ros1(message, type_name))
 
 
 def _messages(
-    store: Any, seconds: float, *, ros1: bool = False, as_png: bool = False
+    store: Any, seconds: float, rate: int, *, ros1: bool = False, as_png: bool = False
 ) -> Iterator[tuple[str, str, int, Any]]:
     """Topic, type, stamp and message, in order of time."""
     pictures = [_pictures(k) for k in range(8)]
     times = [(k / ODOMETRY_RATE, False, k) for k in range(round(seconds * ODOMETRY_RATE) + 1)]
-    times += [(k / RATE, True, k) for k in range(round(seconds * RATE))]
+    times += [(k / rate, True, k) for k in range(round(seconds * rate))]
     for elapsed, is_picture, k in sorted(times):
         stamp = START + round(elapsed * SECOND)
         if not is_picture:

@@ -1,4 +1,4 @@
-"""Results of the committed teams, which one worker makes and all workers read, and kernels as Python for coverage."""
+"""Results of the committed teams, made by one worker and read by all, and switches for the code under test."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ if not IS_COMPILED:
     from support import plain_intrinsics
 
     plain_intrinsics.install()
+
+# Imported after the intrinsics, because it imports kernels.
+from octoreplay.replay.exchange.packet_codec import PacketCodec  # noqa: E402
+
+# Receivers decode every packet in all tests, so that an error in the encoder changes a run.
+PacketCodec.always_decodes = True
 
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
 

@@ -53,7 +53,7 @@ def test_wrong_usage(runs: dict[str, Path], tmp_path: Path) -> None:
     sentence = "no limit given; give at least one, such as --max-label-disagreement 0.001"
     assert sentence in output_of(2, "check", runs["pair"])
     assert "No such option '--max-fun'" in output_of(2, "check", runs["pair"], "--max-fun", 1)
-    assert "is more than 1; it is a share" in output_of(2, "check", runs["pair"], "--min-agreement", 99)
+    assert "is more than 1; give a share" in output_of(2, "check", runs["pair"], "--min-agreement", 99)
     assert "needs the truth; give it with --truth" in output_of(2, "check", runs["pair"], "--min-coverage", 0.5)
     assert "must end in .json" in output_of(2, "check", runs["pair"], *EASY, "--json", tmp_path / "a.txt")
 

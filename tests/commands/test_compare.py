@@ -12,10 +12,10 @@ from support.fixture_paths import PAIR
 def test_a_run_equals_itself_and_its_repetition(runs: dict[str, Path]) -> None:
     for other in ("pair", "again"):
         text = output_of(0, "compare", runs["pair"], runs[other])
-        assert text.endswith("\nthe same: 3 maps, every cell\n")
+        assert text.endswith("\nthe same: all cells of 3 maps\n")
         assert "logs: the same" in text
-        assert "Settings that differ" not in text
-        assert "Where they differ" not in text
+        assert "Different settings" not in text
+        assert "Places of the differences" not in text
 
 
 def test_settings_that_differ_are_listed(runs: dict[str, Path], tmp_path: Path) -> None:
@@ -27,13 +27,13 @@ def test_settings_that_differ_are_listed(runs: dict[str, Path], tmp_path: Path) 
     assert [one["robot_id"] for one in content["maps"]] == ["husky_1", "husky_2", "central"]
     assert content["maps"][0]["num_differing"] > 0
     assert content["maps"][2]["num_differing"] == 0
-    assert "the same: 1 map," in output_of(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
+    assert "the same: all cells of 1 map" in output_of(0, "compare", runs["pair"], runs["slower"], "--robot", "central")
 
 
 def test_maps_within_a_tolerance_are_the_same(runs: dict[str, Path]) -> None:
     assert output_of(1, "compare", runs["pair"], runs["near"]).splitlines()[-1].startswith("different: 2 of 3 maps")
     text = output_of(0, "compare", runs["pair"], runs["near"], "--tolerance", 0.5)
-    assert text.splitlines()[-1].startswith("the same within 0.5: 3 maps, every cell")
+    assert text.splitlines()[-1].startswith("the same within 0.5: all cells of 3 maps")
 
 
 def test_a_robot_of_one_result_only(runs: dict[str, Path]) -> None:
@@ -49,7 +49,7 @@ def test_maps_of_an_earlier_time(runs: dict[str, Path]) -> None:
 def test_results_that_cannot_be_compared(runs: dict[str, Path], tmp_path: Path) -> None:
     text = output_of(1, "compare", runs["pair"], runs["finer"])
     assert text.count("\n") == 1
-    assert "finer.mcap: has the resolution 0.4 m" in text
+    assert "finer.mcap: the resolution is 0.4 m" in text
     text = output_of(1, "compare", runs["pair"], PAIR / "husky_1.mcap")
     assert text.count("\n") == 1
     assert "no result of octoreplay" in text

@@ -19,4 +19,4 @@ def test_demo_writes_every_file(tmp_path: Path) -> None:
     for name in files:
         assert (tmp_path / "show" / name).stat().st_size > 0
     assert "Foxglove" in done.stdout
-    assert_fails(1, "show.*logs: is not empty; give a new folder", "demo", tmp_path / "show")
+    assert_fails(1, "show.*logs: is not empty; use a new folder", "demo", tmp_path / "show")

@@ -35,15 +35,16 @@ def test_the_truth_beside_the_logs_is_suggested_and_not_used(trio_result: Path, 
     done = octoreplay("evaluate", trio_result, "--last")
     assert done.returncode == 0
     assert "IoU" not in done.stdout
-    assert done.stderr.startswith("IoU, coverage and calibration need the truth: --truth WORLD; beside the logs lies ")
-    assert Path(done.stderr.split("lies ")[1].strip()).resolve() == TRIO / "world.npz"
+    hint = "IoU, coverage and calibration need the ground truth: --truth WORLD; found beside the logs: "
+    assert done.stderr.startswith(hint)
+    assert Path(done.stderr.removeprefix(hint).strip()).resolve() == TRIO / "world.npz"
     team = tmp_path / "team"
     shutil.copytree(TRIO, team)
     (team / "world.npz").unlink()
     assert octoreplay("run", "team.yaml", "-o", "out.mcap", "--duration", "1", folder=team).returncode == 0
     done = octoreplay("evaluate", team / "out.mcap", "--last")
     assert (done.returncode, done.stderr) == (
-        0, "IoU, coverage and calibration need the truth: --truth WORLD\n",
+        0, "IoU, coverage and calibration need the ground truth: --truth WORLD\n",
     )  # fmt: skip
 
 
@@ -71,7 +72,7 @@ def test_refused_inputs_and_outputs(trio_result: Path, tmp_path: Path) -> None:
         (1, r"none\.mcap: cannot be read", (trio_result, "--against", tmp_path / "none.mcap")),
         (2, r"must end in \.csv", (trio_result, "--csv", tmp_path / "a.txt")),
         (1, r"the folder .* does not exist", (trio_result, "--json", tmp_path / "none" / "a.json")),
-        (1, r"empty\.npz: is a file; give a folder", (trio_result, "--plot", tmp_path / "empty.npz")),
+        (1, r"empty\.npz: is a file; name a folder", (trio_result, "--plot", tmp_path / "empty.npz")),
     ):
         assert_fails(code, f"^error: .*{sentence}", "evaluate", *arguments)
     assert_fails(2, "Missing argument", "evaluate")

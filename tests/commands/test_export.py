@@ -23,7 +23,7 @@ def test_refused_exports_write_nothing(pair_result: Path, tmp_path: Path) -> Non
     out = tmp_path / "x.ply"
     for code, sentence, arguments in (
         (1, "robot 'husky_9' not found; robots: husky_1, husky_2", (out, "--robot", "husky_9")),
-        (2, r"out\.mcap: the output's name must end in \.ply", (tmp_path / "out.mcap",)),
+        (2, r"out\.mcap: the name of the output must end in \.ply", (tmp_path / "out.mcap",)),
         (1, "is a folder or a device", ("/dev/full",)),
         (1, "no map of robot 'husky_1' is stored up to", (out, "--at", "-5")),
         (1, r"none/x\.ply: cannot be written", (tmp_path / "none" / "x.ply",)),

@@ -54,15 +54,17 @@ def test_odd_and_skipped_clouds_are_warned_of(walls: Path, tmp_path: Path) -> No
     done = octoreplay("import-clouds", walls, "-o", tmp_path / "a.mcap", "--rate", 10)
     assert done.returncode == EXIT_DATA_LOST
     assert "2 clouds, 2 with labels" in done.stdout
-    odd, left_out = done.stderr.splitlines()
+    odd, skipped = done.stderr.splitlines()
     assert odd.startswith(f"warning: {walls / '2.pcd'}: rows have more columns than the header names; those after")
-    assert left_out == "warning: 1 clouds without a usable pose were left out"
+    assert skipped == "warning: 1 clouds without a usable pose were skipped"
 
 
 def test_refused_folders_of_clouds(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     assert_fails(2, r"in: the frames have no times; give a rate or a file of times", "import-clouds", walls, "-o", out)
-    assert_fails(2, r"a\.bag: the output's name must end in \.mcap", "import-clouds", walls, "-o", tmp_path / "a.bag")
+    assert_fails(
+        2, r"a\.bag: the name of the output must end in \.mcap", "import-clouds", walls, "-o", tmp_path / "a.bag"
+    )
     (walls / "1.pcd").write_bytes((walls / "1.pcd").read_bytes()[:-30])
     sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or take it out"
     assert_fails(1, sentence, "import-clouds", walls, "-o", out, "--rate", 10)

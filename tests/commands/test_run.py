@@ -149,7 +149,7 @@ def test_an_interrupted_run_leaves_a_partial_result_and_the_old_result(tmp_path:
     process.send_signal(number)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert f"interrupted; what was finished is in {partial}" in errors
+    assert f"interrupted; the finished part is in {partial}" in errors
     assert out.read_text() == "the result of yesterday"
     with open_result(partial) as opened:
         assert opened.summary.stop_reason == "interrupted"

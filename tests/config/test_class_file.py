@@ -1,4 +1,4 @@
-"""Class tables in team files and from files: built in, merged, ignored, Hydra's and Kimera-Semantics'."""
+"""Tests of class tables in team files and class files: built-in, merged, ignored, Hydra and Kimera-Semantics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _parsed(text, folder=Path("/team")):
     return parse_team(ROBOTS + text, name="team.yaml", folder=folder)
 
 
-def _there_and_back(config):
+def _write_and_read(config):
     text = dump_team(config, Path("/team"))
     again = parse_team(text, name="again", folder=Path("/team"))
     assert again == config
@@ -42,13 +42,13 @@ def _there_and_back(config):
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_built_in_tables_go_there_and_back(name):
+def test_built_in_tables_are_written_and_read(name):
     config = _parsed(f"classes: {name}\n")
     assert config.classes.num_classes > 25
-    _there_and_back(config)
+    _write_and_read(config)
 
 
-def test_semantickitti_as_a_team_would_have_it():
+def test_merging_and_ignoring_in_semantickitti():
     config = _parsed(
         "classes: semantickitti\n"
         "merge_classes:\n  vehicle: [car, truck, bus, other-vehicle]\n  ground: [terrain, other-ground]\n"
@@ -61,26 +61,26 @@ def test_semantickitti_as_a_team_would_have_it():
     assert not {"car", "truck", "person", "moving-car", "terrain"} & by_name.keys()
     assert config.classes.ignored_raw_labels == (0, 1, -7, 300, 30, 252)
     assert (config.merge_classes, config.ignore_hits) == ((), ())
-    assert "merge_classes" not in _there_and_back(config)
+    assert "merge_classes" not in _write_and_read(config)
 
 
-def test_a_list_can_be_merged_and_ignored_too():
+def test_merging_and_ignoring_in_a_list():
     config = _parsed(LIST + "merge_classes: {vehicle: [bus, car]}\nignore_hits: road\nignored_raw_labels: [9]\n")
     assert [(c.class_id, c.name, c.raw_labels) for c in config.classes.classes] == [(1, "vehicle", (2, 3, 5))]
     assert config.classes.ignored_raw_labels == (9, 1)
-    _there_and_back(config)
+    _write_and_read(config)
 
 
-def test_without_classes_the_edits_wait_for_those_of_the_logs():
+def test_edits_without_classes_apply_to_the_logs_classes():
     config = _parsed("merge_classes: {vehicle: [bus, car], plant: tree}\nignore_hits: [person]\n")
     assert config.classes is None
     assert (config.merge_classes, config.ignore_hits) == (
         (("vehicle", ("bus", "car")), ("plant", ("tree",))), ("person",),
     )  # fmt: skip
-    _there_and_back(config)
+    _write_and_read(config)
 
 
-def test_colours_in_images_are_the_own_one_unless_given():
+def test_raw_colours_default_to_the_class_colour():
     config = _parsed(
         "classes:\n- {name: a, color: [1, 2, 3]}\n- {name: b}\n- {name: c, color: [7, 7, 7], raw_colors: [[4, 5, 6]]}\n"
         "- {name: d, raw_colors: [[8, 8, 8], [9, 9, 9], [8, 8, 8]]}\nignored_raw_colors: [[0, 0, 1]]\n"
@@ -90,7 +90,7 @@ def test_colours_in_images_are_the_own_one_unless_given():
         (PALETTE[3], ((8, 8, 8), (9, 9, 9))),
     ]  # fmt: skip
     assert config.classes.ignored_raw_colors == ((0, 0, 1),)
-    text = _there_and_back(config)
+    text = _write_and_read(config)
     assert text.count("raw_colors") == 4
     assert SemanticClass(1, "a", (1, 2, 3), ()).raw_colors == ((1, 2, 3),)
 
@@ -98,33 +98,39 @@ def test_colours_in_images_are_the_own_one_unless_given():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("classes: semanticity\n", "'semanticity' is no file and no built-in table .*; did you mean 'semantickitti'"),
+        (
+            "classes: semanticity\n",
+            "'semanticity' is neither a file nor a built-in table .*; did you mean 'semantickitti'",
+        ),
         ("classes: SemanticKITTI\n", "did you mean 'semantickitti'"),
-        ("classes: nyu40\nignored_raw_labels: [5]\n", "raw label 5 means 'chair' and is in ignored_raw_labels"),
+        (
+            "classes: nyu40\nignored_raw_labels: [5]\n",
+            "raw label 5 belongs to 'chair' and is listed in ignored_raw_labels",
+        ),
         ("classes: nyu40\nmerge_classes: [chair, sofa]\n", "merge_classes: expects new names"),
         ("classes: nyu40\nmerge_classes: {seat: []}\n", "'seat' needs at least one class"),
         ("classes: nyu40\nmerge_classes: {seat: {a: b}}\n", "merge_classes: expects a list of class names"),
         ("classes: nyu40\nignore_hits: {person: 1}\n", "ignore_hits: expects a list of class names"),
         ("classes: nyu40\nignore_hits: [persn]\n", "ignore_hits: no class is called 'persn'; did you mean 'person'"),
         ("classes: nyu40\nignore_hit: [person]\n", "ignore_hit: unknown key; did you mean 'ignore_hits'"),
-        (f"classes: {'road ' * 100}\n", "is no file and no built-in table"),
+        (f"classes: {'road ' * 100}\n", "is neither a file nor a built-in table"),
         ("classes: {name: a}\n", "expects a list of classes, .*, or one of semantickitti, cityscapes"),
         ("classes: [{name: a}, {name: b}, {name: a}]\n", "'a' is listed twice"),
         ("classes: [{name: a, color: 5}]\n", "the color of 'a' must be three whole numbers from 0 to 255, got 5"),
         ("classes: [{name: a, color: [1, 2, true]}]\n", "the color of 'a' must be"),
         ("classes: [{name: a, raw_colors: [1, 2, 3]}]\n", "every raw color of 'a' must be three whole numbers"),
-        ("ignored_raw_labels: [5]\n", "ignored_raw_labels: goes with 'classes'"),
-        ("ignored_raw_colors: [[0, 0, 1]]\n", "ignored_raw_colors: goes with 'classes'"),
+        ("ignored_raw_labels: [5]\n", "ignored_raw_labels: needs 'classes'"),
+        ("ignored_raw_colors: [[0, 0, 1]]\n", "ignored_raw_colors: needs 'classes'"),
         ("classes: [{name: a, raw_colors: 7}]\n", "the raw colors of 'a' must be a list"),
         ("classes: [{name: a}]\nignored_raw_colors: [[1, 2]]\n", "every raw color of ignored_raw_colors must be three"),
     ],
 )
-def test_what_a_team_file_cannot_say_is_one_sentence(text, sentence):
+def test_invalid_class_settings_are_reported_in_one_sentence(text, sentence):
     with pytest.raises(ConfigError, match=f"^team.yaml: .*{sentence}"):
         _parsed(text)
 
 
-def test_a_long_list_can_be_merged_to_what_fits():
+def test_a_long_list_can_be_merged_to_the_maximum():
     entries = [{"name": f"c{i}", "raw_labels": [i]} for i in range(260)]
     rest = ", ".join(f"c{i}" for i in range(7))
     text = f"classes: {entries}\n"
@@ -133,14 +139,14 @@ def test_a_long_list_can_be_merged_to_what_fits():
     assert _parsed(text + f"merge_classes: {{rest: [{rest}]}}\n").classes.num_classes == 254
 
 
-# --- files of classes -------------------------------------------------------------------------------------------------
+# --- class files ------------------------------------------------------------------------------------------------------
 
 
 def _run(**fields):
     return RunConfig((RobotConfig("a", (Path("/logs/a.mcap"),)),), **fields)
 
 
-def test_a_file_of_classes_may_be_a_list_or_build_on_a_table(tmp_path):
+def test_a_class_file_is_a_list_or_extends_a_table(tmp_path):
     (tmp_path / "list.yaml").write_text("- {name: a, raw_labels: [4]}\n- {name: b, raw_labels: [3]}\n")
     (tmp_path / "base.yaml").write_text("classes: nyu40\nmerge_classes: {seat: [chair, sofa]}\n")
     (tmp_path / "more.yaml").write_text("classes: base.yaml\nignore_hits: [seat]\n")
@@ -151,7 +157,7 @@ def test_a_file_of_classes_may_be_a_list_or_build_on_a_table(tmp_path):
     assert config == _run(classes=_parsed("classes: more.yaml\n", tmp_path).classes)
 
 
-def test_a_file_without_classes_edits_those_that_are_there(tmp_path):
+def test_a_file_without_classes_edits_the_existing_ones(tmp_path):
     (tmp_path / "edits.yaml").write_text("merge_classes: {seat: [chair, sofa]}\n")
     old = {"merge_classes": (("x", ("y",)),), "ignore_hits": ("z",)}
     waiting = with_classes(_run(**old), str(tmp_path / "edits.yaml"))
@@ -159,28 +165,32 @@ def test_a_file_without_classes_edits_those_that_are_there(tmp_path):
     nyu = with_classes(_run(**old), "nyu40")
     assert (nyu.merge_classes, nyu.ignore_hits) == ((), ())
     assert with_classes(nyu, str(tmp_path / "edits.yaml")).classes.names[4] == "seat"
-    with pytest.raises(ConfigError, match=r"team.yaml: classes: the file 'edits.yaml' holds no classes"):
+    with pytest.raises(ConfigError, match=r"team.yaml: classes: the file 'edits.yaml' has no key 'classes'"):
         _parsed("classes: edits.yaml\n", tmp_path)
 
 
 @pytest.mark.parametrize(
     ("name", "text", "sentence"),
     [
-        ("self.yaml", "classes: self.yaml\n", "self.yaml: classes: the file 'self.yaml' takes its classes from itself"),
+        ("self.yaml", "classes: self.yaml\n", "self.yaml: classes: the file 'self.yaml' refers to itself"),
         ("word.yaml", "road\n", "word.yaml: a class file is a list of classes, or a mapping with 'classes'"),
-        ("team.yaml", "robots: []\n", "team.yaml: the team file holds no classes"),
+        ("team.yaml", "robots: []\n", "team.yaml: the team file has no class settings"),
         ("bad.yaml", "classes: [\n", "bad.yaml: not valid YAML"),
-        ("hydra.yaml", "label_names: [{label: 1, name: a}, {label: 1, name: b}]\n", "hydra.yaml: raw label 1 means"),
-        ("empty.yaml", "label_names: [{label: 1, name: void}]\n", "empty.yaml: classes: no class is left"),
+        (
+            "hydra.yaml",
+            "label_names: [{label: 1, name: a}, {label: 1, name: b}]\n",
+            "hydra.yaml: raw label 1 belongs to",
+        ),
+        ("empty.yaml", "label_names: [{label: 1, name: void}]\n", "empty.yaml: classes: all classes are ignored"),
         ("kimera.csv", "id,name\n", "kimera.csv: a palette begins with"),
         ("binary.csv", "\udcff", "binary.csv: not a class file"),
     ],
 )
-def test_files_that_hold_no_classes_are_one_sentence(tmp_path, name, text, sentence):
+def test_files_without_classes_are_reported_in_one_sentence(tmp_path, name, text, sentence):
     (tmp_path / name).write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(ConfigError, match=sentence):
         with_classes(_run(), str(tmp_path / name))
-    with pytest.raises(ConfigError, match="is no file and no built-in table"):
+    with pytest.raises(ConfigError, match="is neither a file nor a built-in table"):
         with_classes(_run(), str(tmp_path))
 
 
@@ -192,11 +202,11 @@ def test_a_kimera_palette_gives_classes_and_colours(tmp_path):
 
 
 @needs_recordings
-def test_every_hydra_label_space_can_be_read():
+def test_all_hydra_label_spaces_can_be_read():
     files = sorted(HYDRA.glob("*.yaml"))
     assert len(files) == 13
     for path in files:
-        _there_and_back(_parsed(f"classes: {path.name}\n", HYDRA))
+        _write_and_read(_parsed(f"classes: {path.name}\n", HYDRA))
 
 
 @needs_recordings
@@ -212,7 +222,7 @@ def test_every_hydra_label_space_can_be_read():
         ("kitti_360", 28, (0, 1, 2, 3, 4, 5, 23, 24, 25, 26, 27, 28, 30, 31, 32, 33, 43, 45), {"caravan": (29,)}),
     ],
 )
-def test_hydra_label_spaces_mean_what_hydra_means(name, num_classes, ignored, some):
+def test_hydra_label_spaces_have_hydras_meaning(name, num_classes, ignored, some):
     table = with_classes(_run(), str(HYDRA / f"{name}_label_space.yaml")).classes
     assert (table.num_classes, table.ignored_raw_labels) == (num_classes, ignored)
     assert some.items() <= {item.name: item.raw_labels for item in table.classes}.items()
@@ -231,10 +241,10 @@ def test_classes_of_the_logs_are_merged_and_ignored(tmp_path):
     assert config.classes.names == ("both", *rest)
     assert team.classes.classes[0].raw_labels[0] in config.classes.ignored_raw_labels
     assert (config.merge_classes, config.ignore_hits) == ((), ())
-    _there_and_back(config.to_config())
+    _write_and_read(config.to_config())
 
 
-def test_run_takes_classes_from_a_table_or_a_file(tmp_path, capsys):
+def test_the_option_classes_accepts_a_table_or_a_file(tmp_path, capsys):
     first, second, *rest = load_team_file(PAIR / "team.yaml").classes.names
     (tmp_path / "edits.yaml").write_text(f"merge_classes: {{both: [{first}, {second}]}}\n")
     saved = tmp_path / "team.yaml"
@@ -253,6 +263,6 @@ def test_unknown_colours_are_reported_as_colours():
     counts = FrameCounts(unknown_label_pixels={7: 1}, unknown_colors={0x0A0B0C: 1200, 255: 3})
     sentences = list(progress.losses(counts))
     assert sentences == [
-        "1 pixels or points with labels that no class has were ignored: 7",
-        "1,203 pixels or points with colours that no class has were ignored: #0000ff, #0a0b0c",
+        "1 pixels or points with labels without a class were ignored: 7",
+        "1,203 pixels or points with colours without a class were ignored: #0000ff, #0a0b0c",
     ]

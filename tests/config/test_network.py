@@ -1,4 +1,4 @@
-"""The network's, links', packets' and schedule's parameters: what a team file says, and what it cannot say."""
+"""Tests of the parameters of network, links, packets and schedule in team files."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def _parsed(text, robots=ROBOTS):
 
 
 def _robots(**fields):
-    """Three robots, of which the first has some fields."""
+    """Three robots; ``fields`` are set for the first."""
     first = RobotConfig("husky", (FOLDER / "husky.mcap",), **fields)
     return (first, *(RobotConfig(name, (FOLDER / f"{name}.mcap",)) for name in ("jackal", "spot")))
 
 
-# --- there and back ---------------------------------------------------------------------------------------------------
+# --- writing and reading ----------------------------------------------------------------------------------------------
 
 SCHEDULE = (
     ScheduleEntry(0.0, 5.0, groups=(("husky",), ("jackal", "spot"))),
@@ -79,15 +79,14 @@ CONFIGS = {
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_a_team_file_gives_the_configuration_that_it_was_written_from(name):
+def test_a_written_team_file_gives_the_same_configuration(name):
     config = RunConfig(**{"robots": _robots(), **CONFIGS[name]})
     text = dump_team(config, FOLDER)
     assert parse_team(text, name="team.yaml", folder=FOLDER) == config
     assert dump_team(parse_team(text, name="team.yaml", folder=FOLDER), FOLDER) == text
 
 
-def test_every_parameter_of_links_and_packets_goes_there_and_back():
-    """None of the configurations above leaves one out."""
+def test_the_configurations_above_set_every_parameter_of_links_and_packets():
     for section, default in (("link", LinkConfig()), ("packet", PacketConfig()), ("network", NetworkConfig())):
         changed = {
             item.name
@@ -106,7 +105,7 @@ def test_every_parameter_of_links_and_packets_goes_there_and_back():
     assert in_schedule == {item.name for item in dataclasses.fields(ScheduleEntry)}
 
 
-def test_what_a_team_file_means():
+def test_the_meaning_of_a_team_file():
     config = _parsed(
         "one_way: [[husky, jackal]]\n"
         "loss: 0.1\n"
@@ -126,11 +125,11 @@ def test_what_a_team_file_means():
     assert config.link_config("husky", "jackal") == config.link == LinkConfig(loss=0.1)
 
 
-def test_robots_have_periods_of_the_teams_ticks():
+def test_publish_periods_are_multiples_of_a_tick():
     robots = ROBOTS.replace("id: husky,", "id: husky, publish_period: 0.5, publish_phase: 0.25,")
     config = _parsed("publish_period: 0.25\n", robots)
     assert (config.robots[0].publish_period, config.robots[0].publish_phase) == (0.5, 0.25)
-    # 0.3 is no multiple of 0.1 in binary.
+    # 0.3 is not an exact multiple of 0.1 in floating point.
     config = _parsed("publish_period: 0.1\n", ROBOTS.replace("id: husky,", "id: husky, publish_period: 0.3,"))
     assert config.robots[0].publish_period == 0.3
     with pytest.raises(ConfigError, match=r"robot 'husky': publish_period 0.3 s is not a multiple"):
@@ -144,7 +143,7 @@ def test_a_schedule_file_is_a_list_of_entries(tmp_path):
     assert schedule([]) == ()
 
 
-# --- what a team file cannot say --------------------------------------------------------------------------------------
+# --- invalid team files -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -152,9 +151,9 @@ def test_a_schedule_file_is_a_list_of_entries(tmp_path):
     [
         ("links: [{from: husky, to: spot, latancy: 1}]", r"links: latancy: unknown key; did you mean 'latency'\?"),
         ("links: [{from: husky, to: spot, packets: delta}]", "links: packets: unknown key"),
-        ("links: [{from: husky, loss: 0.1}]", "links: every link names 'from' and 'to', or 'between' two robots"),
-        ("links: [{from: husky, between: [husky, spot]}]", "links: every link names 'from' and 'to', or 'between'"),
-        ("links: [{loss: 0.1}]", "links: every link names"), ("links: [husky]", "links: every link names"),
+        ("links: [{from: husky, loss: 0.1}]", "links: every link needs 'from' and 'to', or 'between' for both"),
+        ("links: [{from: husky, between: [husky, spot]}]", "links: every link needs 'from' and 'to', or 'between'"),
+        ("links: [{loss: 0.1}]", "links: every link needs"), ("links: [husky]", "links: every link needs"),
         ("links: {from: husky}", "links: expects a list of links"),
         ("links: [{between: [husky], loss: 0.1}]", r"links: between: expects \[robot, robot\], got \['husky'\]"),
         ("links: [{between: husky, loss: 0.1}]", r"links: between: expects \[robot, robot\], got 'husky'"),
@@ -204,7 +203,7 @@ def test_a_schedule_file_is_a_list_of_entries(tmp_path):
         ("acknowledge: 1", "acknowledge: expects true or false, got 1"), ("loss: .nan", "loss: nan is not a finite"),
     ],
 )  # fmt: skip
-def test_what_a_team_file_cannot_say_is_one_sentence(text, sentence):
+def test_invalid_network_settings_are_reported_in_one_sentence(text, sentence):
     with pytest.raises(ConfigError) as caught:
         _parsed(text + "\n")
     message = str(caught.value)
@@ -234,6 +233,6 @@ def test_probabilities_are_from_0_to_1(name, value):
         ("publish_phase: -1", "publish_phase must not be negative"),
     ],
 )
-def test_a_robots_period_that_is_no_multiple_is_refused(entry, sentence):
+def test_a_period_that_is_not_a_multiple_is_refused(entry, sentence):
     with pytest.raises(ConfigError, match=rf"^team.yaml: robot 'husky': {sentence}"):
         _parsed("", ROBOTS.replace("id: husky,", f"id: husky, {entry},"))

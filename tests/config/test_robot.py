@@ -1,4 +1,4 @@
-"""Robots in a team file: what is taken, what is refused, and that writing one and reading it gives the same."""
+"""Tests of robots in team files: valid and invalid values, writing and reading."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOUD = RobotConfig("b", (Path("/logs/b.mcap"),), cloud_topic="/points", label_f
 
 
 @pytest.mark.parametrize("folder", [None, Path("/logs"), Path("/other")])
-def test_a_team_file_gives_back_every_field(folder):
+def test_every_field_is_written_and_read(folder):
     config = RunConfig(robots=(FULL, CLOUD)).with_parameters({"hide_robots": True, "start": 2.0, "every": 3})
     config = config.with_parameters({"duration": 10.5, "rate_limit": 2.0})
     text = dump_team(config, folder)
@@ -34,8 +34,8 @@ def test_a_team_file_gives_back_every_field(folder):
     assert "pose_times: /elsewhere/times.txt" in text
 
 
-def test_every_field_of_a_robot_is_written():
-    """Whatever is added to a robot has to be in the robots above."""
+def test_the_robots_above_set_every_field():
+    """Fields added to RobotConfig must be set in the robots above."""
     untested = set(RobotConfig.__dataclass_fields__) - {"pose_topic", "label_info_topic"}
     blank = RobotConfig("x", (Path("x"),))
     assert all(
@@ -66,7 +66,7 @@ def test_every_field_of_a_robot_is_written():
         ({"clock_offset": math.inf}, "clock_offset must be finite, not inf"),
     ],
 )
-def test_what_contradicts_itself_is_refused(fields, sentence):
+def test_contradicting_fields_are_refused(fields, sentence):
     with pytest.raises(ConfigError, match=f"^robot 'r': .*{re.escape(sentence)}"):
         RobotConfig("r", (Path("a"),), **fields)
 
@@ -84,7 +84,7 @@ def test_values_of_the_wrong_type_are_refused_by_name(line, sentence):
         parse_team(f"robots:\n- id: r\n  log: a.mcap\n  {line}\n", name="team.yaml", folder=Path("/x"))
 
 
-def test_the_files_of_a_robot_are_its_inputs(tmp_path, monkeypatch):
+def test_the_files_of_a_robot_are_its_logs_and_pose_files(tmp_path, monkeypatch):
     assert FULL.files == (*FULL.logs, FULL.pose_file, FULL.pose_times)
     assert CLOUD.files == CLOUD.logs
     monkeypatch.chdir(tmp_path)

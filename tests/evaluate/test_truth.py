@@ -14,7 +14,9 @@ from octoreplay.config.class_file import class_table
 from octoreplay.errors import InputError
 from octoreplay.evaluate.truth import load_truth
 from octoreplay.mapping.octree import codes_to_keys
-from octoreplay.simulate.world import labelled_cells, make_village, village_classes, write_ground_truth, write_mesh
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import village_classes
+from octoreplay.simulate.world_files import labelled_cells, write_ground_truth, write_mesh
 
 CLASSES = class_table(
     [{"name": "ground", "color": [10, 20, 30], "raw_labels": [7]}, {"name": "tree", "color": [1, 2, 250]}]

@@ -1,4 +1,4 @@
-"""Text files appear when they are whole, and records become JSON that any reader takes."""
+"""Files are written atomically, and JSON of records is valid."""
 
 import json
 import math
@@ -23,7 +23,7 @@ class Outer:
     by_name: dict[str, float]
 
 
-def test_a_file_replaces_the_one_before_it_and_leaves_nothing_else(tmp_path: Path) -> None:
+def test_a_file_replaces_an_existing_one_and_leaves_no_other(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("before", encoding="utf-8")
     write_whole(path, "größer\n")
@@ -31,7 +31,7 @@ def test_a_file_replaces_the_one_before_it_and_leaves_nothing_else(tmp_path: Pat
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_written_is_one_sentence_and_keeps_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_write_is_an_output_error_and_keeps_the_old_file(tmp_path: Path) -> None:
     folder = tmp_path / "table.csv"
     folder.mkdir()
     with pytest.raises(OutputError, match=r"table\.csv: cannot be written: Is a directory"):
@@ -41,7 +41,7 @@ def test_what_cannot_be_written_is_one_sentence_and_keeps_what_was_there(tmp_pat
         write_whole(tmp_path / "none" / "table.csv", "text")
 
 
-def test_records_become_json_without_numbers_that_json_lacks() -> None:
+def test_json_of_records_has_null_for_numbers_that_are_not_finite() -> None:
     text = json_text(Outer((Inner(math.nan, Path("a/b")), Inner(0.1, Path("c"))), {"é": -math.inf, "two": 2.0}))
     assert json.loads(text) == {
         "parts": [{"value": None, "where": "a/b"}, {"value": 0.1, "where": "c"}],
@@ -51,7 +51,7 @@ def test_records_become_json_without_numbers_that_json_lacks() -> None:
     assert text.endswith("}\n")
 
 
-def test_bytes_are_written_as_they_are(tmp_path: Path) -> None:
+def test_bytes_are_written_unchanged(tmp_path: Path) -> None:
     write_whole(tmp_path / "a.png", b"\x89PNG\r\n\xff")
     assert (tmp_path / "a.png").read_bytes() == b"\x89PNG\r\n\xff"
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]

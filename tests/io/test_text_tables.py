@@ -12,7 +12,7 @@ from octoreplay.errors import InputError
 from octoreplay.io.text_tables import floats, rows, seconds_to_ns
 
 
-def test_rows_have_their_place_and_no_comments(tmp_path):
+def test_rows_have_their_line_and_no_comments(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"# head\n1 2,3\r\n\n  \n4,5 ,6 # why\n#7\n8")
     assert list(rows(path)) == [
@@ -20,7 +20,7 @@ def test_rows_have_their_place_and_no_comments(tmp_path):
     ]  # fmt: skip
 
 
-def test_files_that_are_no_text(tmp_path):
+def test_files_that_are_not_text(tmp_path):
     path = tmp_path / "a.txt"
     with pytest.raises(InputError, match=f"^{re.escape(str(path))}: cannot be read: "):
         list(rows(path))
@@ -51,7 +51,7 @@ def test_seconds_in_any_form(text, expected):
 @pytest.mark.parametrize(
     "text", ["", "x", "nan", "-inf", "1e99", "1e999999", "1e99999999", "9" * 5000, "4294967296", "0x10", "sNaN"]
 )
-def test_what_is_no_time_is_refused_with_its_place(text):
+def test_invalid_times_are_refused_with_their_line(text):
     with pytest.raises(InputError, match=r"^a\.txt, line 3: '.*' is not a time in seconds$"):
         seconds_to_ns("a.txt, line 3", text)
 

@@ -162,8 +162,8 @@ def test_receive_team_equals_receive_robot_by_robot(seed, with_threads):
         [(new[j], old[j] if rng.random() < 0.7 else None) for j in range(4) if rng.random() < 0.6] for _ in range(4)
     ]
     alone = [mass.copy() for mass in masses]
-    for mass, heard in zip(alone, arrivals, strict=True):
-        receive(mass, heard, 7)
+    for mass, received in zip(alone, arrivals, strict=True):
+        receive(mass, received, 7)
     with ThreadPoolExecutor(3) as threads:
         receive_team(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
     for mass, other in zip(masses, alone, strict=True):
@@ -512,7 +512,7 @@ def test_no_drift_over_a_day_of_ticks():
                 num_wraps = int(abs(twin.total).min() // MODULUS)
             octrees = None
     assert num_wraps > 1000
-    under_way = [twins[i - 1].total - twins[i].heard[i - 1][0] for i in range(3)]
+    under_way = [twins[i - 1].total - twins[i].last_received[i - 1][0] for i in range(3)]
     assert (sum(twin.mass for twin in twins) + sum(under_way) == quantised(evidence).sum(axis=0)).all()
     mean = evidence.mean(axis=0, dtype=np.float64)
     errors = [abs(twin.log_odds - mean).max() for twin in twins if twin.weight >= LEAST_WEIGHT]

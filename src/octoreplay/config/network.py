@@ -16,7 +16,7 @@ WEIGHTS = ("metropolis", "degree", "max-degree", "given")
 
 @dataclass(frozen=True)
 class ScheduleEntry:
-    """What is up or down from ``start`` up to, but not with, ``end`` [s since the run's start].
+    """Entry of a schedule: robots and links that are down or up in [start, end) [s since the run's start].
 
     ``groups`` cut all links between robots of different groups; ``links_down`` and ``links_up`` are links, both
     directions; ``robots_off`` neither map nor talk, and ``forget`` what they knew when they come back;
@@ -43,7 +43,7 @@ class ScheduleEntry:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The simulated communication graph: who can hear whom, and when."""
+    """Configuration of the simulated communication graph."""
 
     topology: str = parameter(
         "complete",
@@ -93,7 +93,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """What happens to a packet on a link (one direction): delay, loss, rate and queue.
+    """Configuration of one direction of a link: delay, loss, rate and queue.
 
     Losses follow Gilbert and Elliott's two states: a packet is lost with ``loss`` in the good state and ``burst_loss``
     in the bad one; before every packet the good state turns bad with ``burst_start`` and the bad one good with
@@ -128,18 +128,18 @@ class LinkConfig:
 
     @property
     def is_random(self) -> bool:
-        """True where chance decides what becomes of a packet."""
+        """True where delay, loss or damage is random."""
         return any((self.jitter, self.loss, self.burst_start, self.corruption))
 
     @property
     def mean_loss(self) -> float:
-        """Share of the packets that do not arrive whole, over a long time and without rate limit."""
+        """Long-term share of the packets that are lost or damaged, without a rate limit."""
         in_burst = self.burst_start / (self.burst_start + self.burst_end)
         return (1.0 - in_burst) * self._missing(self.loss) + in_burst * self._missing(self.burst_loss)
 
     @property
     def repeated_loss(self) -> float:
-        """The factor by which one more packet lost in a row is rarer than one less, in long rows.
+        """Ratio of the probabilities of n + 1 and of n lost packets in a row, for large n.
 
         The largest eigenvalue of the two states' transitions, each times the loss in the state that it leads to.
         """
@@ -151,5 +151,5 @@ class LinkConfig:
         return (stay_good + stay_bad + math.sqrt((stay_good - stay_bad) ** 2 + 4.0 * change)) / 2.0
 
     def _missing(self, loss: float) -> float:
-        """Share of the packets that are lost or damaged."""
+        """Share of lost or damaged packets, with the loss of one state."""
         return 1.0 - (1.0 - loss) * (1.0 - self.corruption)

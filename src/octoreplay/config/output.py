@@ -9,7 +9,7 @@ from octoreplay.config.fields import check_ranges, parameter
 
 @dataclass(frozen=True)
 class OutputConfig:
-    """What the result holds."""
+    """Configuration of the result's contents."""
 
     state_every: float = parameter(
         5.0, "period between stored maps of each robot; the last map is stored too [s]", above=0.0

@@ -10,7 +10,7 @@ from octoreplay.errors import ConfigError
 
 @dataclass(frozen=True)
 class PacketConfig:
-    """What robots send: whole maps or changes, how exactly, and how much of it."""
+    """Configuration of packets: full maps or deltas, number format and budget."""
 
     packets: str = parameter(
         "full", "packets hold the full map, or the delta to what the receiver has", choices=("full", "delta")
@@ -56,5 +56,5 @@ class PacketConfig:
 
     @property
     def is_exact(self) -> bool:
-        """True when receivers have just what was published."""
+        """True when packets hold the map's values unchanged."""
         return self.content == "float32" and self.top_classes is None and self.budget is None

@@ -11,7 +11,7 @@ from octoreplay.errors import ConfigError
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """The inverse sensor model: log-odds increments, clamping and ranges."""
+    """Configuration of the inverse sensor model: log-odds increments, clamping and ranges."""
 
     hit: float = parameter(1.0, "log-odds added to the observed class of the cell where a ray ends (psi)", above=0.0)
     miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray crosses (phi)", maximum=0.0)
@@ -40,13 +40,13 @@ class SensorConfig:
 
     @property
     def clamp(self) -> tuple[float, float]:
-        """The least and the largest log-odds of a class."""
+        """Smallest and largest log-odds of a class."""
         return self.clamp_min, self.clamp_max
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """The map's geometry and prior."""
+    """Configuration of the map: geometry, prior and pruning."""
 
     resolution: float = parameter(0.2, "edge length of the finest cell [m]", above=0.0)
     bounds: tuple[float, ...] = parameter(
@@ -73,7 +73,7 @@ class MapConfig:
 
     @property
     def box(self) -> tuple[float, float, float, float, float, float]:
-        """The mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres; infinite where it is not limited."""
+        """Mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres in the team's frame; infinite without bounds."""
         infinity = math.inf
         if len(self.bounds) == 2:
             return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
@@ -82,7 +82,7 @@ class MapConfig:
         return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
 
     def prior(self, num_classes: int) -> float:
-        """h_0: the log-odds of each occupied class in an unobserved cell."""
+        """h_0, the log-odds of each occupied class in an unobserved cell."""
         if self.prob_free is None:
             return 0.0
         return math.log((1.0 - self.prob_free) / num_classes / self.prob_free)

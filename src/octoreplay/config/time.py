@@ -9,7 +9,7 @@ from octoreplay.config.fields import check_ranges, parameter
 
 @dataclass(frozen=True)
 class TimeConfig:
-    """How stamps are read and streams are paired."""
+    """Configuration of the clock, of pairing, and of the part of the logs that is replayed."""
 
     clock: str = parameter("header", "source of stamps: message header, or log time", choices=("header", "log"))
     reorder_window: float = parameter(1.0, "largest delay of out-of-order messages [s]", minimum=0.0, maximum=1e6)

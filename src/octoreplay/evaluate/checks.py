@@ -74,7 +74,7 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class _Subject:
+class _CheckedResult:
     """Result under check, and its evaluation against the truth if a limit needs one."""
 
     result: Result
@@ -115,7 +115,7 @@ class Quantity:
     name: str
     bounds: tuple[str, ...]
     meaning: str
-    measure: Callable[[_Subject], Iterable[Measurement]]
+    measure: Callable[[_CheckedResult], Iterable[Measurement]]
     is_share: bool = False
     needs_truth: bool = False
     absent: str = "no value to measure"
@@ -155,8 +155,8 @@ def check_result(
 
     _check_limits(limits, settled, truth is not None)
     with open_result(path) as result:
-        subject = _Subject(result, None if truth is None else _evaluation(result.path, Path(truth)))
-        rows = [*_flags(subject, settled), *(_row(name, limits[name], subject) for name in LIMITS if name in limits)]
+        checked = _CheckedResult(result, None if truth is None else _evaluation(result.path, Path(truth)))
+        rows = [*_flags(checked, settled), *(_row(name, limits[name], checked) for name in LIMITS if name in limits)]
     return tuple(sorted(rows, key=lambda row: row.passed))
 
 
@@ -199,22 +199,22 @@ def _evaluation(path: Path, truth: Path) -> Evaluation:
 _COMPLETE, _SETTLED = "complete", "settled"
 
 
-def _flags(subject: _Subject, settled: bool) -> Iterator[CheckRow]:
+def _flags(checked: _CheckedResult, settled: bool) -> Iterator[CheckRow]:
     """Yield the rows without a limit: an interrupted run, and maps at rest at the end."""
-    reason = subject.summary.stop_reason
-    if not subject.result.is_complete:
+    reason = checked.summary.stop_reason
+    if not checked.result.is_complete:
         detail = f"the run was interrupted ({reason}); replay the logs again"
-        yield CheckRow(_COMPLETE, 1.0, 0.0, None, None, subject.end, passed=False, detail=detail)
+        yield CheckRow(_COMPLETE, 1.0, 0.0, None, None, checked.end, passed=False, detail=detail)
     if settled:
         has_settled = reason == CONVERGED
         detail = "" if has_settled else f"stopped: {reason}"
-        yield CheckRow(_SETTLED, 1.0, float(has_settled), None, None, subject.end, passed=has_settled, detail=detail)
+        yield CheckRow(_SETTLED, 1.0, float(has_settled), None, None, checked.end, passed=has_settled, detail=detail)
 
 
-def _row(name: str, limit: float, subject: _Subject) -> CheckRow:
+def _row(name: str, limit: float, checked: _CheckedResult) -> CheckRow:
     """Compare one limit with the worst value of its quantity."""
     is_upper = name.startswith("max_")
-    worst = _worst(LIMITS[name].measure(subject), is_upper)
+    worst = _worst(LIMITS[name].measure(checked), is_upper)
     passed = worst.value <= limit if is_upper else worst.value >= limit
     detail = LIMITS[name].absent if math.isnan(worst.value) else ""
     return CheckRow(name, float(limit), worst.value, worst.robot, worst.link, worst.seconds, passed, detail)
@@ -230,38 +230,38 @@ def _worst(found: Iterable[Measurement], is_upper: bool) -> Measurement:
     )
 
 
-def _of_team(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
+def _team_value(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a field of TickMetrics in the last tick."""
-    return lambda subject: [Measurement(getattr(subject.summary.last, name), seconds=subject.end)]
+    return lambda checked: [Measurement(getattr(checked.summary.last, name), seconds=checked.end)]
 
 
-def _of_robots(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
+def _robot_values(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a field of RobotMetrics in the last tick: of the active robots, or of all if none is."""
 
-    def measure(subject: _Subject) -> Iterable[Measurement]:
-        robots = subject.summary.last.counted_robots
-        return [Measurement(float(getattr(robot, name)), robot.robot_id, seconds=subject.end) for robot in robots]
+    def measure(checked: _CheckedResult) -> Iterable[Measurement]:
+        robots = checked.summary.last.counted_robots
+        return [Measurement(float(getattr(robot, name)), robot.robot_id, seconds=checked.end) for robot in robots]
 
     return measure
 
 
-def _of_any_tick(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
+def _robot_values_of_all_ticks(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a field of RobotMetrics in every tick."""
 
-    def measure(subject: _Subject) -> Iterable[Measurement]:
-        for tick in subject.result.metrics:
-            seconds = subject.result.seconds(tick.stamp_ns)
+    def measure(checked: _CheckedResult) -> Iterable[Measurement]:
+        for tick in checked.result.metrics:
+            seconds = checked.result.seconds(tick.stamp_ns)
             for robot in tick.robots:
                 yield Measurement(float(getattr(robot, name)), robot.robot_id, seconds=seconds)
 
     return measure
 
 
-def _sent_bytes_per_second(subject: _Subject) -> Iterable[Measurement]:
+def _sent_bytes_per_second(checked: _CheckedResult) -> Iterable[Measurement]:
     """Bytes that each robot sent before settling, divided by the length of the logs."""
-    duration = subject.summary.log_seconds
+    duration = checked.summary.log_seconds
     sent: dict[str, int] = {}
-    for robot in _robots_in_logs(subject.result.metrics):
+    for robot in _robots_in_logs(checked.result.metrics):
         sent[robot.robot_id] = sent.get(robot.robot_id, 0) + robot.sent_bytes
     return [Measurement(num_bytes / duration if duration > 0 else math.nan, name) for name, num_bytes in sent.items()]
 
@@ -273,34 +273,35 @@ def _robots_in_logs(metrics: Iterable[TickMetrics]) -> Iterator[RobotMetrics]:
             yield from tick.robots
 
 
-def _delivered_share(subject: _Subject) -> Iterable[Measurement]:
+def _delivered_share(checked: _CheckedResult) -> Iterable[Measurement]:
     """Share of delivered packets of each link that was given packets."""
     return [
         Measurement(link.num_delivered / link.num_sent, link=f"{link.sender} -> {link.receiver}")
-        for link in subject.summary.links
+        for link in checked.summary.links
         if link.num_sent
     ]
 
 
-def _ticks_to_consensus(subject: _Subject) -> Iterable[Measurement]:
-    return [Measurement(ticks_to_consensus(subject.result.metrics))]
+def _ticks_to_consensus(checked: _CheckedResult) -> Iterable[Measurement]:
+    """Settling ticks until consensus."""
+    return [Measurement(ticks_to_consensus(checked.result.metrics))]
 
 
-def _frames_lost_share(subject: _Subject) -> Iterable[Measurement]:
+def _frames_lost_share(checked: _CheckedResult) -> Iterable[Measurement]:
     """Share of each robot's frames that was not mapped."""
-    for robot_id, counts in subject.summary.frame_counts.items():
+    for robot_id, counts in checked.summary.frame_counts.items():
         num_frames = counts.used + counts.skipped
         is_known = num_frames > 0 and not counts.truncated_files
         yield Measurement(counts.skipped / num_frames if is_known else math.nan, robot_id)
 
 
-def _of_truth(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
+def _truth_scores(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a score of each robot's last map against the truth."""
 
-    def measure(subject: _Subject) -> Iterable[Measurement]:
-        if subject.evaluation is None:
+    def measure(checked: _CheckedResult) -> Iterable[Measurement]:
+        if checked.evaluation is None:
             return []
-        final = subject.evaluation.final
+        final = checked.evaluation.final
         return [Measurement(scores.score(name), scores.robot_id, seconds=final.seconds) for scores in final.robots]
 
     return measure
@@ -308,25 +309,25 @@ def _of_truth(name: str) -> Callable[[_Subject], Iterable[Measurement]]:
 
 QUANTITIES = (
     Quantity("label_disagreement", ("max",), "share of known cells with different labels at the end",
-             _of_team("label_disagreement"), is_share=True),
-    Quantity("total_distance", ("max",), "disagreement over the links at the end", _of_team("total_distance")),
+             _team_value("label_disagreement"), is_share=True),
+    Quantity("total_distance", ("max",), "disagreement over the links at the end", _team_value("total_distance")),
     Quantity("total_distance_all", ("max",), "disagreement over all pairs of robots at the end",
-             _of_team("total_distance_all")),
+             _team_value("total_distance_all")),
     Quantity("ticks_to_consensus", ("max",),
              "settling ticks until the share of known cells with different labels stays below 0.1 %",
              _ticks_to_consensus, absent="the labels did not reach consensus"),
     Quantity("agreement", ("min",), "share of known cells with the centralised map's label, worst robot at the end",
-             _of_robots("agreement"), is_share=True),
+             _robot_values("agreement"), is_share=True),
     Quantity("agreement_occupied", ("min",), "the same over the cells that the centralised map calls occupied",
-             _of_robots("agreement_occupied"), is_share=True),
+             _robot_values("agreement_occupied"), is_share=True),
     Quantity("entropy_bits", ("max",), "mean entropy of a known cell [bits], worst robot at the end",
-             _of_robots("entropy_bits")),
+             _robot_values("entropy_bits")),
     Quantity("num_leaves", ("max", "min"), "leaves of the largest (max) or the smallest (min) map at the end",
-             _of_robots("num_leaves")),
+             _robot_values("num_leaves")),
     Quantity("memory_bytes", ("max",), "memory of a robot's evidence and map in any tick",
-             _of_any_tick("memory_bytes")),
+             _robot_values_of_all_ticks("memory_bytes")),
     Quantity("packet_bytes", ("max",), "size of a robot's packet in any tick, mean over its receivers",
-             _of_any_tick("packet_bytes")),
+             _robot_values_of_all_ticks("packet_bytes")),
     Quantity("sent_bytes_per_second", ("max",), "bytes per second over the length of the logs, robot that sends most",
              _sent_bytes_per_second),
     Quantity("delivered_share", ("min",), "share of delivered packets over the run, worst link",
@@ -334,13 +335,13 @@ QUANTITIES = (
     Quantity("frames_lost_share", ("max",), "share of frames that could not be mapped, worst robot",
              _frames_lost_share, is_share=True, absent="there are no frames, or a log is truncated or damaged"),
     Quantity("mean_iou", ("min",), "mean intersection over union of the classes, worst robot; needs --truth",
-             _of_truth("mean_iou"), is_share=True, needs_truth=True),
+             _truth_scores("mean_iou"), is_share=True, needs_truth=True),
     Quantity("coverage", ("min",), "share of the observed surface in the map, worst robot; needs --truth",
-             _of_truth("coverage"), is_share=True, needs_truth=True),
+             _truth_scores("coverage"), is_share=True, needs_truth=True),
     Quantity("calibration_error", ("max",), "expected calibration error, worst robot; needs --truth",
-             _of_truth("calibration_error"), is_share=True, needs_truth=True),
+             _truth_scores("calibration_error"), is_share=True, needs_truth=True),
     Quantity("team_calibration_error", ("max",), "the same of the team posterior h_0 + N (h - h_0); needs --truth",
-             _of_truth("team_calibration_error"), is_share=True, needs_truth=True),
+             _truth_scores("team_calibration_error"), is_share=True, needs_truth=True),
 )  # fmt: skip
 """All quantities that limits can be set on."""
 

@@ -178,7 +178,7 @@ def compare_results(
     with ExitStack() as stack:
         result_a, result_b = (stack.enter_context(open_result(path)) for path in (a, b))
         _check_comparable(result_a, result_b)
-        names_a, names_b = (_chosen(result, robot) for result in (result_a, result_b))
+        names_a, names_b = (_map_names(result, robot) for result in (result_a, result_b))
         if not names_a and not names_b:
             raise InputError(f"{a}, {b}: neither has a map of robot '{robot}'; robots: {', '.join(result_a.robots)}")
         maps = tuple(_map_difference(result_a, result_b, name, at, tolerance) for name in names_a if name in names_b)
@@ -242,13 +242,13 @@ def _differences(a: LeafSpans, b: LeafSpans, intervals: MortonIntervals, prior_d
     for values_a, values_b in zip(a.deviations.T, b.deviations.T, strict=True):
         # Deviations from the prior are compared, since float32 sums with the prior would lose small differences.
         difference = np.abs(
-            _taken(values_a, intervals.leaves_a) - _taken(values_b, intervals.leaves_b) + prior_difference
+            _values_in(values_a, intervals.leaves_a) - _values_in(values_b, intervals.leaves_b) + prior_difference
         )
         np.maximum(largest, np.where(np.isnan(difference), np.inf, difference), out=largest)
     return largest
 
 
-def _taken(values: Any, leaves: Int64Array) -> Float64Array:
+def _values_in(values: Any, leaves: Int64Array) -> Float64Array:
     """Deviations (S,) of a class in the leaves (S,); 0, that of the prior, without a leaf."""
     taken = np.zeros(leaves.size)
     taken[leaves >= 0] = values[leaves[leaves >= 0]]
@@ -303,7 +303,7 @@ def _check_comparable(a: Result, b: Result) -> None:
             )
 
 
-def _chosen(result: Result, robot: str | None) -> tuple[str, ...]:
+def _map_names(result: Result, robot: str | None) -> tuple[str, ...]:
     """Names of a result's maps to compare: of the robots, and the centralised one if it is stored."""
     central = (CENTRAL,) if result.stored_ticks(CENTRAL) else ()
     return tuple(name for name in (*result.robots, *central) if robot in (None, name))

@@ -1,4 +1,4 @@
-"""Files that appear when they are whole: any text or picture, and records as JSON."""
+"""Atomic writing of text and binary files, and conversion of records to JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from octoreplay.errors import OutputError
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file, text in UTF-8, beside its own name and rename it when it is complete. Raises OutputError."""
+    """Write a file (text in UTF-8) under a temporary name, then rename it. Raises OutputError."""
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -27,12 +27,12 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def json_text(content: Any) -> str:
-    """Records (dataclasses), mappings and sequences as JSON, keys in their order; null for NaN and infinities."""
+    """Return dataclasses, mappings and sequences as JSON text; keys keep their order, NaN and infinities are null."""
     return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _plain(value: Any) -> Any:
-    """A value that JSON has."""
+    """Return a value in types that JSON supports."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, Mapping):

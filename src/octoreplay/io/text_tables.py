@@ -1,4 +1,4 @@
-"""Text tables: words, numbers, times and matrices, with the file and line in every error."""
+"""Reading of text tables: words, numbers, times and matrices; errors name file and line."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _MAX_SECONDS = 1 << 32
 
 
 def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """The rows of a text table as words, with 'file line N' for messages; comments and empty lines are left out.
+    """Yield ('FILE line N', words) for each row of a text table; comments (#) and empty lines are skipped.
 
-    Raises InputError where the file cannot be read or is no text.
+    Words are separated by spaces or commas. Raises InputError where the file cannot be read or is not text.
     """
     for number, line in enumerate(_read_text(path).splitlines(), start=1):
         fields = line.split("#", 1)[0].replace(",", " ").split()
@@ -35,7 +35,7 @@ def _read_text(path: Path) -> str:
 
 
 def floats(where: str, fields: list[str]) -> list[float]:
-    """Numbers from words. Raises InputError, begun by ``where``."""
+    """Convert words to numbers. Raises InputError, which begins with ``where``."""
     try:
         return [float(field) for field in fields]
     except ValueError:
@@ -43,19 +43,19 @@ def floats(where: str, fields: list[str]) -> list[float]:
 
 
 def seconds_to_ns(where: str, text: str) -> int:
-    """Integer nanoseconds of a decimal number of seconds, without going through a float. Raises InputError."""
+    """Convert a decimal number of seconds to integer nanoseconds without rounding to float. Raises InputError."""
     try:
         seconds = Decimal(text)
     except InvalidOperation:
         seconds = Decimal("nan")
-    # Checked before it is multiplied: an exponent may have millions.
+    # Checked before the multiplication: a number like 1e999999 would have millions of digits.
     if not seconds.is_finite() or seconds.copy_abs() >= _MAX_SECONDS:
         raise InputError(f"{where}: '{text}' is not a time in seconds")
     return int((seconds * 1_000_000_000).to_integral_value())
 
 
 def read_matrix(path: Path, shapes: tuple[int, ...]) -> Float64Array:
-    """A square matrix of one of these sizes, (n, n) float64, from a text file. Raises InputError."""
+    """Read a square matrix from a text file, (n, n) float64 with n one of ``shapes``. Raises InputError."""
     values = [value for where, fields in rows(path) for value in floats(where, fields)]
     for n in shapes:
         if len(values) == n * n:

@@ -58,7 +58,7 @@ class MapComparer:
         since: int,
         threads: Executor | None = None,
     ) -> MapComparison:
-        """Return the comparison; bricks of which all revisions are below ``since`` are not compared again.
+        """Return the comparison; bricks with all revisions below ``since`` are not compared again.
 
         ``links`` are robot indices, each linked pair once. The result does not depend on ``threads``.
         """

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
@@ -35,7 +35,8 @@ class TickMeasurer:
     ``oracle`` is the centralised map: the sum of the evidence of all robots, evidence from before restarts included.
     """
 
-    def __init__(self, config: RunConfig, num_classes: int, threads: Executor) -> None:
+    def __init__(self, config: ResolvedRun, threads: Executor) -> None:
+        num_classes = config.classes.num_classes
         self.oracle = SemanticOctree(config.map.resolution, num_classes)
         self._config = config
         self._threads = threads

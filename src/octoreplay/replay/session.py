@@ -35,7 +35,7 @@ class Session:
     Parameters
     ----------
     config : ResolvedRun
-        Resolved configuration.
+        Configuration of the run.
     sources : sequence of FrameSource
         Frames of each robot, in the order of ``config.robots``.
     threads : Executor
@@ -79,9 +79,9 @@ class Session:
         self._bodies = bodies
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
         self._packet_codec = PacketCodec(config.packet)
-        self.team = make_team(config, config.classes.num_classes, self._packet_codec)
+        self.team = make_team(config, self._packet_codec)
         self._links: Links[Content] = Links(config)
-        self._measurer = TickMeasurer(config, config.classes.num_classes, threads)
+        self._measurer = TickMeasurer(config, threads)
         self._period_ns = round(config.network.publish_period * 1e9)
         self._graph = self._network.at(0.0, [False] * len(robot_ids), self.team.positions())
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import LinkConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
-from octoreplay.config.run import RunConfig
 from octoreplay.records import CONVERGED
 from octoreplay.replay.network.graph import CommunicationGraph, step_size
 
@@ -38,7 +38,7 @@ class Settling:
     ``longest_transmission`` is the longest time that a packet kept a link busy [s].
     """
 
-    def __init__(self, graph: CommunicationGraph, config: RunConfig, longest_transmission: float) -> None:
+    def __init__(self, graph: CommunicationGraph, config: ResolvedRun, longest_transmission: float) -> None:
         self.stop_reason = SETTLE_MAX
         self._consensus = config.consensus
         self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
@@ -58,7 +58,7 @@ class Settling:
         self._num_quiet = self._num_quiet + 1 if max_change < self._consensus.settle_tolerance else 0
 
 
-def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
+def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
     """Number of ticks without any change after which a team has settled: 1 without losses and delays.
 
     A link on which every packet was lost in all of these ticks has probability QUIET_PROB. ``transmission`` is the
@@ -71,7 +71,7 @@ def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig, transmission: 
     return num_losses * slower + _delay(links, config, 2.0 * transmission)
 
 
-def num_settle_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
+def num_settle_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
     """Largest number of settling ticks, with each weight reduced to its link's share of packets that arrive."""
     consensus = config.consensus
     if not consensus.traits.has_step_size:
@@ -109,7 +109,7 @@ def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsi
     return consensus.settle + math.ceil(12.0 / -math.log10(rate))
 
 
-def _link_configs(graph: CommunicationGraph, config: RunConfig) -> dict[tuple[int, int], LinkConfig]:
+def _link_configs(graph: CommunicationGraph, config: ResolvedRun) -> dict[tuple[int, int], LinkConfig]:
     """Link configuration of each directed link."""
     ids = graph.robot_ids
     return {(a, b): config.link_config(ids[a], ids[b]) for a, b in graph.links}
@@ -120,26 +120,26 @@ def _num_losses(loss: float) -> int:
     return 1 if loss <= 0.0 else max(1, math.ceil(math.log(QUIET_PROB) / math.log(loss)))
 
 
-def _slowest_period(config: RunConfig) -> int:
+def _slowest_period(config: ResolvedRun) -> int:
     """Ticks between two maps of the robot with the longest publish period."""
     period = config.network.publish_period
     return max(round((robot.publish_period or period) / period) for robot in config.robots)
 
 
-def _repeats(config: RunConfig, links: Sequence[LinkConfig]) -> int:
+def _repeats(config: ResolvedRun, links: Sequence[LinkConfig]) -> int:
     """Number of packets until one makes up for a lost packet: the next one, or the next key frame."""
     packet = config.packet
     waits = packet.packets == "delta" and not packet.acknowledge and any(link.mean_loss > 0.0 for link in links)
     return packet.key_frame_every if waits else 1
 
 
-def _sources_in_turn(config: RunConfig) -> int:
+def _sources_in_turn(config: ResolvedRun) -> int:
     """Number of ticks in which each robot's evidence is first in a budget once; 1 where evidence does not share one."""
     takes_turns = config.consensus.traits.exchanges is Exchanged.EVIDENCE and config.packet.budget is not None
     return len(config.robots) if takes_turns else 1
 
 
-def _delay(links: Sequence[LinkConfig], config: RunConfig, waiting: float) -> int:
+def _delay(links: Sequence[LinkConfig], config: ResolvedRun, waiting: float) -> int:
     """Largest delay of a packet in ticks, with ``waiting`` seconds in queues."""
     delays = np.array([link.latency + link.jitter for link in links])
     return math.ceil((float(delays.max(initial=0.0)) + waiting) / config.network.publish_period)

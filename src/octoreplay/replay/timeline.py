@@ -1,4 +1,4 @@
-"""The frames of a team on one clock: every robot's stream, read as it is asked for."""
+"""Frames of a team on the shared clock, read lazily."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from octoreplay.records import Frame
 
 
 class FrameSource(Protocol):
-    """A robot's frames in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
+    """Frames of one robot in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
 
     def frames(self) -> Iterator[Frame]:
-        """The frames from the beginning."""
+        """Iterate over the frames from the beginning."""
 
 
 class Bodies(Protocol):
-    """Where the robots' bodies are (``io.robots.team_bodies.TeamBodies``)."""
+    """Boxes of the robots' bodies over time (``io.robots.team_bodies.TeamBodies``)."""
 
     def advance(self, start_ns: int, end_ns: int) -> None:
-        """Make the boxes between two stamps known."""
+        """Read the boxes between two stamps."""
 
     def add_to(self, index: int, frame: Frame) -> Frame:
         """Return a robot's frame with the boxes of all other robots at its stamp added."""
 
 
 class Timeline:
-    """Gives robots' frames up to a common time; holds one frame of each robot ahead.
+    """Frames of all robots up to a common time. It holds one frame of each robot ahead.
 
-    Different robots' frames may be taken in parallel threads.
+    Frames of different robots may be taken in parallel threads.
     """
 
     def __init__(self, logs: Sequence[FrameSource]) -> None:
@@ -37,16 +37,16 @@ class Timeline:
         self._last_ns: list[int | None] = [None] * len(self._streams)
         stamps = [frame.stamp_ns for frame in self._next if frame is not None]
         self.first_stamp_ns = min(stamps, default=None)
-        """Stamp of the team's first frame; None where no robot has one."""
+        """Stamp of the team's first frame; None without frames."""
 
     @property
     def exhausted(self) -> bool:
-        """True when every frame of every robot has been given."""
+        """True when all frames of all robots have been taken."""
         return all(frame is None for frame in self._next)
 
     @property
     def next_stamp_ns(self) -> int | None:
-        """Stamp of the earliest frame that has not been given; None when every frame has."""
+        """Stamp of the earliest frame that has not been taken; None at the end."""
         return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
 
     def active(self, leave_ns: int | None) -> list[bool]:
@@ -61,7 +61,7 @@ class Timeline:
         ]
 
     def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
-        """A robot's frames not given yet with stamps below ``stamp_ns``."""
+        """Remaining frames of a robot with stamps below ``stamp_ns``."""
         while (frame := self._next[robot_index]) is not None and frame.stamp_ns < stamp_ns:
             self._last_ns[robot_index] = frame.stamp_ns
             self._next[robot_index] = next(self._streams[robot_index], None)

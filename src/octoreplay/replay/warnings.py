@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
-from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.robot_log import RobotLog
 
 
-def rule_warnings(config: RunConfig, is_symmetric: bool) -> tuple[str, ...]:
+def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
     """Sentences on the rule and the faults of this network that it does not tolerate.
 
     ``is_symmetric`` says whether every link of all graphs carried both ways with the same weight.

@@ -114,7 +114,7 @@ def _times_table(evaluation: Evaluation) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     if evaluation.truth is not None:
         table.add_column("central:\nmean IoU", justify="right", no_wrap=True)
-    for tick in _chosen(evaluation.ticks):
+    for tick in _shown_ticks(evaluation.ticks):
         shares = (tick.label_disagreement, tick.mean("agreement"), tick.mean("agreement_occupied"))
         ratios = [tick.mean(name) for name in list(columns.values())[2:]]
         if evaluation.truth is not None:
@@ -123,7 +123,7 @@ def _times_table(evaluation: Evaluation) -> Table:
     return table
 
 
-def _chosen(ticks: Sequence[EvaluatedTick]) -> list[EvaluatedTick]:
+def _shown_ticks(ticks: Sequence[EvaluatedTick]) -> list[EvaluatedTick]:
     """At most MAX_TIMES ticks, evenly over the run, including the last one."""
     count = min(MAX_TIMES, len(ticks))
     return [ticks[-1 - (len(ticks) - 1) * index // max(count - 1, 1)] for index in reversed(range(count))]

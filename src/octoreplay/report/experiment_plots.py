@@ -79,6 +79,7 @@ def _rules(found: Tables) -> dict[str, Figure]:
 
 
 def _steps(found: Tables) -> dict[str, Figure]:
+    """Step sizes against each other, and the bound of epsilon."""
     return {"steps.png": _trade_off(found["steps"]), "bound.png": _bound(found["bound"])}
 
 

@@ -93,6 +93,7 @@ def variant(row: Row) -> str:
 
 
 def _rules(found: Tables) -> Iterator[str]:
+    """Yield the tables of the experiment ``rules``, one per graph."""
     for (topology,), rows in groups(found["rules"], "topology").items():
         yield f"**{topology}**\n"
         columns = (
@@ -131,10 +132,12 @@ def with_summed_evidence(rows: Sequence[Row]) -> list[Row]:
 
 
 def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
+    """Rows grouped by rule, evidence and gamma."""
     return list(groups(rows, "rule", "evidence", "gamma", "gamma_power").values())
 
 
 def _steps(found: Tables) -> Iterator[str]:
+    """Yield the table of the experiment ``steps``."""
     columns = (
         Column("epsilon / bound", _share("epsilon_share", 2)),
         Column("factor of Φ per tick", _share("contraction", 4)),
@@ -145,6 +148,7 @@ def _steps(found: Tables) -> Iterator[str]:
 
 
 def _scale(found: Tables) -> Iterator[str]:
+    """Yield the tables of the experiment ``scale``."""
     columns = (
         Column("real-time factor", _number("realtime_factor")),
         Column("peak memory", _megabytes("peak_rss_bytes")),
@@ -161,6 +165,7 @@ def _scale(found: Tables) -> Iterator[str]:
 
 
 def _noise(found: Tables) -> Iterator[str]:
+    """Yield the tables of the experiment ``noise``, one per kind of noise."""
     columns = (
         Column("mean IoU", _share("mean_iou", 3)),
         Column("mean IoU of known cells", _share("mean_iou_known", 3)),
@@ -177,6 +182,7 @@ def _noise(found: Tables) -> Iterator[str]:
 
 
 def _choose(found: Tables) -> Iterator[str]:
+    """Yield the tables of the experiment ``choose``, one per situation."""
     columns = (
         Column("agreement over the logs, all / occupied", _pair("agreement_mean", "agreement_occupied_mean")),
         Column("agreement, settled", _pair("agreement", "agreement_occupied")),
@@ -208,26 +214,32 @@ def _named(value: Any) -> str:
 
 
 def _number(name: str) -> Callable[[Sequence[Row]], str]:
+    """Text of the mean of a column."""
     return lambda rows: _short(mean(rows, name))
 
 
 def _share(name: str, digits: int) -> Callable[[Sequence[Row]], str]:
+    """Text of the mean of a column with fixed digits."""
     return lambda rows: _fixed(mean(rows, name), digits)
 
 
 def _percent(name: str) -> Callable[[Sequence[Row]], str]:
+    """Text of the mean of a share in per cent."""
     return lambda rows: "-" if math.isnan(value := mean(rows, name)) else f"{100 * value:.2f} %"
 
 
 def _pair(first: str, second: str) -> Callable[[Sequence[Row]], str]:
+    """Text of the means of two shares."""
     return lambda rows: f"{_fixed(mean(rows, first), 4)} / {_fixed(mean(rows, second), 4)}"
 
 
 def _kilobytes(name: str) -> Callable[[Sequence[Row]], str]:
+    """Text of the mean of a column of bytes, in kilobytes."""
     return lambda rows: _short(mean(rows, name) / 1e3)
 
 
 def _megabytes(name: str) -> Callable[[Sequence[Row]], str]:
+    """Text of the mean of a column of bytes, in megabytes."""
     return lambda rows: "-" if math.isnan(value := mean(rows, name)) else f"{value / 1e6:,.0f} MB"
 
 
@@ -240,6 +252,7 @@ def _ticks(rows: Sequence[Row]) -> str:
 
 
 def _fixed(value: float, digits: int) -> str:
+    """Number with fixed digits, a dash for NaN."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 

@@ -27,7 +27,8 @@ from octoreplay.report import map_view, paper_plots, plots
 from octoreplay.report.figures import save_figures
 from octoreplay.result import Result, StoredMap, open_result
 from octoreplay.simulate.team import SimulationConfig
-from octoreplay.simulate.world import World, make_village
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import World
 from octoreplay.study.teams import replayed_team, simulated_team
 
 TEAM, RESULT, FIGURES, NUMBERS = "team", "paper.mcap", "figures", "numbers.json"

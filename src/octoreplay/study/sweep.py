@@ -101,37 +101,17 @@ def run_sweep(
 
     Each run is a process of its own. A failed run has a row with the reason and does not stop the others.
 
-    Parameters
-    ----------
-    teams : path or sequence of paths
-        Team files.
-    variations : sequence of str
-        Variations such as ``topology=complete,ring`` (docs/sweeps.md).
-    output : path
-        Folder of the sweep. Finished runs that it holds are not repeated.
-    settings : mapping, optional
-        Parameters of all runs by name, and ``preset``.
-    num_seeds : int, optional
-        Run every combination with ``network_seed`` 0 to num_seeds - 1.
-    truth : path, optional
-        Ground truth to evaluate against, relative to each team file or to the working folder.
-    keep : bool
-        Keep the results.
-    num_jobs : int, optional
-        Processes at once on this machine. Default: processors / ``num_threads``.
-    num_threads : int
-        Threads of each run.
-    scheduler : str, optional
-        Address of a dask scheduler on whose workers the runs are executed.
-    progress : callable, optional
-        Called with a SweepProgress whenever a run has finished.
+    ``teams`` are team files, ``variations`` texts such as ``topology=complete,ring`` (docs/sweeps.md), and ``settings``
+    the parameters of all runs by name, and ``preset``. ``num_seeds`` runs every combination with ``network_seed`` 0 to
+    num_seeds - 1. ``truth`` is the ground truth to evaluate against, relative to each team file or to the working
+    folder. Finished runs in the folder ``output`` are not repeated; ``keep`` keeps the results there.
 
-    Raises
-    ------
-    ConfigError
-        If any combination is invalid; no run is started then.
-    InputError, OutputError
-        If the team files, the truth, the scheduler or the folder cannot be used.
+    The runs are executed on this machine, ``num_jobs`` at once (default: processors / ``num_threads``) with
+    ``num_threads`` threads each, or on the workers of the dask scheduler at the address ``scheduler``. ``progress`` is
+    called whenever a run has finished.
+
+    Raises ConfigError before the first run if any combination is invalid, InputError and OutputError if the team files,
+    the truth, the scheduler or the folder cannot be used.
     """
     fixed = {name: value for name, value in (settings or {}).items() if value is not None}
     parsed = [parse_variation(text) for text in variations]
@@ -150,22 +130,27 @@ def run_sweep(
         table = _Table(folder, tasks, columns, progress)
         left = table.begin()
         if left:
-            finished = execute_locally(left, num_jobs) if scheduler is None else _on_cluster(left, scheduler)
-            try:
-                with closing(finished):
-                    for task, row in finished:
-                        table.add(task, row)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt(
-                    f"interrupted; {len(table.rows)} of {len(tasks)} runs are finished, and the same command continues"
-                    " with the others"
-                ) from None
-            finally:
-                table.write()
-        varied = [variation.names for variation in parsed]
-        write_sweep_figures(table.ordered(), varied, folder.figures)
-        rows, num_earlier = table.ordered(), len(tasks) - len(left)
-        return Sweep(folder.path, folder.table, names, columns, rows, num_earlier, tuple(_warnings(runs, num_seeds)))
+            _fill(table, execute_locally(left, num_jobs) if scheduler is None else _on_cluster(left, scheduler))
+        rows = table.ordered()
+        write_sweep_figures(rows, [variation.names for variation in parsed], folder.figures)
+        return Sweep(
+            folder.path, folder.table, names, columns, rows, len(tasks) - len(left), tuple(_warnings(runs, num_seeds))
+        )  # fmt: skip
+
+
+def _fill(table: _Table, finished: Generator[tuple[Task, Row]]) -> None:
+    """Add the rows of tasks to the table as they finish; an interrupt's message gives their number."""
+    try:
+        with closing(finished):
+            for task, row in finished:
+                table.add(task, row)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted; {len(table.rows)} of {table.num_tasks} runs are finished, and the same command continues"
+            " with the others"
+        ) from None
+    finally:
+        table.write()
 
 
 def _on_cluster(tasks: Sequence[Task], scheduler: str) -> Generator[tuple[Task, Row]]:
@@ -198,6 +183,7 @@ class _Table:
         progress: Callable[[SweepProgress], None] | None,
     ) -> None:
         self.rows: dict[str, Row] = {}
+        self.num_tasks = len(tasks)
         self._folder = folder
         self._tasks = tasks
         self._columns = columns
@@ -246,8 +232,8 @@ class _Table:
         num_new = len(rows) - self._num_earlier
         pace = (time.monotonic() - self._started) / num_new if num_new else math.nan
         num_failed = sum(row["status"] == FAILED for row in rows)
-        left = len(self._tasks) - len(rows)
-        self._progress(SweepProgress(len(rows), num_failed, len(self._tasks), pace * left if left else 0.0))
+        left = self.num_tasks - len(rows)
+        self._progress(SweepProgress(len(rows), num_failed, self.num_tasks, pace * left if left else 0.0))
 
 
 class _CacheKeys:

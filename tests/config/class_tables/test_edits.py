@@ -14,7 +14,7 @@ TABLE = ClassTable(
 )
 
 
-def test_a_merged_class_stands_and_looks_like_its_first_member():
+def test_a_merged_class_has_the_position_and_colour_of_its_first_member():
     table = edited(TABLE, (("vehicle", ("truck", "car")), ("ground", ("road",))), ())
     assert [(c.class_id, c.name, c.color, c.raw_labels, c.raw_colors) for c in table.classes] == [
         (1, "ground", (0, 0, 0), (20, 30), ((0, 0, 0),)), (2, "tree", (2, 2, 2), (18, 32), ((2, 2, 2),)),
@@ -24,19 +24,19 @@ def test_a_merged_class_stands_and_looks_like_its_first_member():
     assert (table.ignored_raw_labels, table.ignored_raw_colors) == ((255,), ((9, 9, 9),))
 
 
-def test_ignored_classes_leave_their_labels_and_colours_to_be_ignored():
+def test_labels_and_colours_of_ignored_classes_are_ignored():
     table = edited(TABLE, (("thing", ("sky", "tree")),), ("thing", "person", "thing"))
     assert [(c.class_id, c.name) for c in table.classes] == [(1, "road"), (2, "car"), (3, "truck")]
     assert table.ignored_raw_labels == (255, 16, 18, 32, 34, 15, 35)
     assert table.ignored_raw_colors == ((9, 9, 9), (4, 4, 4), (2, 2, 2), (5, 5, 5))
 
 
-def test_nothing_to_do_changes_nothing():
+def test_without_edits_the_table_is_unchanged():
     assert edited(TABLE, (), ()) == TABLE
 
 
 @given(st.lists(st.lists(st.sampled_from(NAMES), min_size=1), max_size=4), st.sets(st.sampled_from(NAMES), max_size=5))
-def test_every_raw_label_keeps_a_meaning(groups, ignore):
+def test_every_raw_label_has_a_class_or_is_ignored(groups, ignore):
     taken: set[str] = set()
     merge = []
     for index, group in enumerate(groups):
@@ -64,28 +64,28 @@ def test_every_raw_label_keeps_a_meaning(groups, ignore):
     ("merge", "ignore", "sentence"),
     [
         ((("vehicle", ("car", "trruck")),), (), "merge_classes: no class is called 'trruck'; did you mean 'truck'?"),
-        ((("vehicle", ("car",)), ("big", ("car",))), (), "'car' becomes both 'vehicle' and 'big'"),
-        ((("vehicle", ("car", "car")),), (), "'car' becomes both 'vehicle' and 'vehicle'"),
-        ((("tree", ("car",)),), (), "merge_classes: 'tree' is a class of the table itself"),
+        ((("vehicle", ("car",)), ("big", ("car",))), (), "'car' is merged into both 'vehicle' and 'big'"),
+        ((("vehicle", ("car", "car")),), (), "'car' is merged into both 'vehicle' and 'vehicle'"),
+        ((("tree", ("car",)),), (), "merge_classes: 'tree' is already a class of the table"),
         ((), ("Person",), "ignore_hits: no class is called 'Person'; did you mean 'person'?"),
         ((), ("qqq",), "ignore_hits: no class is called 'qqq'; classes: road, car, tree, truck, sky, person"),
-        ((("vehicle", ("car",)),), ("car",), "ignore_hits: 'car' is part of 'vehicle'"),
-        ((), NAMES, "no class is left"),
+        ((("vehicle", ("car",)),), ("car",), "ignore_hits: merge_classes makes 'car' part of 'vehicle'"),
+        ((), NAMES, "all classes are ignored"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence(merge, ignore, sentence):
+def test_invalid_edits_are_reported_in_one_sentence(merge, ignore, sentence):
     with pytest.raises(ConfigError, match=sentence.replace("?", r"\?")):
         edited(TABLE, merge, ignore)
 
 
-def test_a_name_can_stay_among_its_members():
+def test_a_merged_class_can_have_the_name_of_a_member():
     assert edited(TABLE, (("car", ("truck", "car")),), ()).names == ("road", "tree", "car", "sky", "person")
     assert edited(TABLE, (("car", ("truck", "car")),), ("car",)).names == ("road", "tree", "sky", "person")
 
 
-def test_more_classes_than_a_map_has_must_be_merged():
+def test_too_many_classes_are_refused_unless_merged():
     many = ClassTable(tuple(SemanticClass(i + 1, f"c{i}", (0, 0, 0), (i,)) for i in range(300)))
-    with pytest.raises(ConfigError, match="at most 254 classes can be mapped, got 300; join some with merge_classes"):
+    with pytest.raises(ConfigError, match="at most 254 classes can be mapped, got 300; merge some with merge_classes"):
         edited(many, (), ())
     rest = tuple(f"c{i}" for i in range(MAX_CLASSES - 1, 300))
     assert edited(many, (("rest", rest),), ()).num_classes == MAX_CLASSES

@@ -13,7 +13,7 @@ from octoreplay.config.class_tables.label_rows import (
 from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError
 
-# Read off the data sets' own files (class_tables/SOURCES.md): number of labels, of ignored ones, and some labels.
+# From the data sets' own files (class_tables/SOURCES.md): number of labels, ignored labels, and some labels.
 FACTS = {
     "semantickitti": (34, {0, 1}, {
         10: ("car", (100, 150, 245)), 40: ("road", (255, 0, 255)), 70: ("vegetation", (0, 175, 0)),
@@ -48,11 +48,11 @@ SHARED = {
     "cityscapes": {("pole", "polegroup")},
     "ade20k": {("road", "skyscraper")},
 }  # fmt: skip
-"""Classes that their data set gives one colour; docs/classes.md lists them."""
+"""Classes that share a colour in their data set; docs/classes.md lists them."""
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_built_in_tables_are_as_their_data_sets_define_them(name):
+def test_built_in_tables_match_their_data_sets(name):
     number, ignored, facts = FACTS[name]
     rows = built_in_rows(name)
     assert len(rows) == len({row.raw_label for row in rows}) == len({row.name for row in rows}) == number
@@ -87,9 +87,9 @@ def test_rows_of_one_name_are_one_class():
     assert [(c.class_id, c.name, c.color, c.raw_labels, c.raw_colors) for c in table.classes] == [
         (1, "plant", (1, 1, 1), (3, 9), ((1, 1, 1), (2, 2, 2))), (2, "wall", PALETTE[1], (2,), ()),
     ]  # fmt: skip
-    # The person's colour means a plant too.
+    # The person's colour is also the plant's.
     assert (table.ignored_raw_labels, table.ignored_raw_colors) == ((1, 7), ((5, 5, 5),))
-    with pytest.raises(ConfigError, match="raw label 3 means both 'plant' and 'wall'"):
+    with pytest.raises(ConfigError, match="raw label 3 belongs to both 'plant' and 'wall'"):
         table_of_rows((LabelRow(3, "plant"), LabelRow(3, "wall")), PALETTE)
 
 
@@ -128,7 +128,7 @@ Plane,255,20,127,255,4
 """
 
 
-def test_kimera_palettes_have_a_class_for_every_id():
+def test_kimera_palettes_have_one_class_per_id():
     table = table_of_rows(kimera_rows(PALETTE_CSV + "\n"), PALETTE)
     assert [(c.name, c.color, c.raw_labels, c.raw_colors) for c in table.classes] == [
         ("Chair_1", (10, 20, 30), (3,), ((10, 20, 30), (11, 20, 30))),

@@ -1,4 +1,4 @@
-"""Damaged logs: what is whole is read, what is not is counted, and nothing makes room for what is not there."""
+"""Damaged logs: intact messages are read, damage is counted, and wrong sizes allocate no memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def times(path: Path) -> list[int]:
 
 
 def times_of_chunk(records: bytes) -> list[int]:
-    """The log times of the messages in an MCAP's chunk."""
+    """Log times of the messages in a chunk of an MCAP file."""
     found, place = [], 0
     while place < len(records):
         opcode, length = struct.unpack_from("<BQ", records, place)
@@ -62,9 +62,7 @@ def put(path: Path, place: int, piece: bytes) -> None:
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("has_summary", [True, False])
 @pytest.mark.parametrize("back", [1, 12, 40])
-def test_a_chunk_of_an_mcap_whose_checksum_does_not_fit_is_left_out_and_counted(
-    tmp_path, compression, has_summary, back
-):
+def test_an_mcap_chunk_with_a_wrong_checksum_is_skipped_and_counted(tmp_path, compression, has_summary, back):
     path = write_strings_mcap(tmp_path / "a.mcap", compression=compression)
     data = path.read_bytes()
     chunk = mcap_chunks(data)[2]
@@ -79,7 +77,7 @@ def test_a_chunk_of_an_mcap_whose_checksum_does_not_fit_is_left_out_and_counted(
     assert outcome.damage == f"{path}: {missing_end}{skipped}"
 
 
-def test_damage_is_counted_once_however_often_a_log_is_read(tmp_path, caplog):
+def test_damage_counts_once_when_a_log_is_read_repeatedly(tmp_path, caplog):
     path = write_strings_mcap(tmp_path / "a.mcap")
     chunks = mcap_chunks(path.read_bytes())
     for chunk in (chunks[1], chunks[4]):
@@ -94,18 +92,18 @@ def test_damage_is_counted_once_however_often_a_log_is_read(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_an_mcap_is_read_on_after_garbage_at_the_next_good_chunk(tmp_path, compression):
+def test_reading_of_an_mcap_resumes_at_the_next_intact_chunk(tmp_path, compression):
     path = write_strings_mcap(tmp_path / "a.mcap", compression=compression)
     data = path.read_bytes()
     third = mcap_chunks(data)[2]
-    # The third chunk's length is a lie, so that nobody knows where it ends; and its place in the summary is gone.
+    # The third chunk has a wrong length, so its end is unknown, and the summary is removed.
     path.write_bytes(data[: third.start + 1] + struct.pack("<Q", 123) + data[third.start + 9 : -30])
     outcome = read_all(path)
     assert [time for _, time, _ in outcome.messages] == without(*times_of_chunk(third.records))
     assert "1 damaged part with an unknown number of messages was skipped" in outcome.damage
 
 
-def test_a_chunk_that_lies_about_its_length_up_to_beyond_the_end_is_no_cut(tmp_path):
+def test_a_chunk_length_beyond_the_end_of_the_file_is_not_a_cut(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap")
     data = path.read_bytes()
     first = mcap_chunks(data)[1]
@@ -114,7 +112,7 @@ def test_a_chunk_that_lies_about_its_length_up_to_beyond_the_end_is_no_cut(tmp_p
 
 
 @pytest.mark.parametrize("length", [5_000, 1 << 40])
-def test_a_lie_about_the_length_of_what_is_between_chunks_costs_no_chunk(tmp_path, length):
+def test_a_wrong_length_of_a_record_between_chunks_loses_no_chunk(tmp_path, length):
     path = write_strings_mcap(tmp_path / "a.mcap")
     data = path.read_bytes()
     index = mcap_chunks(data)[2].end
@@ -123,7 +121,7 @@ def test_a_lie_about_the_length_of_what_is_between_chunks_costs_no_chunk(tmp_pat
     assert times(path) == without()
 
 
-def test_a_damaged_chunk_whose_message_index_lies_about_its_length_is_counted(tmp_path):
+def test_a_damaged_chunk_with_a_wrong_message_index_is_counted(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap")
     chunk = mcap_chunks(path.read_bytes())[2]
     put(path, chunk.end - 3, b"\xff\xff")
@@ -133,7 +131,7 @@ def test_a_damaged_chunk_whose_message_index_lies_about_its_length_is_counted(tm
     assert outcome.damage.startswith(f"{path}: 1 damaged chunk with ")
 
 
-def test_an_mcap_without_chunks_is_read_on_after_garbage_at_the_next_records(tmp_path):
+def test_reading_of_an_mcap_without_chunks_resumes_at_the_next_records(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", use_chunking=False)
     data = path.read_bytes()
     place = data.index(b"\x05", len(data) // 2)
@@ -144,18 +142,18 @@ def test_an_mcap_without_chunks_is_read_on_after_garbage_at_the_next_records(tmp
     assert "1 damaged part with an unknown number of messages was skipped" in outcome.damage
 
 
-def test_a_summary_whose_checksum_does_not_fit_is_not_believed(tmp_path):
+def test_a_summary_with_a_wrong_checksum_is_not_used(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap")
     data = path.read_bytes()
     (summary_start,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)
-    # The name of a topic, which stands there and in the first chunk.
+    # The name of a topic, which is in the summary and in the first chunk.
     put(path, data.index(b"/a", summary_start), b"/x")
     with open_log(path) as log:
         assert [topic.name for topic in log.topics] == ["/a", "/b"]
         assert log.damage is None
 
 
-def test_channels_that_a_damaged_chunk_declared_are_used(tmp_path):
+def test_channels_declared_in_a_damaged_chunk_are_used(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", compression=CompressionType.NONE)
     data = path.read_bytes()
     first = mcap_chunks(data)[0]
@@ -163,10 +161,10 @@ def test_channels_that_a_damaged_chunk_declared_are_used(tmp_path):
     assert times(path) == without(*times_of_chunk(first.records))
 
 
-def test_messages_of_no_channel_are_counted(tmp_path):
+def test_messages_of_an_unknown_channel_are_counted(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", use_chunking=False)
     data = path.read_bytes()
-    # The channel record of /b becomes one of an unknown kind, here and in the summary, and the summary incomplete.
+    # The channel record of /b gets an unknown opcode, here and in the summary, which makes the summary incomplete.
     path.write_bytes(data.replace(b"\x04" + data[data.index(b"\x02\0\0\0/b") - 12 :][:8], b"\x90" + bytes(8), 1)[:-9])
     record = data.index(b"\x02\0\0\0/b") - 4 - 9
     broken = bytearray(data[: data.index(b"\x0f\x04\0\0\0\0\0\0\0")])
@@ -179,7 +177,7 @@ def test_messages_of_no_channel_are_counted(tmp_path):
 
 @pytest.mark.parametrize("size", [1 << 60, (1 << 64) - 1, 1 << 31, MAX_CHUNK_BYTES])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_a_chunk_that_claims_a_huge_size_makes_no_room_for_it(tmp_path, size, compression):
+def test_a_huge_chunk_size_allocates_no_memory(tmp_path, size, compression):
     path = write_strings_mcap(tmp_path / "a.mcap", compression=compression)
     chunk = mcap_chunks(path.read_bytes())[3]
     put(path, chunk.start + 9 + 16, struct.pack("<Q", size))
@@ -191,7 +189,7 @@ def test_a_chunk_that_claims_a_huge_size_makes_no_room_for_it(tmp_path, size, co
     assert peak < 5e6
 
 
-def test_records_that_claim_a_huge_length_make_no_room_for_it(tmp_path):
+def test_a_huge_record_length_allocates_no_memory(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", use_chunking=False)
     data = path.read_bytes()
     place = data.index(b"\x05", 200)
@@ -203,7 +201,7 @@ def test_records_that_claim_a_huge_length_make_no_room_for_it(tmp_path):
         tracemalloc.stop()
 
 
-def test_a_chunk_that_the_summary_names_twice_is_not_read_twice(tmp_path):
+def test_a_chunk_listed_twice_in_the_summary_is_read_once(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", enable_crcs=False)
     data = path.read_bytes()
     chunks = mcap_chunks(data)
@@ -211,13 +209,13 @@ def test_a_chunk_that_the_summary_names_twice_is_not_read_twice(tmp_path):
     assert times(path) == without()
 
 
-def test_messages_between_chunks_are_read_though_the_summary_names_only_chunks(tmp_path):
+def test_messages_between_chunks_are_read_without_being_in_the_summary(tmp_path):
     path = write_strings_mcap(tmp_path / "a.mcap", enable_crcs=False)
     data = path.read_bytes()
     chunks = mcap_chunks(data)
     body = struct.pack("<HIQQ", 1, 0, 500, 500) + b"\0\1\0\0\1\0\0\0\0"
     loose = struct.pack("<BQ", 5, len(body)) + body
-    # In place of the last chunk's message indexes, so that all offsets stay right.
+    # Replaces the message indexes of the last chunk, so that all offsets stay valid.
     index_length = data.index(b"\x0f\x04\0\0\0\0\0\0\0") - chunks[-1].end
     filler = struct.pack("<BQ", 0x90, index_length - len(loose) - 9) + bytes(index_length - len(loose) - 9)
     end = chunks[-1].end
@@ -229,7 +227,7 @@ def test_messages_between_chunks_are_read_though_the_summary_names_only_chunks(t
 # --- decompression ---------------------------------------------------------------------------------------------------
 
 
-def test_decompression_is_bounded_by_what_is_there():
+def test_decompression_is_limited_by_the_compressed_size():
     assert not is_plausible_size("zstd", 100, 1 << 30)
     assert not is_plausible_size("lz4", 1 << 30, MAX_CHUNK_BYTES + 1)
     assert not is_plausible_size("brotli", 100, 100)
@@ -243,7 +241,7 @@ def test_decompression_is_bounded_by_what_is_there():
         tracemalloc.stop()
         assert len(decompress(name, memoryview(packed), len(zeros))) == len(zeros)
         assert len(decompress(name, memoryview(packed[: len(packed) // 2]), len(zeros))) < len(zeros)
-    # A frame that claims more than anybody has.
+    # A frame with a size above any memory.
     liar = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 1 << 62) + bytes(20)
     assert len(decompress("zstd", memoryview(liar), 1 << 62)) == 0
 
@@ -252,7 +250,7 @@ def test_decompression_is_bounded_by_what_is_there():
 
 
 def bag_chunks(path: Path) -> list[tuple[int, int]]:
-    """(start of the data, end) of each chunk of a good bag."""
+    """(start of the data, end) of each chunk of an intact bag."""
     chunks, size = [], path.stat().st_size
     with path.open("rb") as file:
         head = read_head(file, 13, size)
@@ -265,7 +263,7 @@ def bag_chunks(path: Path) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("compression", [Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4])
 @pytest.mark.parametrize("has_index", [True, False])
-def test_a_damaged_chunk_of_a_bag_is_left_out_and_counted(tmp_path, compression, has_index):
+def test_a_damaged_chunk_of_a_bag_is_skipped_and_counted(tmp_path, compression, has_index):
     path = write_strings_bag(tmp_path / "a.bag", compression)
     start, end = bag_chunks(path)[2]
     put(path, start, bytes(end - start))
@@ -282,7 +280,7 @@ def test_a_damaged_chunk_of_a_bag_is_left_out_and_counted(tmp_path, compression,
 
 
 @pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
-def test_a_bag_is_read_on_after_garbage_at_the_next_good_chunk(tmp_path, compression):
+def test_reading_of_a_bag_resumes_at_the_next_intact_chunk(tmp_path, compression):
     path = write_strings_bag(tmp_path / "a.bag", compression)
     data = path.read_bytes()
     place = bag_chunks(path)[3][0] + 20
@@ -323,19 +321,19 @@ def write_long_db3(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8, 0.95])
-def test_a_cut_database_gives_every_row_before_the_cut(tmp_path, share):
+def test_all_rows_before_the_cut_of_a_database_are_read(tmp_path, share):
     path = write_long_db3(tmp_path / "bag")
     whole = read_all(path)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     outcome = read_all(path)
     assert set(outcome.messages) < set(whole.messages)
-    # A page of rows is filled from its end, so that of the last one the first rows are lost.
+    # SQLite fills a page of rows from its end, so the cut page loses its first rows.
     assert len(outcome.messages) > share * 600 - 2 * 4096 / 100
     assert [m[1] for m in outcome.messages] == sorted(m[1] for m in outcome.messages)
     assert outcome.damage.startswith(f"{path}: cut before its end, and ")
 
 
-def test_a_database_with_damaged_pages_gives_the_rows_of_the_others_once(tmp_path):
+def test_rows_outside_damaged_pages_of_a_database_are_read_once(tmp_path):
     path = write_long_db3(tmp_path / "bag")
     whole = read_all(path)
     data = path.read_bytes()
@@ -348,24 +346,24 @@ def test_a_database_with_damaged_pages_gives_the_rows_of_the_others_once(tmp_pat
         assert len(outcome.messages) == 600 or outcome.damage is not None
 
 
-def test_a_database_whose_pages_do_not_fit_together_is_never_taken_for_whole(tmp_path):
+def test_a_database_with_inconsistent_pages_is_reported_as_damaged(tmp_path):
     path = write_long_db3(tmp_path / "bag")
     data = path.read_bytes()
     # The file's last page begins eight bytes later.
     path.write_bytes(data[:-4096] + bytes(8) + data[-4096:])
     assert read_all(path).damage is not None
-    # The table of messages is lost with its line in the schema.
+    # The table of messages cannot be found without its row in the schema.
     path.write_bytes(data.replace(b"tablemessagesmessages", b"tablemess\xffgesmessages"))
-    assert read_all(path).refusal == f"{path}: cannot be read: no rosbag2 recording, or a damaged one"
+    assert read_all(path).refusal == f"{path}: cannot be read: not a rosbag2 recording, or a damaged one"
 
 
-def test_a_database_of_an_odd_name_is_read(tmp_path):
+def test_a_database_with_special_characters_in_its_name_is_read(tmp_path):
     path = write_long_db3(tmp_path / "bag").rename(tmp_path / "50%?a#b.db3")
     outcome = read_all(path)
     assert (len(outcome.messages), outcome.damage) == (600, None)
 
 
-def test_rows_that_rosbags_stumbles_over_are_left_out_and_the_others_are_given_once(tmp_path):
+def test_rows_that_rosbags_cannot_read_are_skipped_and_the_others_read_once(tmp_path):
     path = write_long_db3(tmp_path / "bag")
     whole = read_all(path)
     data = path.read_bytes()
@@ -388,7 +386,7 @@ def test_rows_that_rosbags_stumbles_over_are_left_out_and_the_others_are_given_o
 # --- folders ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_that_the_metadata_name_and_that_is_missing_is_named(tmp_path):
+def test_a_missing_file_of_a_folder_is_named(tmp_path):
     folder = write_strings_rosbag2(tmp_path / "bag", storage="mcap")
     only = next(folder.glob("*.mcap"))
     metadata = (folder / "metadata.yaml").read_text()
@@ -403,7 +401,7 @@ def test_a_file_that_the_metadata_name_and_that_is_missing_is_named(tmp_path):
     for clause in (
         "bag_1.mcap: no such file",
         "bag_2.mcap: the file is empty",
-        "a folder, where",
+        "a folder, but",
         "everything else is used",
     ):
         assert clause in outcome.damage
@@ -420,7 +418,7 @@ def test_a_damaged_file_of_a_folder_is_named(tmp_path):
     assert outcome.damage.startswith(f"{folder}: bag.mcap: cut after its last message")
 
 
-def test_a_file_of_a_folder_is_read_when_its_first_message_is_due(tmp_path):
+def test_a_file_of_a_folder_is_read_from_the_time_of_its_first_message(tmp_path):
     folder = tmp_path / "bag"
     folder.mkdir()
     for index in range(3):
@@ -430,7 +428,7 @@ def test_a_file_of_a_folder_is_read_when_its_first_message_is_due(tmp_path):
         messages = log.messages(["/a"])
         seen = [next(messages) for _ in range(2)]
         assert {m.log.name for m in seen} == {"rec_0.mcap"}
-        # The later files have not been looked into: what befalls them now is found only when they are due.
+        # The later files have not been read yet, so damage done now is found when their messages are due.
         (folder / "rec_2.mcap").write_bytes((folder / "rec_2.mcap").read_bytes()[:40])
         assert {m.log.name for m in messages} == {"rec_0.mcap", "rec_1.mcap"}
         assert log.damage.startswith(f"{folder}: rec_2.mcap: 3 damaged chunks")
@@ -450,7 +448,7 @@ def test_a_split_recording_without_metadata_is_one_log(tmp_path, suffix):
     assert f"it holds other_0{suffix}, rec_0{suffix}" in read_all(folder).refusal
 
 
-def test_messages_that_are_compressed_and_damaged_are_counted(tmp_path):
+def test_damaged_compressed_messages_are_counted(tmp_path):
     from rosbags.rosbag2 import CompressionMode
 
     folder = write_strings_rosbag2(tmp_path / "bag", storage="mcap", mode=CompressionMode.MESSAGE)
@@ -467,22 +465,22 @@ def test_messages_that_are_compressed_and_damaged_are_counted(tmp_path):
 # --- the sentence ----------------------------------------------------------------------------------------------------
 
 
-def test_the_sentence_counts_what_was_skipped():
+def test_the_damage_sentence_counts_skipped_parts_and_messages():
     damage = Damage()
 
     def sentence() -> str | None:
         return damage_sentence(Path("x.bag"), damage.clauses)
 
     assert sentence() is None
-    damage.lose("/a", 0)
+    damage.skip_messages("/a", 0)
     assert sentence() is None
-    damage.skip("chunk", 7, 100)
+    damage.skip_part("chunk", 7, 100)
     assert sentence() == "x.bag: 1 damaged chunk with 100 messages was skipped; everything else is used"
-    damage.skip("chunk", 7, 100)
-    damage.skip("chunk", 9, 18)
+    damage.skip_part("chunk", 7, 100)
+    damage.skip_part("chunk", 9, 18)
     assert sentence() == "x.bag: 2 damaged chunks with 118 messages were skipped; everything else is used"
-    damage.skip("part", 9, None)
-    damage.lose("/a", 1)
+    damage.skip_part("part", 9, None)
+    damage.skip_messages("/a", 1)
     damage.note("cut before its end")
     assert sentence() == (
         "x.bag: cut before its end, and 3 damaged parts with at least 118 messages were skipped, "

@@ -16,7 +16,7 @@ def write_mcap(path: Path, number: int) -> None:
             writer.write("/clock", "rosgraph_msgs/msg/Clock", clock, index + number)
 
 
-def test_a_finished_mcap_is_known_by_its_summary_and_footer(tmp_path: Path) -> None:
+def test_the_fingerprint_of_a_finished_mcap_is_of_its_summary_and_footer(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", 1)
     write_mcap(tmp_path / "same.mcap", 1)
     write_mcap(tmp_path / "other.mcap", 2)
@@ -31,7 +31,7 @@ def test_a_finished_mcap_is_known_by_its_summary_and_footer(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("cut", [1, 8, 20, 37, 60])
-def test_a_cut_mcap_is_known_by_its_ends(tmp_path: Path, cut: int) -> None:
+def test_the_fingerprint_of_a_cut_mcap_is_of_its_first_and_last_mib(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, 1)
     path.write_bytes(path.read_bytes()[:-cut])
@@ -39,7 +39,7 @@ def test_a_cut_mcap_is_known_by_its_ends(tmp_path: Path, cut: int) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, EDGE, EDGE + 5, 2 * EDGE, 2 * EDGE + 5])
-def test_the_ends_of_another_file_count_once(tmp_path: Path, size: int) -> None:
+def test_overlapping_ends_are_hashed_once(tmp_path: Path, size: int) -> None:
     data = bytearray(index % 251 for index in range(size))
     path = tmp_path / "a.bag"
     path.write_bytes(data)
@@ -47,7 +47,7 @@ def test_the_ends_of_another_file_count_once(tmp_path: Path, size: int) -> None:
     assert fingerprint(path).value == hashlib.sha256(whole).hexdigest()
 
 
-def test_the_middle_counts_only_for_the_whole_hash(tmp_path: Path) -> None:
+def test_only_the_whole_hash_covers_the_middle(tmp_path: Path) -> None:
     data = bytearray(2 * EDGE + 100)
     path = tmp_path / "a.bag"
     path.write_bytes(data)
@@ -61,12 +61,12 @@ def test_the_middle_counts_only_for_the_whole_hash(tmp_path: Path) -> None:
     assert changed.method == "sha256"
 
 
-def test_a_missing_file_is_one_sentence(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.mcap: cannot be read: No such file"):
         fingerprint(tmp_path / "none.mcap")
 
 
-def test_a_folder_is_all_its_files(tmp_path: Path) -> None:
+def test_the_files_of_a_folder_are_sorted(tmp_path: Path) -> None:
     for name in ("b.db3", "a.db3", "metadata.yaml"):
         (tmp_path / name).write_text(name)
     assert [path.name for path in log_files(tmp_path)] == ["a.db3", "b.db3", "metadata.yaml"]

@@ -1,4 +1,4 @@
-"""Containers: what goes into a log by an independent writer comes out, whole or as far as the file goes."""
+"""Containers: messages written by independent writers are read, of cut files those before the cut."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ CONTAINERS = Path(__file__).parents[2] / "fixtures" / "containers"
 
 
 def first_message(log, topic: str) -> RawMessage | None:
-    """The first message of a topic."""
+    """Return the first message of a topic."""
     return next(log.messages((topic,)), None)
 
 
 def contents(path: Path, topics=None) -> list[tuple[str, int, bytes]]:
-    """Every message of a log as this package reads it."""
+    """Return all messages of a log as read by this package."""
     with open_log(path) as log:
         names = {topic.name for topic in log.topics} if topics is None else topics
         return [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages(names)]
 
 
 def expected_of(entries: list[Entry]) -> list[tuple[str, int, bytes]]:
-    """The same from the entries that were written, in the order of log time."""
+    """Return the messages that were written, in order of log time."""
     rows = [(e.topic, e.log_time_ns, bytes(typestore().serialize_cdr(e.value, e.type_name))) for e in entries]
     return sorted(rows, key=lambda row: row[1])
 
 
 def write_plain_mcap(path: Path, messages: list[tuple[str, int, bytes]], **options) -> Path:
-    """An MCAP with the writer of the mcap package as such."""
+    """Write an MCAP file with the writer of the mcap package."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start(profile="ros2")
@@ -66,7 +66,7 @@ def text(value: str) -> bytes:
 
 
 @pytest.mark.parametrize("container", ["mcap", "small chunks", "rosbag2 sqlite3", "rosbag2 mcap", "db3 file"])
-def test_every_container_gives_what_was_written(tmp_path, container):
+def test_messages_written_to_each_container_are_read(tmp_path, container):
     entries = robot_entries()
     if container in ("mcap", "small chunks"):
         path = write_mcap(tmp_path / "a.mcap", entries, chunk_size=300 if container == "small chunks" else 1 << 20)
@@ -89,7 +89,7 @@ def test_every_container_gives_what_was_written(tmp_path, container):
         assert message.decode().child_frame_id == "base_link"
 
 
-def test_a_ros1_bag_gives_what_was_written(tmp_path):
+def test_messages_written_to_a_ros1_bag_are_read(tmp_path):
     entries = robot_entries(factory=Factory(ros1=True))
     path = write_bag(tmp_path / "a.bag", entries)
     with open_log(path) as log:
@@ -118,7 +118,9 @@ def test_topics_are_filtered_and_iterators_are_independent(tmp_path):
     st.booleans(), st.booleans(), st.booleans(),
 )  # fmt: skip
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
-def test_any_mcap_comes_in_log_time_order(tmp_path, stamps, compression, use_chunking, has_index, has_summary):
+def test_messages_of_any_mcap_are_in_log_time_order(
+    tmp_path, stamps, compression, use_chunking, has_index, has_summary
+):
     messages = [(topic, log_time, text(str(i))) for i, (topic, log_time) in enumerate(stamps)]
     path = write_plain_mcap(
         tmp_path / "any.mcap", messages, chunk_size=150, compression=compression, use_chunking=use_chunking,
@@ -137,7 +139,7 @@ def test_any_mcap_comes_in_log_time_order(tmp_path, stamps, compression, use_chu
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_a_cut_mcap_gives_every_whole_message_before_the_cut(tmp_path, compression, use_chunking):
+def test_all_complete_messages_before_the_cut_of_an_mcap_are_read(tmp_path, compression, use_chunking):
     rng = np.random.default_rng(1)
     messages = [("/a", i, text(rng.bytes(40).hex())) for i in range(60)]
     whole = write_plain_mcap(
@@ -155,7 +157,7 @@ def test_a_cut_mcap_gives_every_whole_message_before_the_cut(tmp_path, compressi
             assert log.damage is not None
             assert log.damage.startswith(f"{cut}: cut")
             assert log.message_count == len(found)
-        # Nothing that the mcap package finds in whole chunks may be missing.
+        # All messages that the mcap package finds in complete chunks are among them.
         assert len(found) >= count_whole(data[:size])
     assert counts == sorted(counts)
     assert counts[0] == 0
@@ -163,7 +165,7 @@ def test_a_cut_mcap_gives_every_whole_message_before_the_cut(tmp_path, compressi
 
 
 def count_whole(data: bytes) -> int:
-    """How many messages the mcap package reads before it fails."""
+    """Return the number of messages that the mcap package reads before it fails."""
     count = 0
     try:
         for _ in NonSeekingReader(io.BytesIO(data)).iter_messages(log_time_order=False):
@@ -173,7 +175,7 @@ def count_whole(data: bytes) -> int:
     return count
 
 
-def test_a_cut_uncompressed_chunk_gives_its_whole_messages(tmp_path):
+def test_complete_messages_of_a_cut_uncompressed_chunk_are_read(tmp_path):
     messages = [("/a", i, text("x" * 100)) for i in range(10)]
     path = write_plain_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.NONE)
     path.write_bytes(path.read_bytes()[:900])
@@ -184,7 +186,7 @@ def test_a_cut_uncompressed_chunk_gives_its_whole_messages(tmp_path):
 
 @given(st.binary(max_size=200), st.integers(0, 2000), st.integers(1, 40))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
-def test_damaged_bytes_never_raise_anything_but_input_errors(tmp_path, noise, position, length):
+def test_damaged_mcaps_raise_only_input_errors(tmp_path, noise, position, length):
     path = tmp_path / "damaged.mcap"
     data = bytearray(write_plain_mcap(path, [("/a", i, text(str(i))) for i in range(20)], chunk_size=200).read_bytes())
     position %= len(data)
@@ -199,7 +201,7 @@ def test_damaged_bytes_never_raise_anything_but_input_errors(tmp_path, noise, po
 
 
 def write_long_bag(path: Path, compression) -> Path:
-    """A bag of several chunks."""
+    """Write a bag of several chunks."""
     writer = Rosbag1Writer(path)
     writer.chunk_threshold = 2000
     if compression is not None:
@@ -214,7 +216,7 @@ def write_long_bag(path: Path, compression) -> Path:
 
 
 @pytest.mark.parametrize("compression", [None, *Rosbag1Writer.CompressionFormat])
-def test_a_cut_bag_gives_every_whole_message_before_the_cut(tmp_path, compression):
+def test_all_complete_messages_before_the_cut_of_a_bag_are_read(tmp_path, compression):
     whole = write_long_bag(tmp_path / "whole.bag", compression)
     messages, data = contents(whole), whole.read_bytes()
     assert len(messages) == 60
@@ -235,7 +237,7 @@ def test_a_cut_bag_gives_every_whole_message_before_the_cut(tmp_path, compressio
 
 @given(st.binary(max_size=60), st.integers(0, 20000), st.integers(1, 40))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
-def test_damaged_bags_never_raise_anything_but_input_errors(tmp_path, noise, position, length):
+def test_damaged_bags_raise_only_input_errors(tmp_path, noise, position, length):
     path = tmp_path / "damaged.bag"
     path.unlink(missing_ok=True)
     data = bytearray(write_long_bag(path, None).read_bytes())
@@ -272,7 +274,7 @@ def test_a_type_is_decoded_as_the_file_defines_it(tmp_path):
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2")
-        # Another String than ROS's, and a type that no store knows.
+        # A String that differs from ROS's, and a type that no type store has.
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"uint8 level\nstring data\n")
         other = writer.register_schema("my_msgs/msg/Pair", "ros2msg", b"int32 a\nint32 b\n")
         head = b"\x00\x01\x00\x00"
@@ -321,8 +323,8 @@ def test_other_encodings_are_listed_and_refused_when_decoded(tmp_path):
         ]  # fmt: skip
         assert first_message(log, "/json").decode() == SimpleNamespace()
         for topic, sentence in (
-            ("/cbor", "message encoding 'cbor' is not supported; cdr, ros1, protobuf, json are"),
-            ("/log", "the definition of type 'foxglove.Log' cannot be understood"),
+            ("/cbor", "message encoding 'cbor' is not supported; supported are cdr, ros1, protobuf, json"),
+            ("/log", "the definition of type 'foxglove.Log' cannot be parsed"),
         ):
             with pytest.raises(InputError, match=rf"a\.mcap: topic '{topic}' at 1\.000 s: {sentence}$"):
                 first_message(log, topic).decode()
@@ -342,7 +344,7 @@ def test_a_message_that_is_too_short_is_damage(tmp_path, size):
                 short.header_stamp_ns()
 
 
-def test_what_is_no_log_gets_one_sentence(tmp_path):
+def test_files_that_are_not_logs_are_input_errors(tmp_path):
     def refused(name: str, data: bytes | None) -> str:
         path = tmp_path / name
         if data is not None:
@@ -362,7 +364,7 @@ def test_what_is_no_log_gets_one_sentence(tmp_path):
     assert "cannot be read" in refused("a.db3", b"SQLite format 3\0" + b"\0" * 100)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "x.mcap").touch()
-    assert "without metadata.yaml is no rosbag2 recording; name the files in it; it holds x.mcap" in refused(
+    assert "without metadata.yaml is not a rosbag2 recording; name the files in it; it holds x.mcap" in refused(
         "folder", None
     )
     (tmp_path / "folder" / "metadata.yaml").write_text("a: [")
@@ -370,12 +372,12 @@ def test_what_is_no_log_gets_one_sentence(tmp_path):
         open_log(tmp_path / "folder")
 
 
-def test_a_file_that_is_not_readable_says_so(tmp_path):
+def test_an_unreadable_file_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="cannot be read: Not a directory"):
         open_log(write_mcap(tmp_path / "a.mcap", []) / "inside")
 
 
-def test_short_type_names_become_long():
+def test_type_names_are_normalised():
     assert normalise_type_name("tf2_msgs/TFMessage") == "tf2_msgs/msg/TFMessage"
     assert normalise_type_name("tf2_msgs/msg/TFMessage") == "tf2_msgs/msg/TFMessage"
 
@@ -396,7 +398,7 @@ def test_short_type_names_become_long():
         ("ros1/plotjuggler_tilt_laser.bag", 4093),
     ],
 )  # fmt: skip
-def test_recordings_made_by_others(name, count):
+def test_recordings_of_other_projects(name, count):
     with open_log(RECORDINGS / name) as log:
         messages = list(log.messages([topic.name for topic in log.topics]))
         assert len(messages) == log.message_count == sum(t.num_messages for t in log.topics) == count
@@ -437,7 +439,7 @@ def test_bags_are_read_as_rosbags_reads_them(name):
         ("tf_example_cut_50pct.db3", "cut before its end"),
     ],
 )
-def test_damaged_recordings_are_used_as_far_as_they_go(name, sentence):
+def test_intact_messages_of_damaged_recordings_are_read(name, sentence):
     with open_log(RECORDINGS / "derived_damaged" / name) as log:
         assert sentence in log.damage
         assert len(list(log.messages([t.name for t in log.topics]))) == log.message_count > 180
@@ -466,6 +468,6 @@ def test_a_log_is_read_the_same_way_in_another_thread(name):
         topics = [topic.name for topic in log.topics]
         found = thread.submit(lambda: [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages(topics)]).result()
         assert log.damage is None
-        # Not by the way that damaged databases are read.
+        # The reader of damaged databases was not used.
         assert all(getattr(part, "_rows", None) is None for part in (log, *getattr(log, "_logs", ())))
     assert found == expected

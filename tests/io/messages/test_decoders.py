@@ -55,7 +55,7 @@ def decode_row(row: Row, data: bytes | None = None):
 
 
 def problem_of(read: Callable[[], object], kind: type[InputError] = InputError) -> str:
-    """The sentence with which reading fails; empty where it does not."""
+    """Return the error message of ``read``; empty without an error."""
     try:
         read()
     except kind as error:
@@ -83,7 +83,7 @@ def test_a_known_type_needs_no_definition(entry, make_row):
     assert value.child_frame_id == "base_link"
 
 
-def test_the_definition_in_the_log_holds_where_it_differs_from_the_known_one():
+def test_the_definition_in_the_log_has_precedence_over_the_built_in_one():
     definition = b"uint8 more\nstring child_frame_id\n"
     value = decode(b"\0\1\0\0\7\0\0\0\2\0\0\0a\0", "nav_msgs/msg/Odometry", "cdr", "ros2msg", definition)
     assert (value.more, value.child_frame_id) == (7, "a")
@@ -92,26 +92,26 @@ def test_the_definition_in_the_log_holds_where_it_differs_from_the_known_one():
 @pytest.mark.parametrize(
     ("encoding", "definition_format", "definition", "sentence"),
     [
-        ("cbor", "", b"", "message encoding 'cbor' is not supported; cdr, ros1, protobuf, json are"),
+        ("cbor", "", b"", "message encoding 'cbor' is not supported; supported are cdr, ros1, protobuf, json"),
         ("cdr", "ros2msg", b"", "the definition of type 'a/msg/B' is unknown"),
         ("ros1", "ros1msg", b"", "the definition of type 'a/msg/B' is unknown"),
-        ("cdr", "ros2msg", b"\xff\xfe\0 nonsense {", "the definition of type 'a/msg/B' cannot be understood"),
+        ("cdr", "ros2msg", b"\xff\xfe\0 nonsense {", "the definition of type 'a/msg/B' cannot be parsed"),
         ("cdr", "ros2msg", b"other/Missing x\n", "the definition of type 'a/msg/B' "),
-        ("cdr", "ros2idl", b"module {", "the definition of type 'a/msg/B' cannot be understood"),
+        ("cdr", "ros2idl", b"module {", "the definition of type 'a/msg/B' cannot be parsed"),
         ("ros1", "ros1msg", b"float99 x\n", "the definition of type 'a/msg/B' "),
         ("protobuf", "protobuf", b"", "the definition of type 'a/msg/B' "),
         ("protobuf", "protobuf", b"\x0a\x05hello", "the definition of type 'a/msg/B' "),
         ("protobuf", "protobuf", b"garbage", "the definition of type 'a/msg/B' "),
     ],
 )
-def test_types_that_cannot_be_known_are_named(encoding, definition_format, definition, sentence):
+def test_types_without_a_usable_definition_are_named(encoding, definition_format, definition, sentence):
     with pytest.raises(UndefinedTypeError, match=f"^{re.escape(sentence)}"):
         decode(b"\0" * 64, "a/msg/B", encoding, definition_format, definition)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.schema_name} {row.encoding}")
-def test_cut_bytes_are_damage_or_give_a_value(row):
-    """Protobuf has no length, so that a cut between two fields is a shorter message."""
+def test_cut_bytes_are_damage_or_a_shorter_message(row):
+    """Protobuf messages have no length, so a cut between two fields gives a shorter message."""
     for size in range(len(row.data)):
         problem = problem_of(lambda size=size: decode_row(row, row.data[:size]), DamagedMessageError)
         assert problem.startswith(f"damaged {row.message().type_name}") or (
@@ -121,7 +121,7 @@ def test_cut_bytes_are_damage_or_give_a_value(row):
 
 @given(st.sampled_from(ROWS), st.integers(0, 10**6), st.binary(min_size=1, max_size=12), st.booleans())
 @settings(max_examples=600, deadline=None)
-def test_changed_bytes_raise_nothing_but_input_errors(row, position, noise, is_definition):
+def test_changed_bytes_raise_only_input_errors(row, position, noise, is_definition):
     source = bytearray(row.schema if is_definition else row.data)
     position %= len(source)
     source[position : position + len(noise)] = noise
@@ -135,7 +135,7 @@ def test_changed_bytes_raise_nothing_but_input_errors(row, position, noise, is_d
 @given(st.sampled_from(ROWS), st.binary(max_size=80))
 @example(ROWS[0], b"")
 @settings(max_examples=300, deadline=None)
-def test_garbage_raises_nothing_but_input_errors(row, data):
+def test_random_bytes_raise_only_input_errors(row, data):
     message = row._replace(data=data).message()
     for read in (message.decode, message.sensor_message, message.header_stamp_ns, message.header_frame_id):
         assert problem_of(read)[:15] in ("", "a.mcap: topic '")
@@ -144,7 +144,7 @@ def test_garbage_raises_nothing_but_input_errors(row, data):
 @pytest.mark.parametrize(
     "text", [b"", b"{", b"\xff", b"nul", b'{"a": 1', b"[" * 100_000, b'{"a":' * 100_000, b"1" * 10_000, b"1e999"]
 )
-def test_json_that_is_none(text):
+def test_invalid_json_is_damage(text):
     try:
         value = decode(text, "foxglove.RawImage", "json", "jsonschema", b"{}")
     except DamagedMessageError:
@@ -157,7 +157,7 @@ def test_json_objects_are_namespaces():
     assert value.a.b == [1, SimpleNamespace(c=None)]
 
 
-def test_a_json_message_that_is_no_object_is_damage():
+def test_a_json_message_that_is_not_an_object_is_damage():
     for text in (b"[]", b"3", b"null", b'"x"', b"{}"):
         row = ROWS[7]._replace(data=text)
         assert row.encoding == "json"

@@ -1,4 +1,4 @@
-"""The same content gives the same records, whichever schema and encoding it was recorded in."""
+"""Equal content gives equal records in all schemas and encodings."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
 
 def plain(value):
-    """A record as something that can be compared: arrays and bytes as lists."""
+    """Return a record in a form that can be compared: arrays and bytes as lists."""
     if dataclasses.is_dataclass(value):
         return type(value).__name__, {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, bytes | bytearray | memoryview):
@@ -62,7 +62,7 @@ def plain(value):
 
 
 def ros_rows(type_name: str, make) -> dict[str, Row]:
-    """A message that both kinds of ROS have."""
+    """Return a message of a type that ROS 1 and ROS 2 have, in both encodings."""
     return {
         "ros2": ros_row(Entry("/t", type_name, make(ros2), STAMP)),
         "ros1": ros1_row(Entry("/t", type_name, make(ros1), STAMP)),
@@ -70,12 +70,12 @@ def ros_rows(type_name: str, make) -> dict[str, Row]:
 
 
 def foxglove_rows(name: str, fields) -> dict[str, Row]:
-    """A message in all encodings of Foxglove's schemas."""
+    """Return a message of a Foxglove schema in all encodings."""
     return {encoding: foxglove_row("/t", name, fields, STAMP, encoding) for encoding in FOXGLOVE_ENCODINGS}
 
 
 def check(rows: dict[str, Row], expected, *, stamped: str | None = "camera") -> None:
-    """Every row gives the record, and its stamp and frame without it."""
+    """Check that each row gives the record, and that its stamp and frame are read without decoding."""
     for dialect, row in rows.items():
         message = row.message()
         if isinstance(expected, Transforms) and kind_of(message.type_name) is Kind.TF:
@@ -95,7 +95,7 @@ def test_images():
     check(rows, Image(STAMP, "camera", 3, 4, "16UC1", False, 10, data))
 
 
-def test_big_endian_images_say_so():
+def test_big_endian_images_are_marked():
     pixels = np.arange(12, dtype=np.uint16).reshape(3, 4)
     rows = ros_rows("sensor_msgs/msg/Image", lambda f: f.image(STAMP, pixels, "mono16", big_endian=True))
     check(rows, Image(STAMP, "camera", 3, 4, "mono16", True, 8, pixels.astype(">u2").tobytes()))
@@ -121,7 +121,7 @@ def test_cameras():
     check(rows, Calibration(STAMP, "camera", 64, 48, "plumb_bob", *matrices, (2, 3), (4, 5, 30, 20)))
 
 
-def test_a_camera_without_p_has_none():
+def test_a_camera_without_p_has_zeros():
     fields = {**STAMPED, "width": 64, "height": 48, "distortion_model": "", "D": [], "K": [1.0] * 9, "R": [1.0] * 9}
     for encoding in ("protobuf", "json"):
         found = foxglove_row("/t", "CameraCalibration", {**fields, "P": []}, STAMP, encoding).message().sensor_message()
@@ -137,7 +137,7 @@ def test_clouds():
     message = ros2.cloud(STAMP, columns, gap=3)
     data = message.data.tobytes()
     offsets = [field.offset for field in message.fields]
-    # Foxglove's numbers of the types, in the order of KINDS.
+    # Foxglove's type codes, in the order of KINDS.
     fields = [{"name": "abcdefgh"[i], "offset": offsets[i], "type": i + 1} for i in range(8)]
     cloud = {**STAMPED, "pose": foxglove_pose((0, 0, 0)), "point_stride": message.point_step, "fields": fields}
     rows |= foxglove_rows("PointCloud", {**cloud, "data": data})
@@ -157,7 +157,7 @@ def test_the_pose_of_a_cloud_or_scan_is_a_transform(encoding, length):
     np.testing.assert_allclose(found.T_frame_scan, pose_matrix((1, 2, 3), TURN), atol=1e-12)
 
 
-def test_a_pose_that_was_left_out_is_none():
+def test_an_unset_pose_is_none():
     cloud = {**STAMPED, "point_stride": 4, "fields": [], "data": b""}
     assert foxglove_row("/t", "PointCloud", cloud, STAMP, "protobuf").message().sensor_message().T_frame_cloud is None
     pose = foxglove_pose((1, 2, 3), (0, 0, 0, 0))
@@ -168,14 +168,14 @@ def test_a_pose_that_was_left_out_is_none():
 @pytest.mark.parametrize(
     "bad", [((math.nan, 0, 0), IDENTITY), ((1, 0, 0), (math.nan, 0, 0, 1)), ((0, 0, 0), (1e-9, 0, 0, 0))]
 )
-def test_a_pose_that_is_none_is_damage(bad):
+def test_an_invalid_pose_is_damage(bad):
     cloud = {**STAMPED, "pose": foxglove_pose(*bad), "point_stride": 4, "fields": [], "data": b""}
     with pytest.raises(DamagedMessageError):
         foxglove_row("/t", "PointCloud", cloud, STAMP, "protobuf").message().sensor_message()
 
 
 def test_scans():
-    # Numbers that float32 holds.
+    # Numbers that float32 represents exactly.
     ranges = [1.0, 2.5, math.inf, 0.25]
     rows = ros_rows(
         "sensor_msgs/msg/LaserScan", lambda f: f.scan(STAMP, ranges, angle_min=-0.5, frame_id="camera", limits=(0.5, 8))
@@ -215,7 +215,7 @@ def test_poses_and_odometry():
     check(with_covariance, Transforms((StampedTransform(STAMP, "a", "", (1.0, 2.0, 3.0), IDENTITY),)), stamped="a")
 
 
-def test_paths_give_their_frame_to_poses_without_one():
+def test_poses_without_a_frame_have_that_of_the_path():
     def make(factory):
         poses = [factory.pose_stamped(STAMP, (1, 2, 3), TURN, frame_id=frame) for frame in ("", "other")]
         return factory.path(STAMP, poses, frame_id="camera")
@@ -239,7 +239,7 @@ def test_label_names():
     check({"ros2": row}, LabelNames({4: "x", 2: "y"}), stamped="camera")
 
 
-def test_kinds_are_known_by_every_name_of_a_type():
+def test_kinds_of_all_names_of_a_type():
     assert kind_of("foxglove_msgs/msg/PointCloud") is kind_of("foxglove.PointCloud") is Kind.CLOUD
     assert kind_of("std_msgs/msg/String") is None
     assert {kind_of(name) for name in sensor_messages._TYPES} == set(Kind)
@@ -247,7 +247,7 @@ def test_kinds_are_known_by_every_name_of_a_type():
 
 @pytest.mark.parametrize("value", [None, [], 3, "text", SimpleNamespace(), SimpleNamespace(header=None)])
 @pytest.mark.parametrize("type_name", [*sensor_messages._TYPES, "std_msgs/msg/String"])
-def test_anything_else_is_damage(type_name, value):
+def test_missing_fields_and_unused_types_are_damage(type_name, value):
     with pytest.raises(DamagedMessageError):
         convert(type_name, value)
 
@@ -271,8 +271,8 @@ ODD = [None, -1, 1e300, math.nan, math.inf, 10**400, "text", [], [[1], [2]], {},
         ("FrameTransform", foxglove_transform("a", "b", STAMP, (0, 0, 0))),
     ],
 )  # fmt: skip
-def test_odd_json_gives_a_record_or_damage_and_nothing_else(name, fields):
-    """Each value of a message, also within its parts, is replaced by odd ones."""
+def test_invalid_json_values_give_a_record_or_damage(name, fields):
+    """Each value of a message, also in nested messages, is replaced by invalid ones."""
 
     def variants(value):
         yield from ODD

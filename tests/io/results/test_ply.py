@@ -12,7 +12,7 @@ from support.result_factory import leaf_table
 COLORS = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9], [250, 251, 252]], dtype=np.uint8)
 
 
-def test_points_hold_centres_colours_and_what_is_there(tmp_path: Path) -> None:
+def test_points_hold_centres_colours_labels_and_probabilities(tmp_path: Path) -> None:
     leaves = leaf_table()
     ply.write_points(tmp_path / "a.ply", leaves, COLORS, ["first", "second"])
     data = PlyData.read(tmp_path / "a.ply")
@@ -72,7 +72,7 @@ def test_an_empty_map_is_an_empty_file(tmp_path: Path) -> None:
         assert len(PlyData.read(tmp_path / "a.ply")["vertex"].data) == 0
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"none/a\.ply: cannot be written: No such file"):
         ply.write_points(tmp_path / "none" / "a.ply", leaf_table(), COLORS)
     (tmp_path / "folder.ply").mkdir()

@@ -11,10 +11,27 @@ from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
 from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
 
+
+class CountedFile:
+    """A file that counts the bytes read."""
+
+    def __init__(self, file) -> None:
+        self._file = file
+        self.num_bytes = 0
+
+    def read(self, *size: int) -> bytes:
+        data = self._file.read(*size)
+        self.num_bytes += len(data)
+        return data
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
+
+
 METRICS = [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
 
 
-def test_what_was_written_comes_back(tmp_path: Path) -> None:
+def test_a_written_result_is_read(tmp_path: Path) -> None:
     path = write_result(tmp_path)
     with ResultReader(path) as reader:
         assert reader.metrics() == METRICS
@@ -29,7 +46,7 @@ def test_what_was_written_comes_back(tmp_path: Path) -> None:
     assert read.lost_data
 
 
-def test_numbers_of_the_configuration_come_back_exactly(tmp_path: Path) -> None:
+def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:
     values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
     config = team(tmp_path).with_parameters(values)
     with ResultWriter(tmp_path / "out.mcap", config) as writer:
@@ -61,6 +78,40 @@ def test_states_lead_from_the_last_key_frame(tmp_path: Path) -> None:
             reader.states("alpha", START)
 
 
+def test_one_tick_or_time_is_read_without_the_rest(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def fill(writer: ResultWriter) -> None:
+        # Random bytes that cannot be compressed: each chunk holds a few states. Every tenth is a key frame.
+        for tick in range(1, 101):
+            data = rng.bytes(300_000)
+            writer.write_state(state("alpha", tick, tick, data, key=tick % 10 == 1))
+
+    path = write_result(tmp_path, fill)
+    for tick, num_chunks in ((5, 8), (50, 14), (100, 14)):
+        with ResultReader(path) as reader:
+            stamp = reader.state_stamp("alpha", tick)
+            assert stamp == START + tick * SECOND
+            assert [entry.tick for entry in reader.states("alpha", stamp)] == list(
+                range((tick - 1) // 10 * 10 + 1, tick + 1)
+            )
+        with ResultReader(path) as reader:
+            reader._reader._stream = counted = CountedFile(reader._reader._stream)
+            reader.states("alpha", reader.state_stamp("alpha", tick))
+            assert counted.num_bytes < num_chunks * 1_500_000 < path.stat().st_size
+
+
+def test_stamps_of_ticks_that_are_not_evenly_spaced(tmp_path: Path) -> None:
+    states = [state("alpha", 0, 1, b"a", key=True), state("alpha", 1, 3, b"b"), state("alpha", 2, 7, b"c")]
+    moved = [dataclasses.replace(s, stamp_ns=s.stamp_ns + i * SECOND // 3) for i, s in enumerate(states)]
+    with ResultReader(write_result(tmp_path, lambda writer: [writer.write_state(s) for s in moved] and None)) as reader:
+        assert [reader.state_stamp("alpha", s.tick) for s in moved] == [s.stamp_ns for s in moved]
+        assert reader.state_stamp("alpha", 2) is None
+        assert reader.state_stamp("beta", 1) is None
+        with pytest.raises(InputError, match="robot 'gamma' not found"):
+            reader.state_stamp("gamma", 1)
+
+
 def test_a_delta_may_build_on_an_older_state(tmp_path: Path) -> None:
     states = [state("alpha", 0, 1, b"a", key=True), state("alpha", 1, 2, b"b")]
     states.append(dataclasses.replace(state("alpha", 2, 3, b"c"), base_sequence=0))
@@ -76,7 +127,7 @@ def test_a_missing_key_frame_is_damage(tmp_path: Path) -> None:
         reader.states("alpha")
 
 
-def test_poses_are_the_sensors(tmp_path: Path) -> None:
+def test_poses_are_those_of_the_sensors(tmp_path: Path) -> None:
     with ResultReader(write_result(tmp_path)) as reader:
         stamps, poses = reader.poses("alpha")
     assert stamps == [START + tick * SECOND for tick in range(1, 5)]
@@ -91,7 +142,7 @@ def test_an_unknown_robot_is_named_with_the_known_ones(tmp_path: Path) -> None:
                 ask("gamma")
 
 
-def test_changed_and_missing_inputs_are_told(tmp_path: Path) -> None:
+def test_changed_and_missing_inputs_are_reported(tmp_path: Path) -> None:
     path = write_result(tmp_path)
     with ResultReader(path) as reader:
         assert reader.changed_inputs() == []
@@ -102,7 +153,7 @@ def test_changed_and_missing_inputs_are_told(tmp_path: Path) -> None:
     assert second.endswith("beta.bag: input of result.mcap is missing")
 
 
-def test_a_moved_result_finds_the_logs_that_moved_with_it(tmp_path: Path) -> None:
+def test_logs_are_found_relative_to_a_moved_result(tmp_path: Path) -> None:
     (tmp_path / "before").mkdir()
     write_result(tmp_path / "before")
     (tmp_path / "before").rename(tmp_path / "after")
@@ -123,14 +174,14 @@ def test_an_interrupted_result_can_be_read(tmp_path: Path) -> None:
     assert read.peak_total_distance == METRICS[1].total_distance
 
 
-def test_a_result_without_a_tick_says_so(tmp_path: Path) -> None:
+def test_a_result_without_ticks_has_no_summary(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_until(KeyboardInterrupt, tmp_path / "o.mcap", [])
     with ResultReader(tmp_path / "o.partial.mcap") as reader, pytest.raises(InputError, match="holds no tick"):
         reader.summary(reader.metrics())
 
 
-def test_other_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_files_that_are_not_results_are_input_errors(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.mcap: cannot be read: No such file"):
         ResultReader(tmp_path / "none.mcap")
     for content in (b"", b"not an MCAP", b"\x89MCAP0\r\n" + bytes(100)):
@@ -144,14 +195,14 @@ def test_other_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
         ResultReader(tmp_path / "log.mcap")
 
 
-def test_a_later_format_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_later_format_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("octoreplay.io.results.result_writer.FORMAT_VERSION", "3")
     path = write_result(tmp_path)
     with pytest.raises(InputError, match="result format 3, this version reads 2"):
         ResultReader(path)
 
 
-def test_damage_is_one_sentence_or_harmless(tmp_path: Path) -> None:
+def test_damaged_results_raise_only_input_errors(tmp_path: Path) -> None:
     def fill(writer: ResultWriter) -> None:
         writer.write_state(state("alpha", 0, 1, bytes(range(256)), key=True))
 
@@ -172,7 +223,7 @@ def test_damage_is_one_sentence_or_harmless(tmp_path: Path) -> None:
     assert all(sentence.startswith(str(damaged)) for sentence in sentences)
 
 
-def test_every_cut_of_a_result_is_one_sentence(tmp_path: Path) -> None:
+def test_cut_results_are_input_errors(tmp_path: Path) -> None:
     data = write_result(tmp_path).read_bytes()
     cut = tmp_path / "cut.mcap"
     for length in range(0, len(data), max(1, len(data) // 60)):

@@ -38,7 +38,7 @@ def metadata(path: Path) -> dict[str, dict[str, str]]:
 
 def test_rosbags_reads_every_message_by_the_schemas_in_the_file(tmp_path: Path) -> None:
     path = write_result(tmp_path, fill)
-    # A bare store: octoreplay's own types can only come from the file.
+    # An empty type store: octoreplay's types can only come from the file.
     with AnyReader([path], default_typestore=get_typestore(Stores.EMPTY)) as reader:
         seen: dict[str, list[tuple[int, object]]] = {}
         for connection, stamp, raw in reader.messages():
@@ -122,7 +122,7 @@ def test_frames_and_graph_show_where_the_robots_are(tmp_path: Path) -> None:
     assert [name.text for name in names] == ["alpha", "beta"]
 
 
-def test_a_graph_without_links_takes_the_old_lines_away(tmp_path: Path) -> None:
+def test_a_graph_without_links_deletes_the_old_lines(tmp_path: Path) -> None:
     poses = [pose("alpha", 1.0), pose("beta", 2.0)]
     path = write_result(tmp_path, lambda writer: writer.write_graph(START + 9 * SECOND, [], poses))
     with AnyReader([path]) as reader:
@@ -141,14 +141,14 @@ def test_quaternions_are_those_of_scipy(seed: int) -> None:
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
-def test_half_turns_have_a_quaternion_too(axis: tuple[int, int, int]) -> None:
+def test_quaternions_of_half_turns(axis: tuple[int, int, int]) -> None:
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
     q = _quaternion(transform)
     np.testing.assert_allclose(np.abs([q.x, q.y, q.z, q.w]), [*axis, 0], atol=1e-12)
 
 
-def test_metadata_says_what_was_run(tmp_path: Path) -> None:
+def test_metadata_describe_the_run(tmp_path: Path) -> None:
     records = metadata(write_result(tmp_path))
     assert records["octoreplay"]["format_version"] == "2"
     assert json.loads(records["octoreplay"]["robots"]) == ["alpha", "beta"]
@@ -187,7 +187,7 @@ def test_the_result_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     assert not partial_path(out).exists()
 
 
-def test_an_error_leaves_no_half_result(tmp_path: Path) -> None:
+def test_an_error_leaves_no_incomplete_result(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     with pytest.raises(ZeroDivisionError):
         write_until(ZeroDivisionError, out, [tick_metrics(1)])

@@ -44,5 +44,5 @@ def test_flipped_bits_and_cuts_are_refused():
 def test_unknown_formats_are_refused(place, value):
     body = bytearray(encode_acknowledgement(SAMPLE)[:-4])
     body[place] = value
-    with pytest.raises(PacketError, match="format that this octoreplay does not know"):
+    with pytest.raises(PacketError, match="of an unknown format version"):
         decode_acknowledgement(bytes(body) + struct.pack("<I", zlib.crc32(body)))

@@ -120,29 +120,29 @@ def test_a_robot_has_what_it_scanned_while_it_was_on_and_has_not_forgotten():
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ([ScheduleEntry(3.0, 4.0)], r"the entry from 3 s to 4 s says nothing; give it groups, links_down"),
+        ([ScheduleEntry(3.0, 4.0)], r"the entry from 3 s to 4 s has no effect; give it groups, links_down"),
         ([ScheduleEntry(3.0, links_down=(("spot", "spot"),))], r"'spot' cannot have a link to itself \(from 3 s on\)"),
         ([ScheduleEntry(3.0, links_up=(("spot", "spot"),))], r"'spot' cannot have a link to itself"),
-        ([ScheduleEntry(3.0, groups=(("spot", "husky"),))], r"one group alone cuts no link \(from 3 s on\); name"),
+        ([ScheduleEntry(3.0, groups=(("spot", "husky"),))], r"one group alone cuts no link \(from 3 s on\); list"),
         ([ScheduleEntry(3.0, groups=((), ()))], r"one group alone cuts no link"),
         (
             [ScheduleEntry(3.0, 5.0, groups=(("spot", "husky"), ("jackal", "spot")))],
-            r"'spot' is twice in the groups from 3 s to 5 s; name it in one group",
+            r"'spot' is in two groups from 3 s to 5 s; list it in one group",
         ),
         (
             [ScheduleEntry(20.0, robots_silent=("spot",)), ScheduleEntry(0.0, 30.0, robots_off=("husky", "spot"))],
-            r"robot 'spot' is in it twice at 20 s \(from 0 s to 30 s, and from 20 s on\); end the one before the other",
+            r"robot .spot. is in two entries at 20 s \(from 0 s to 30 s, and from 20 s on\); end one before the other",
         ),
         (
             [
                 ScheduleEntry(0.0, 30.0, groups=(("husky", "warthog"), ("jackal", "spot"))),
                 ScheduleEntry(20.0, 25.0, links_up=(("spot", "husky"),)),
             ],
-            r"link 'husky' - 'spot' is in it twice at 20 s",
+            r"link 'husky' - 'spot' is in two entries at 20 s",
         ),
         (
             [ScheduleEntry(0.0, 30.0, groups=(("husky",), ("spot",)), links_up=(("spot", "husky"),))],
-            r"link 'husky' - 'spot' is in it twice at 0 s",
+            r"link 'husky' - 'spot' is in two entries at 0 s",
         ),
         ([ScheduleEntry(0.0, links_down=(("spot", "husky"), ("husky", "spot")))], r"link 'husky' - 'spot' is in it"),
         ([ScheduleEntry(0.0, robots_off=("spot",), robots_silent=("spot",))], r"robot 'spot' is in it twice"),

@@ -1,6 +1,6 @@
-"""ROS 1 bags, whole, cut or damaged: an index of chunks, and lazy reading in log-time order.
+"""Reader of ROS 1 bags, also cut and damaged ones.
 
-The index comes from the records at the bag's end, else from one pass over the file. Format:
+The index of chunks is read from the records at the bag's end, else built in one pass over the file. Format:
 http://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from typing import IO
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.bag_pass import CUT_CHUNK, BagPass
+from octoreplay.io.containers.bag_pass import BagPass
 from octoreplay.io.containers.bag_records import (
     CHUNK_INFO,
     CONNECTION,
@@ -23,7 +23,7 @@ from octoreplay.io.containers.bag_records import (
     walk_messages,
     whole_records,
 )  # fmt: skip
-from octoreplay.io.containers.block_log import Block, BlockLog, Entry, Index
+from octoreplay.io.containers.block_log import CUT_CHUNK, Block, BlockLog, Entry, Index
 from octoreplay.io.messages.decoders import Bytes
 
 _TIME = struct.Struct("<II")
@@ -31,13 +31,13 @@ _COUNT = struct.Struct("<II")
 
 
 class BagLog(BlockLog):
-    """A ROS 1 bag. A damaged one gives everything that is whole, and ``damage`` says what was skipped.
+    """A ROS 1 bag. Of a damaged bag all intact messages are read, and ``damage`` describes what was skipped.
 
-    Raises InputError where the file cannot be opened, is encrypted, or holds neither an index nor a whole message.
+    Raises InputError where the file cannot be opened, is encrypted, or holds neither an index nor a complete message.
     """
 
     def _read_index(self) -> Index:
-        """The index: from the records at the end, else from one pass over the file."""
+        """Return the index from the records at the end, else from one pass over the file."""
         header = read_head(self._file, len(MAGIC), self._size)
         if header is not None and header.fields.get("encryptor"):
             raise InputError(f"{self.path}: cannot be read: the bag is encrypted")
@@ -46,14 +46,14 @@ class BagLog(BlockLog):
             return index
         index = BagPass(self._file, self._size, self._damage).index()
         if not index.blocks:
-            raise InputError(f"{self.path}: cannot be read: the bag has no index and holds no whole message")
+            raise InputError(f"{self.path}: cannot be read: the bag has no index and holds no complete message")
         return index
 
     def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
-        """The messages of the wanted connections in a chunk."""
+        """Yield the messages of the wanted connections in a chunk."""
         records = self._records(block)
         if records is None:
-            self._damage.skip("chunk", block.offset, block.num_messages)
+            self._damage.skip_part("chunk", block.offset, block.num_messages)
             return
         count = 0
         for channel_id, log_time_ns, start, end in walk_messages(records):
@@ -61,10 +61,10 @@ class BagLog(BlockLog):
             if channel_id in wanted:
                 yield log_time_ns, block.offset, start, end, channel_id, records
         if block.num_messages is not None and count < block.num_messages:
-            self._damage.skip("part", block.offset, block.num_messages - count)
+            self._damage.skip_part("part", block.offset, block.num_messages - count)
 
     def _records(self, block: Block) -> Bytes | None:
-        """The records in a chunk; None where they cannot be read."""
+        """Return the records in a chunk; None where they cannot be read."""
         try:
             head = read_head(self._file, block.offset, block.offset + block.length)
         except OSError:
@@ -79,7 +79,7 @@ class BagLog(BlockLog):
 
 
 def _index_from_end(file: IO[bytes], size: int) -> Index | None:
-    """The index that the records at the end hold; None where they are missing or damaged."""
+    """Return the index given by the records at the end; None where they are missing or damaged."""
     header = read_head(file, len(MAGIC), size)
     if header is None or not len(MAGIC) < header.number("index_pos") <= size:
         return None
@@ -97,15 +97,15 @@ def _index_from_end(file: IO[bytes], size: int) -> Index | None:
         position = head.end
     if (len(index.channels), len(infos)) != (header.number("conn_count"), header.number("chunk_count")):
         return None
-    # A chunk ends before the next one begins, or a file could be read any number of times.
+    # A chunk ends where the next one begins, so that no byte is read twice.
     infos.sort(key=lambda info: info[0].number("chunk_pos"))
     ends = [head.number("chunk_pos") for head, _ in infos[1:]] + [end]
-    is_good = all(_take_info(index, head, data, end) for (head, data), end in zip(infos, ends, strict=False))
+    is_good = all(_add_chunk_info(index, head, data, end) for (head, data), end in zip(infos, ends, strict=False))
     return index if is_good else None
 
 
-def _take_info(index: Index, head: RecordHead, data: bytes, end: int) -> bool:
-    """Take what a chunk info record says of a chunk before a byte; False where it is damaged."""
+def _add_chunk_info(index: Index, head: RecordHead, data: bytes, end: int) -> bool:
+    """Add the chunk of a chunk info record, which ends before the byte ``end``; False where the record is damaged."""
     position, times = head.number("chunk_pos"), [head.fields.get(name, b"") for name in ("start_time", "end_time")]
     if len(data) != _COUNT.size * head.number("count") or not len(MAGIC) <= position < end:
         return False
@@ -118,6 +118,9 @@ def _take_info(index: Index, head: RecordHead, data: bytes, end: int) -> bool:
     for channel_id, count in counts.items():
         index.tally.add(channel_id, start_ns, count, end_ns)
     if counts:
-        block = Block(position, end - position, start_ns, frozenset(counts), num_messages=sum(counts.values()))
-        index.blocks.append(block)
+        num_messages = sum(counts.values())
+        last_ns = end_ns if end_ns >= start_ns else None
+        index.blocks.append(
+            Block(position, end - position, start_ns, last_ns, frozenset(counts), num_messages=num_messages)
+        )
     return True

@@ -1,4 +1,4 @@
-"""The records of ROS 1 bags as bytes: their heads, and the chunks that hold messages.
+"""Parsing of the records of ROS 1 bags: record headers, sequences of records and chunks.
 
 Format: http://wiki.ros.org/Bags/Format/2.0
 """
@@ -19,14 +19,14 @@ MESSAGE, BAG_HEADER, INDEX_DATA, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 
 _MAX_HEAD_BYTES = 1 << 20
 _UINT32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
-# The fields of a message's head, in any order; other heads are longer.
+# The fields of a message's header, in any order. Headers of other records are longer.
 _MESSAGE_HEAD = re.compile(
     rb"(?:\x04\0\0\0op=\x02|\x09\0\0\0conn=(?P<conn>.{4})|\x0d\0\0\0time=(?P<time>.{8})){3}", re.DOTALL
 )
 
 
 class RecordHead(NamedTuple):
-    """The fields of a record's head, and where its data are in the file."""
+    """Header of a record: its fields, and start and length of the record's data in the file [bytes]."""
 
     fields: Mapping[str, bytes]
     start: int
@@ -34,23 +34,23 @@ class RecordHead(NamedTuple):
 
     @property
     def operation(self) -> int:
-        """What kind of record it is; -1 where it does not say."""
+        """Kind of the record, its field ``op``; -1 where it is missing."""
         value = self.fields.get("op", b"")
         return value[0] if len(value) == 1 else -1
 
     @property
     def end(self) -> int:
-        """Where the next record starts."""
+        """End of the record's data."""
         return self.start + self.length
 
     def number(self, name: str) -> int:
-        """A field as an unsigned number; -1 where it is missing."""
+        """Return a field as an unsigned number; -1 where it is missing."""
         value = self.fields.get(name)
         return -1 if value is None else int.from_bytes(value, "little")
 
 
 def read_head(file: IO[bytes], position: int, limit: int) -> RecordHead | None:
-    """The head of the record at a byte; None where none ends before another byte. Its data may go beyond that."""
+    """Read the header of the record at a byte; None where it is damaged or ends after ``limit``. The data may."""
     file.seek(position)
     head_length = int.from_bytes(file.read(4), "little")
     start = position + 4 + head_length + 4
@@ -64,7 +64,7 @@ def read_head(file: IO[bytes], position: int, limit: int) -> RecordHead | None:
 
 
 def fields_of(head: Bytes) -> dict[str, bytes] | None:
-    """The fields ``name=value`` of a head; None where it is damaged."""
+    """Return the fields ``name=value`` of a record header; None where it is damaged."""
     fields: dict[str, bytes] = {}
     position = 0
     while position < len(head):
@@ -80,7 +80,7 @@ def fields_of(head: Bytes) -> dict[str, bytes] | None:
 
 
 def walk(records: Bytes) -> Iterator[tuple[int, int, int]]:
-    """(start of the head, start of the data, end) of each whole record in a chunk."""
+    """Yield (start of the header, start of the data, end) of each complete record in a chunk."""
     position, size = 0, len(records)
     while position + 4 <= size:
         (head_length,) = _UINT32.unpack_from(records, position)
@@ -95,7 +95,7 @@ def walk(records: Bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def message_head(records: Bytes, start: int, end: int) -> tuple[int, int] | None:
-    """(connection, log time in nanoseconds) of a message's head between two bytes; None for any other head."""
+    """Return (connection, log time [ns]) of a message's header between two bytes; None for other headers."""
     match = _MESSAGE_HEAD.fullmatch(records, start, end)
     if match is None or match["conn"] is None or match["time"] is None:
         return None
@@ -104,7 +104,7 @@ def message_head(records: Bytes, start: int, end: int) -> tuple[int, int] | None
 
 
 def walk_messages(records: Bytes) -> Iterator[tuple[int, int, int, int]]:
-    """(connection, log time in nanoseconds, start, end) of each whole message in a chunk."""
+    """Yield (connection, log time [ns], start, end) of each complete message in a chunk."""
     for head_start, start, end in walk(records):
         message = message_head(records, head_start, start - 4)
         if message is not None:
@@ -112,7 +112,7 @@ def walk_messages(records: Bytes) -> Iterator[tuple[int, int, int, int]]:
 
 
 def whole_records(head: RecordHead, data: bytes) -> Bytes | None:
-    """The records of a chunk; None where it is no chunk, or its sizes do not fit."""
+    """Return the records of a chunk; None for another record, or where its sizes do not match."""
     if head.operation != CHUNK or len(data) != head.length:
         return None
     compression, size = head.fields.get("compression", b"").decode("ascii", "replace"), head.number("size")
@@ -123,13 +123,13 @@ def whole_records(head: RecordHead, data: bytes) -> Bytes | None:
 
 
 def cut_records(head: RecordHead, data: bytes) -> Bytes:
-    """The records of a chunk whose end is missing, as far as they can be decompressed."""
+    """Return the records of a chunk that is cut, up to where they can be decompressed."""
     compression = head.fields.get("compression", b"").decode("ascii", "replace")
     return decompress(compression, memoryview(data), max(0, head.number("size")))
 
 
 def channel_of(fields: Mapping[str, bytes], data: Bytes) -> Channel | None:
-    """The channel of a connection record's fields and data; None where it is damaged."""
+    """Return the channel given by a connection record's fields and data; None where it is damaged."""
     details = fields_of(data)
     if details is None or len(fields.get("conn", b"")) != 4:
         return None
@@ -140,5 +140,5 @@ def channel_of(fields: Mapping[str, bytes], data: Bytes) -> Channel | None:
 
 
 def _single_slashes(topic: str) -> str:
-    """A topic's name without empty parts."""
+    """Return a topic's name without repeated and trailing slashes."""
     return "/" * topic.startswith("/") + "/".join(part for part in topic.split("/") if part)

@@ -1,4 +1,4 @@
-"""What could not be read of a log: counted as it is come upon, and said in one sentence."""
+"""Record of what could not be read of a log, and its description in one sentence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 class Damage:
-    """The damage of one log, as far as it has been read; nothing is counted twice, however often it is read."""
+    """Damage found in one log so far. Damage at one place counts once, however often the place is read."""
 
     def __init__(self) -> None:
         self._notes: dict[str, None] = {}
@@ -15,24 +15,24 @@ class Damage:
         self._messages: dict[object, int] = {}
 
     def note(self, clause: str) -> None:
-        """Remember something about the whole log, such as 'cut before its end'."""
+        """Record damage of the log as a whole, such as 'cut before its end'."""
         self._notes[clause] = None
 
-    def skip(self, noun: str, offset: int, num_messages: int | None) -> None:
-        """Count a part that was left out: what it is, where it is, and its messages (None: nobody knows)."""
+    def skip_part(self, noun: str, offset: int, num_messages: int | None) -> None:
+        """Record a skipped part, named by ``noun``, at an offset with its number of messages (None: unknown)."""
         self._parts[noun, offset] = num_messages
 
-    def lose(self, where: object, num_messages: int) -> None:
-        """Count single messages that were left out somewhere; the most that was said of a place stands."""
+    def skip_messages(self, where: object, num_messages: int) -> None:
+        """Record messages skipped at a place; of several numbers for one place the greatest counts."""
         self._messages[where] = max(num_messages, self._messages.get(where, 0))
 
     @property
     def clauses(self) -> tuple[str, ...]:
-        """What is wrong and what was skipped, for a sentence; empty for a good log."""
+        """Clauses on what is damaged and what was skipped; empty for a good log."""
         return (*self._notes, *self._skipped_parts(), *self._skipped_messages())
 
     def _skipped_parts(self) -> tuple[str, ...]:
-        """How many parts were left out, with how many messages."""
+        """Clause on the number of skipped parts and their messages; empty without any."""
         if not self._parts:
             return ()
         nouns = {noun for noun, _ in self._parts}
@@ -46,18 +46,18 @@ class Damage:
         return (f"{counted(len(self._parts), f'damaged {noun}')} with {messages} {_were(len(self._parts))} skipped",)
 
     def _skipped_messages(self) -> tuple[str, ...]:
-        """How many single messages were left out."""
+        """Clause on the number of skipped single messages; empty without any."""
         total = sum(self._messages.values())
         return (f"{counted(total, 'damaged message')} {_were(total)} skipped",) if total else ()
 
 
 def damage_sentence(path: Path, clauses: Sequence[str]) -> str | None:
-    """A log and what is wrong with it in one sentence; None where nothing is."""
+    """Return one sentence on the damage of a log; None without clauses."""
     return f"{path}: {', and '.join(clauses)}; everything else is used" if clauses else None
 
 
 def counted(number: int, noun: str) -> str:
-    """A number and its noun, in the plural where it is not one."""
+    """Return a number with its noun, in the plural unless the number is 1."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 

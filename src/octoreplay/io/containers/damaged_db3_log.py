@@ -1,6 +1,6 @@
-"""rosbag2's sqlite3 files that are cut or damaged: every row that can still be read, by row number.
+"""Reader of cut and damaged sqlite3 files of rosbag2: every row that can still be read, by row number.
 
-A cut takes the index of times with it, which the recorder wrote among the rows, so nothing is asked for by time.
+The index of times is not used: its pages lie among those of the rows, and a cut removes some of them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _DEFINITIONS = "rowid, topic_type, encoding, encoded_message_definition"
 
 
 class DamagedDb3Log(BlockLog):
-    """A sqlite3 recording that is cut or damaged. Raises InputError where not even its tables can be found."""
+    """A sqlite3 recording that is cut or damaged. Raises InputError where its tables cannot be found."""
 
     def __init__(self, path: Path) -> None:
         self._database = sqlite3.connect(":memory:")
@@ -42,7 +42,7 @@ class DamagedDb3Log(BlockLog):
 
     @property
     def damage_clauses(self) -> tuple[str, ...]:
-        """What is wrong and what was skipped; empty for a good database."""
+        """Clauses on what is damaged and what was skipped; empty for a good database."""
         return super().damage_clauses or (() if self._is_sound else ("its pages are damaged, and rows may be missing",))
 
     def close(self) -> None:
@@ -51,7 +51,7 @@ class DamagedDb3Log(BlockLog):
         self._database.close()
 
     def _read_index(self) -> Index:
-        """The index of blocks of rows, from one pass over the rows' heads."""
+        """Return the index of blocks of rows, from one pass over row number, topic, time and length of the rows."""
         try:
             self._database.close()
             self._database = _connect(self.path, self._size)
@@ -65,7 +65,7 @@ class DamagedDb3Log(BlockLog):
             self._cut_end = last_page.rstrip(b"\0")[-_COMPARED_BYTES:]
         index = Index(self._read_channels())
         if not index.channels or "messages" not in self._tables:
-            raise InputError(f"{self.path}: cannot be read: its table of topics or of messages is lost")
+            raise InputError(f"{self.path}: cannot be read: its table of topics or its table of messages is lost")
         builder, first, last, num_bytes, next_row = BlockBuilder(index.tally), 0, 0, 0, 0
         for row, topic_id, timestamp, length in self._rows("messages", _HEADS, 0, _MAX_ROW):
             if builder.num_messages and (num_bytes > _BLOCK_BYTES or row != next_row):
@@ -77,36 +77,36 @@ class DamagedDb3Log(BlockLog):
                 builder.add(topic_id, timestamp)
                 num_bytes += length
         index.blocks += builder.build(first, last - first + 1)
-        self._damage.lose(-1, index.tally.drop_unknown(index.channels))
+        self._damage.skip_messages(-1, index.tally.drop_unknown(index.channels))
         self._is_sound = bool(self._damage.clauses) or self._has_sound_pages()
         return index
 
     def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
-        """The messages of the wanted topics in some rows."""
+        """Yield the messages of the wanted topics in a block of rows."""
         for row, topic_id, timestamp, data in self._rows("messages", _ROWS, block.offset, block.offset + block.length):
             if topic_id not in wanted or not isinstance(timestamp, int) or not isinstance(data, bytes):
                 continue
             if self._is_cut(data):
-                self._damage.skip("part", row, 1)
+                self._damage.skip_part("part", row, 1)
             else:
                 yield timestamp, row, 0, len(data), topic_id, data
 
     def _is_cut(self, data: bytes) -> bool:
-        """True where the file ends within a row: SQLite takes what is missing of the last page for zeros."""
+        """Return True if the file ends within the row ``data``; SQLite reads missing bytes as zeros."""
         if not self._cut_end:
             return False
         known = data.rstrip(b"\0")[-len(self._cut_end) :]
         return self._cut_end.endswith(known)
 
     def _has_sound_pages(self) -> bool:
-        """True where SQLite finds nothing wrong with the pages."""
+        """Return True if SQLite's check of the pages finds no damage."""
         try:
             return bool(self._database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
         except sqlite3.Error:
             return False
 
     def _read_channels(self) -> dict[int, Channel]:
-        """The topics as channels, with their definitions where the recording has them."""
+        """Return the topics as channels, with their types' definitions where the recording has them."""
         definitions = {
             type_name: (str(encoding), text.encode())
             for _, type_name, encoding, text in self._rows("message_definitions", _DEFINITIONS, 0, _MAX_ROW)
@@ -119,7 +119,7 @@ class DamagedDb3Log(BlockLog):
         }
 
     def _rows(self, table: str, columns: str, first: int, stop: int) -> Iterator[tuple[Any, ...]]:
-        """The rows of a table from a row number on and before another; those that cannot be read are passed over."""
+        """Yield the rows with ``first`` <= row number < ``stop``; rows that cannot be read are skipped."""
         if table not in self._tables:
             return
         query = f"SELECT {columns} FROM {table} WHERE rowid >= ? AND rowid < ? ORDER BY rowid"
@@ -127,13 +127,13 @@ class DamagedDb3Log(BlockLog):
             with suppress(sqlite3.Error, ValueError, OverflowError):
                 for row in self._database.execute(query, (first, stop)):
                     if row[0] < first:
-                        # A damaged page may lead back to where the rows began.
+                        # A damaged page may lead back to earlier rows.
                         break
                     yield row
                     first = row[0] + 1
                 else:
                     return
-            # The row before a damaged one is lost with it, as a cursor is one row ahead; asked for alone, it is there.
+            # A cursor is one row ahead, so damage also hides the row before it. Asked for alone, that row is found.
             row = self._next_row(f"{query} LIMIT 1", first, stop)
             if row is None:
                 self._note_gap(table, first, stop)
@@ -143,14 +143,14 @@ class DamagedDb3Log(BlockLog):
             first = row[0] + 1
 
     def _note_gap(self, table: str, first: int, stop: int) -> None:
-        """Count rows that cannot be read: recorders number them one by one. Where they end at all is unknown."""
+        """Record rows that cannot be read. Recorders number rows consecutively; the last row number is unknown."""
         if table == "messages" and first < stop:
-            self._damage.skip("part", first, stop - first if stop < _MAX_ROW else None)
+            self._damage.skip_part("part", first, stop - first if stop < _MAX_ROW else None)
 
     def _next_row(self, query: str, first: int, stop: int) -> tuple[Any, ...] | None:
-        """The next row from a number on that can be read; None where there is none.
+        """Return the next readable row from a row number on; None where there is none.
 
-        By doubling steps and halving them again: damaged pages hold runs of rows.
+        Damaged pages hold consecutive rows, so the search doubles its step until it finds a row, then bisects.
         """
         bad, good = first - 1, first
         while (row := self._row(query, good, stop)) is None:
@@ -164,7 +164,7 @@ class DamagedDb3Log(BlockLog):
         return row
 
     def _row(self, query: str, first: int, stop: int) -> tuple[Any, ...] | None:
-        """The first row from a number on; None where it cannot be read, or there is none before the end."""
+        """Return the first row from a row number on; None where it cannot be read or none is left before ``stop``."""
         if first >= stop:
             return None
         try:
@@ -175,18 +175,18 @@ class DamagedDb3Log(BlockLog):
 
 
 def _page_counts(header: bytes) -> tuple[int, int]:
-    """Bytes of a page and number of pages by a database's header (https://www.sqlite.org/fileformat.html, 1.3)."""
+    """Return page size [bytes] and number of pages (https://www.sqlite.org/fileformat.html, section 1.3)."""
     page_size = int.from_bytes(header[16:18], "big")
-    # 65536 does not fit into two bytes and is written as 1.
+    # A page size of 65536 is stored as 1, because it does not fit into two bytes.
     return 65536 if page_size == 1 else page_size, int.from_bytes(header[28:32], "big")
 
 
 def _connect(path: Path, size: int) -> sqlite3.Connection:
-    """A connection that reads a database whose end is missing, and makes no room for more than the file holds."""
+    """Open a database whose end may be missing; values are limited to the size of the file."""
     database = sqlite3.connect(f"file:{quote(str(path.absolute()))}?immutable=1", uri=True, check_same_thread=False)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, _BLOCK_BYTES))
     database.text_factory = lambda data: data.decode("utf-8", "replace")
-    # Without it, a database of fewer pages than it says is refused whole.
+    # Without it, SQLite refuses a database with fewer pages than its header gives.
     database.execute("PRAGMA writable_schema = ON")
     database.execute("PRAGMA trusted_schema = OFF")
     return database

@@ -1,4 +1,4 @@
-"""Fingerprints of input files: quick ones that do not read the whole file, and the full SHA-256."""
+"""Fingerprints of input files: fast ones of a part of the file, and the SHA-256 of all of it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from octoreplay.errors import InputError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 FOOTER_TAIL = 1 + 8 + 8 + 8 + 4 + len(MCAP_MAGIC)
-"""Bytes of an MCAP file from its footer record on: opcode, length, two offsets, CRC, magic."""
+"""Length of an MCAP file's end from its footer record on [bytes]: opcode, length, two offsets, CRC, magic."""
 EDGE = 1 << 20
-"""Bytes that are read from either end of a file that is no finished MCAP."""
+"""Bytes hashed at the beginning and at the end of a file that is not a finished MCAP file."""
 
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """What identifies one input file: path, size in bytes, what was hashed, and the hash in hexadecimal.
+    """Fingerprint of one input file: path, size [bytes], hashed part, and SHA-256 of this part in hexadecimal.
 
-    ``method`` is ``sha256`` (the whole file), ``mcap-summary`` (an MCAP's summary and footer) or ``edges``
-    (the first and the last MiB).
+    ``method`` is ``sha256`` (the whole file), ``mcap-summary`` (summary and footer of an MCAP file) or ``edges`` (the
+    first and the last MiB).
     """
 
     path: Path
@@ -31,7 +31,7 @@ class Fingerprint:
 
 
 def fingerprint(path: Path, *, whole: bool = False) -> Fingerprint:
-    """The fingerprint of one file; ``whole`` hashes all of it.
+    """Return the fingerprint of one file; ``whole`` hashes all of it.
 
     Raises InputError where the file cannot be read.
     """
@@ -51,12 +51,12 @@ def fingerprint(path: Path, *, whole: bool = False) -> Fingerprint:
 
 
 def log_files(log: Path) -> tuple[Path, ...]:
-    """The files of one log: itself, or all files of a folder (rosbag2), sorted."""
+    """Return the files of one log: the file itself, or all files of a rosbag2 folder, sorted."""
     return tuple(sorted(path for path in log.iterdir() if path.is_file())) if log.is_dir() else (log,)
 
 
 def _summary_start(stream: BinaryIO, size: int) -> int | None:
-    """Where a finished MCAP's summary starts; None for a cut one, one without a summary, or another format."""
+    """Return the offset of an MCAP file's summary; None for a cut file, one without a summary and other formats."""
     if size < len(MCAP_MAGIC) + FOOTER_TAIL or not _has_magic(stream, 0):
         return None
     if not _has_magic(stream, size - len(MCAP_MAGIC)):
@@ -72,7 +72,7 @@ def _has_magic(stream: BinaryIO, offset: int) -> bool:
 
 
 def _edges(stream: BinaryIO, size: int) -> str:
-    """Hash of the first and the last MiB; of a shorter file, of every byte once."""
+    """Return the hash of the first and the last MiB, or of every byte once where the file is shorter."""
     digest = hashlib.sha256()
     stream.seek(0)
     digest.update(stream.read(EDGE))

@@ -1,4 +1,4 @@
-"""rosbag2 folders: what their metadata says, and their files as one log."""
+"""Reader of rosbag2 folders: their metadata, and their files as one log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SPLIT_NAME = re.compile(r"(?P<prefix>.+)_(?P<number>\d+)")
 
 @dataclass(frozen=True)
 class FolderContents:
-    """The files of a rosbag2 folder in their order; whether files, or single messages, are compressed with zstd."""
+    """Files of a rosbag2 folder in their order, and whether files or single messages are compressed with zstd."""
 
     files: tuple[Path, ...]
     has_compressed_files: bool = False
@@ -29,10 +29,10 @@ class FolderContents:
 
 
 def folder_contents(path: Path) -> FolderContents:
-    """The contents of a rosbag2 folder, by its metadata or, without any, by the names of a split recording.
+    """Return the contents of a rosbag2 folder from its metadata, or without metadata from the names of its files.
 
-    Of the metadata only what files there are is used: its times and counts may be wrong. Raises InputError for a
-    folder that is no recording, and for a compression that is not zstd.
+    Times and counts in the metadata are not used, because they may be wrong. Raises InputError for a folder that is not
+    a recording, and for a compression other than zstd.
     """
     if not (path / METADATA).is_file():
         return FolderContents(_split_files(path))
@@ -43,7 +43,7 @@ def folder_contents(path: Path) -> FolderContents:
     try:
         content = YAML(typ="safe", pure=True).load(where.read_text(encoding="utf-8"))
         information = content["rosbag2_bagfile_information"]
-        # Old versions give the folder too.
+        # Old versions write the folder's name before the file's.
         files = tuple(dict.fromkeys(path / Path(name).name for name in information["relative_file_paths"]))
         storage = str(information["storage_identifier"])
         mode = str(information.get("compression_mode") or "none").lower()
@@ -58,20 +58,21 @@ def folder_contents(path: Path) -> FolderContents:
 
 
 def _split_files(path: Path) -> tuple[Path, ...]:
-    """The files of a split recording that was interrupted before its metadata was written, in their order."""
+    """Return the files of a split recording that was interrupted before its metadata was written, in their order."""
     logs = sorted(p for p in path.iterdir() if p.suffix in (".mcap", ".db3", ".bag"))
     names = [_SPLIT_NAME.fullmatch(p.stem) for p in logs if p.suffix != ".bag"]
     kinds = {(p.suffix, name["prefix"] if name else "") for p, name in zip(logs, names, strict=False)}
     if len(names) == len(logs) and len(kinds) == 1 and all(names):
         return tuple(sorted(logs, key=lambda p: (int(p.stem.rpartition("_")[2]), p.name)))
     hint = f"; it holds {', '.join(p.name for p in logs[:5])}" if logs else ""
-    raise InputError(f"{path}: a folder without {METADATA} is no rosbag2 recording; name the files in it{hint}")
+    raise InputError(f"{path}: a folder without {METADATA} is not a rosbag2 recording; name the files in it{hint}")
 
 
 class FolderLog(LogReader):
-    """A rosbag2 folder as one log of its open files.
+    """A rosbag2 folder as one log. It closes its open ``logs`` and removes the folder ``scratch`` when it is closed.
 
-    ``missing`` are sentences of files that are not among them. ``scratch`` is a folder that is removed at closing.
+    ``missing`` are clauses on files that could not be opened. With ``compressed_messages`` each message is decompressed
+    with zstd.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class FolderLog(LogReader):
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics, sorted by name and type; counts are summed over the files, channel ids are those of the first."""
+        """Topics, sorted by name and type, with counts of all files and the channel ids of the first."""
         merged: dict[tuple[str, str, str], TopicInfo] = {}
         for topic in (topic for log in self._logs for topic in log.topics):
             key = (topic.name, topic.type_name, topic.encoding)
@@ -108,40 +109,46 @@ class FolderLog(LogReader):
 
     @property
     def message_count(self) -> int:
-        """Messages of all topics."""
+        """Number of messages of all topics."""
         return sum(log.message_count for log in self._logs)
 
     @property
     def damage_clauses(self) -> tuple[str, ...]:
-        """What is missing from the folder, and what is wrong with which of its files."""
+        """Clauses on missing files, and on the damage of each file."""
         return (
             *self._damage.clauses,
             *(f"{log.path.name}: {clause}" for log in self._logs for clause in log.damage_clauses),
         )
 
     def close(self) -> None:
-        """Close all files; a second call does nothing."""
+        """Close all files and remove the scratch folder; a second call does nothing."""
         for log in self._logs:
             log.close()
         if self._scratch is not None:
             self._scratch.cleanup()
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the files."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the files.
+
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. Files without
+        messages in this range are not read.
+        """
         bad: Counter[str] = Counter()
-        for message in self._merged(topics):
+        for message in self._merged(topics, start_ns, stop_ns):
             if not self._compressed_messages:
                 yield message
                 continue
             data = decompress_message(message.data)
             if data is None:
                 bad[message.topic] += 1
-                self._damage.lose(message.topic, bad[message.topic])
+                self._damage.skip_messages(message.topic, bad[message.topic])
             else:
                 yield RawMessage(message.log, message.channel, message.log_time_ns, bytearray(data))
 
-    def _merged(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of all files; a file is read from when its first message is due, so that few are at a time."""
+    def _merged(self, topics: Collection[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
+        """Merge the messages of all files by log time; a file is read only from the time of its first message on."""
         waiting = sorted(
             ((log.start_ns, i) for i, log in enumerate(self._logs) if log.start_ns is not None), reverse=True
         )
@@ -149,7 +156,7 @@ class FolderLog(LogReader):
         while waiting or heads:
             while waiting and (not heads or waiting[-1][0] <= heads[0][0]):
                 _, index = waiting.pop()
-                _push(heads, index, self._logs[index].messages(topics))
+                _push(heads, index, self._logs[index].messages(topics, start_ns, stop_ns))
             if len(heads) == 1 and not waiting:
                 _, _, message, iterator = heads[0]
                 yield message
@@ -164,7 +171,7 @@ class FolderLog(LogReader):
 def _push(
     heads: list[tuple[int, int, RawMessage, Iterator[RawMessage]]], index: int, iterator: Iterator[RawMessage]
 ) -> None:
-    """Put a file's next message among those of the others; nothing where it has no more."""
+    """Push a file's next message on the heap; nothing at the end of the file."""
     message = next(iterator, None)
     if message is not None:
         heapq.heappush(heads, (message.log_time_ns, index, message, iterator))

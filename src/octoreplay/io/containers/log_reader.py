@@ -1,4 +1,4 @@
-"""What every log container gives: topics, spans and raw messages that are decoded only when asked."""
+"""Common interface of the log readers: topics, time span and raw messages, which are decoded on request."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from octoreplay.io.messages.decoders import Bytes, DamagedMessageError, Undefine
 from octoreplay.io.messages.ros_types import stamp_to_ns
 from octoreplay.io.messages.sensor_messages import Kind, SensorMessage, convert, kind_of
 
-# So many messages are looked at for one that is whole.
+# Messages that first_whole_message tries to decode.
 _NUM_TRIED = 100
-# Where the stamp of a message stands in its bytes, by encoding: without a Header, and with one.
+# Byte offset of the stamp in a serialised message by encoding: without and with a std_msgs/Header.
 _STAMP_OFFSETS = {"cdr": (4, 4), "ros1": (0, 4)}
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic of a log as one type: a topic that carries two types is listed twice.
+    """One topic of a log with one message type. A topic with two types has two entries.
 
-    ``type_name`` is normalised to ``package/msg/Name``; ``encoding`` is ``cdr``, ``ros1``, ``protobuf``, ...;
-    ``channel_ids`` are the container's ids of its channels (connections).
+    ``type_name`` has the form ``package/msg/Name``. ``encoding`` is ``cdr``, ``ros1``, ``protobuf``, ...
+    ``channel_ids`` are the container's ids of the topic's channels (MCAP) or connections (ROS 1 bags).
     """
 
     name: str
@@ -42,7 +42,11 @@ class TopicInfo:
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """Where a message comes from: the topic, its type, and the definition that its log holds of that type."""
+    """Topic, message type and encoding of messages, with the type's definition as the log holds it.
+
+    ``definition_format`` names the language of ``definition``: ``ros2msg``, ``ros2idl``, ``ros1msg``, ``protobuf``, ...
+    It is empty, as is ``definition``, where the log holds no definition.
+    """
 
     topic: str
     type_name: str
@@ -52,7 +56,10 @@ class Channel:
 
 
 class RawMessage:
-    """One message as recorded: its bytes stay as they are until ``decode`` is called."""
+    """One message as recorded. ``data`` is its serialised content, which only ``decode`` parses.
+
+    ``log_time_ns`` is the time at which the recorder received the message.
+    """
 
     __slots__ = ("_value", "channel", "data", "log", "log_time_ns")
 
@@ -65,23 +72,24 @@ class RawMessage:
 
     @property
     def topic(self) -> str:
-        """The topic it was recorded on."""
+        """Topic of the message."""
         return self.channel.topic
 
     @property
     def type_name(self) -> str:
-        """Its type as ``package/msg/Name``."""
+        """Message type as ``package/msg/Name``."""
         return self.channel.type_name
 
     @property
     def where(self) -> str:
-        """File, topic and time, as errors begin."""
+        """File, topic and log time, the first words of error messages."""
         return printable(f"{self.log}: topic '{self.topic}' at {self.log_time_ns / 1e9:.3f} s")
 
     def header_stamp_ns(self) -> int:
-        """The header's stamp in nanoseconds; only for types that begin with a Header, or with a time and a frame.
+        """Stamp of the header [ns], for types that begin with a Header or with a time and a frame id.
 
-        ROS messages are not decoded for it. Raises as ``decode`` does, also where the message has no such stamp.
+        ROS messages are not decoded for this. Raises the errors of ``decode``, and DamagedMessageError for a message
+        without a stamp.
         """
         if self.channel.encoding in _STAMP_OFFSETS:
             seconds, nanoseconds = self._peek("iI", self._header_offset)
@@ -93,18 +101,18 @@ class RawMessage:
             raise DamagedMessageError(f"{self.where}: the message has no timestamp") from None
 
     def header_frame_id(self) -> str:
-        """The header's frame; as ``header_stamp_ns`` otherwise."""
+        """Frame id of the header, for the same types and with the same errors as ``header_stamp_ns``."""
         if self.channel.encoding not in _STAMP_OFFSETS:
             return str(getattr(self.decode(), "frame_id", ""))
         start = self._header_offset + 8
         (length,) = self._peek("I", start)
-        # CDR counts the zero at the string's end.
+        # In CDR the length includes the terminating zero.
         return bytes(self.data[start + 4 : start + 4 + length]).rstrip(b"\0").decode("utf-8", "replace")
 
     def decode(self) -> Any:
-        """The message as an object whose fields are named as in its definition; arrays are views of ``data``.
+        """Return the message as an object with the fields of its definition; arrays are views of ``data``.
 
-        Raises DamagedMessageError where the bytes do not fit the type, InputError for an unknown type or encoding.
+        Raises DamagedMessageError where the bytes do not fit the type, and InputError for an unknown type or encoding.
         """
         if self._value is not None:
             return self._value
@@ -116,14 +124,14 @@ class RawMessage:
         except (DamagedMessageError, UndefinedTypeError) as error:
             raise type(error)(f"{self.where}: {error}") from error
         if channel.encoding not in _STAMP_OFFSETS:
-            # Its stamp cannot be read from the bytes alone, so it is decoded before it is used.
+            # The stamp of such a message is read from the decoded message, so it is decoded before it is used.
             self._value = value
         return value
 
     def sensor_message(self) -> SensorMessage:
-        """The message in the form that it has whatever its schema; only for types that ``kind_of`` knows.
+        """Return the message in the form common to ROS and Foxglove schemas, for types that ``kind_of`` knows.
 
-        Raises as ``decode`` does, and DamagedMessageError where fields are missing.
+        Raises the errors of ``decode``, and DamagedMessageError where fields are missing.
         """
         value = self.decode()
         try:
@@ -133,12 +141,12 @@ class RawMessage:
 
     @property
     def _header_offset(self) -> int:
-        """Where the stamp stands: after the encapsulation in CDR, after a Header's sequence number in ROS 1."""
+        """Offset of the stamp: after the encapsulation header in CDR, after the Header's sequence number in ROS 1."""
         has_header = not self.channel.type_name.startswith("foxglove_msgs/")
         return _STAMP_OFFSETS[self.channel.encoding][has_header]
 
     def _peek(self, form: str, offset: int) -> tuple[Any, ...]:
-        """Numbers at an offset of the bytes; CDR may be big-endian, ROS 1 is little-endian always."""
+        """Unpack numbers at a byte offset; CDR may be big-endian, ROS 1 is always little-endian."""
         is_big_endian = self.channel.encoding == "cdr" and len(self.data) > 1 and self.data[1] == 0
         try:
             return struct.unpack_from((">" if is_big_endian else "<") + form, self.data, offset)
@@ -147,7 +155,7 @@ class RawMessage:
 
 
 class LogReader(ABC):
-    """One log, open for reading; a context manager. Several message iterators may be in use at a time."""
+    """One open log; a context manager. Several iterators over its messages may be in use at a time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -156,7 +164,7 @@ class LogReader(ABC):
     @property
     @abstractmethod
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics, sorted by name and type."""
+        """Topics, sorted by name and type."""
 
     @property
     @abstractmethod
@@ -171,11 +179,17 @@ class LogReader(ABC):
     @property
     @abstractmethod
     def message_count(self) -> int:
-        """Messages of all topics."""
+        """Number of messages of all topics."""
 
     @abstractmethod
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics in order of log time, read lazily; ties in the order of the file."""
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics in order of log time, read lazily; equal times in the order of the file.
+
+        Only messages with ``start_ns <= log_time_ns < stop_ns`` are given; None leaves that side open. Parts of the log
+        that the index places outside this range are not read, and ``damage`` does not cover them.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -183,15 +197,15 @@ class LogReader(ABC):
 
     @property
     def damage(self) -> str | None:
-        """What is missing from a cut or damaged log, as one sentence; None for a good log.
+        """One sentence on what is missing from a cut or damaged log; None for a good log.
 
-        It grows while messages are read: ask for it at the end. A reader logs nothing; whoever opened it tells.
+        It covers what has been read so far, so it is complete only after the last message. A reader logs nothing.
         """
         return damage_sentence(self.path, self.damage_clauses)
 
     @property
     def damage_clauses(self) -> tuple[str, ...]:
-        """The parts of that sentence, without the path."""
+        """Clauses of ``damage`` without the path; empty for a good log."""
         return self._damage.clauses
 
     def __enter__(self) -> Self:
@@ -204,14 +218,15 @@ class LogReader(ABC):
 
 
 def normalise_type_name(name: str) -> str:
-    """``package/msg/Name`` of a type's name in ROS 1's short or ROS 2's long form."""
+    """Return ``package/msg/Name`` for a type name in the form of ROS 1 (``package/Name``) or ROS 2."""
     return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
 def first_whole_message(log: LogReader, topic: str, kinds: Collection[Kind]) -> RawMessage | None:
-    """The first message of a topic that says something of some kinds and is whole; None without any of those kinds.
+    """Return the first message of a topic that has one of some kinds and can be decoded.
 
-    Where none of the first hundred is whole, it is the first.
+    Returns the first message of these kinds where none of the first hundred can be decoded, and None where the topic
+    has no message of these kinds.
     """
     found = None
     messages = (message for message in log.messages((topic,)) if kind_of(message.type_name) in kinds)

@@ -1,4 +1,4 @@
-"""Opening a log whatever its container: MCAP, ROS 1 bag, rosbag2 sqlite3 file or rosbag2 folder."""
+"""Opening of logs of every container: MCAP, ROS 1 bag, rosbag2 sqlite3 file or rosbag2 folder."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _MAGIC_LENGTH = 16
 
 
 def open_log(path: Path) -> LogReader:
-    """A reader of one log; use it as a context manager.
+    """Open one log; the reader is a context manager.
 
-    What kind of log it is follows from its first bytes, not from its name. Raises InputError with one sentence where
-    the path is missing, empty, or no log.
+    The container is recognised by the first bytes of the file, not by its name. Raises InputError for a path that is
+    missing, empty or not a log.
     """
     path = Path(path)
     if path.is_dir():
@@ -31,7 +31,7 @@ def open_log(path: Path) -> LogReader:
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: not a file; give a log, or the folder of a rosbag2 recording")
+        raise InputError(f"{path}: not a file; give a log or the folder of a rosbag2 recording")
     try:
         with path.open("rb") as file:
             magic = file.read(_MAGIC_LENGTH)
@@ -46,16 +46,18 @@ def open_log(path: Path) -> LogReader:
     if magic.startswith(bag_records.MAGIC):
         return BagLog(path)
     if magic.startswith(b"#ROSBAG V"):
-        raise InputError(f"{path}: only ROS 1 bags of version 2.0 can be read; 'rosbag fix' makes one of an older bag")
+        raise InputError(f"{path}: only ROS 1 bags of version 2.0 can be read; convert an older bag with 'rosbag fix'")
     if magic.startswith(b"SQLite format 3"):
         if path.suffix != ".db3":
             raise InputError(f"{path}: a rosbag2 sqlite3 recording must end in .db3; rename it")
         return open_db3(path)
-    raise InputError(f"{path}: not a log; MCAP (.mcap), ROS 1 bags (.bag) and rosbag2 (.db3 or folder) can be read")
+    raise InputError(
+        f"{path}: not a log; give MCAP (.mcap), a ROS 1 bag (.bag) or a rosbag2 recording (.db3 or folder)"
+    )
 
 
 def _open_folder(path: Path) -> LogReader:
-    """A reader of a rosbag2 folder: of its files that can be opened, where there is one."""
+    """Open the files of a rosbag2 folder as one log; raise InputError where none of them can be opened."""
     contents = folder_contents(path)
     scratch = TemporaryDirectory() if contents.has_compressed_files else None
     logs: list[LogReader] = []
@@ -64,7 +66,7 @@ def _open_folder(path: Path) -> LogReader:
         for file in contents.files:
             try:
                 if file.is_dir():
-                    raise InputError(f"{file}: a folder, where the metadata name a file")
+                    raise InputError(f"{file}: a folder, but the metadata name a file")
                 logs.append(open_log(file) if scratch is None else _open_compressed(file, Path(scratch.name)))
             except InputError as error:
                 missing.append(str(error))
@@ -78,7 +80,7 @@ def _open_folder(path: Path) -> LogReader:
 
 
 def _open_compressed(file: Path, scratch: Path) -> LogReader:
-    """A reader of a file that is compressed as a whole, by way of a copy that is not."""
+    """Decompress a file into the scratch folder and open the copy."""
     copy = scratch / file.stem
     try:
         decompress_file(file, copy)

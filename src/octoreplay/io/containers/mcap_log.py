@@ -1,6 +1,6 @@
-"""MCAP files, whole, cut or damaged: an index of blocks of records, and lazy reading in log-time order.
+"""Reader of MCAP files, also cut and damaged ones.
 
-The index comes from the file's summary where that is complete, else from one pass over the file. Format:
+The index of chunks is read from the file's summary if that is complete, else built in one pass over the file. Format:
 https://mcap.dev/spec
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterator
 from mcap.opcode import Opcode
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.block_log import Block, BlockLog, Entry, Index
+from octoreplay.io.containers.block_log import CUT_CHUNK, Block, BlockLog, Entry, Index
 from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES
-from octoreplay.io.containers.mcap_pass import CUT_CHUNK, McapPass
+from octoreplay.io.containers.mcap_pass import McapPass
 from octoreplay.io.containers.mcap_records import (
     MAGIC,
     MAX_TIME_NS,
@@ -29,23 +29,23 @@ from octoreplay.io.messages.decoders import Bytes
 
 
 class McapLog(BlockLog):
-    """An MCAP file. A damaged file gives everything that is whole, and ``damage`` says what was skipped.
+    """An MCAP file. Of a damaged file all intact messages are read, and ``damage`` describes what was skipped.
 
-    A chunk whose checksum or sizes do not fit is left out whole. Raises InputError where the file is no MCAP or cannot
-    be opened.
+    A chunk whose checksum or sizes do not match is skipped completely. Raises InputError for a file that is not MCAP or
+    cannot be opened.
     """
 
     def _read_index(self) -> Index:
-        """The index: from the summary, else from one pass over the file."""
+        """Return the index from the summary, else from one pass over the file."""
         if self._file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{self.path}: not an MCAP file")
         return index_from_summary(self._file) or McapPass(self._file, self._damage).index()
 
     def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
-        """The messages of the wanted channels in a chunk or in a run of records."""
+        """Yield the messages of the wanted channels in a chunk or in a sequence of records outside chunks."""
         records = self._records(block)
         if records is None:
-            self._damage.skip("chunk", block.offset, self._num_messages_of(block))
+            self._damage.skip_part("chunk", block.offset, self._num_messages_of(block))
             return
         end = num_late = 0
         for opcode, start, end in walk(records):
@@ -58,17 +58,15 @@ class McapLog(BlockLog):
                     continue
                 yield log_time_ns, block.offset, start + MESSAGE_HEAD.size, end, channel_id, records
         if num_late:
-            self._damage.lose(block.offset, num_late)
+            self._damage.skip_messages(block.offset, num_late)
         if end < len(records) and block.form == CHUNK and block.num_messages is None:
-            # A chunk without a checksum whose records do not end where it does: what follows the damage is lost.
-            expected, found = (
-                self._num_messages_of(block),
-                sum(opcode == Opcode.MESSAGE for opcode, _, _ in walk(records)),
-            )
-            self._damage.skip("part", block.offset, None if expected is None else max(0, expected - found))
+            # The chunk has no checksum, and its last record is incomplete: messages behind the damage are lost.
+            expected = self._num_messages_of(block)
+            found = sum(opcode == Opcode.MESSAGE for opcode, _, _ in walk(records))
+            self._damage.skip_part("part", block.offset, None if expected is None else max(0, expected - found))
 
     def _records(self, block: Block) -> Bytes | None:
-        """The records in a block; None where they cannot be read."""
+        """Return the records in a block; None where they cannot be read."""
         if block.length > 2 * MAX_CHUNK_BYTES:
             return None
         data = self._bytes_at(block.offset, block.length)
@@ -79,7 +77,7 @@ class McapLog(BlockLog):
         return cut_records(data) if block.form == CUT_CHUNK else data
 
     def _num_messages_of(self, block: Block) -> int | None:
-        """How many messages a damaged chunk held, by the index records that follow it; None without them."""
+        """Return the number of messages of a damaged chunk, from the message indexes behind it; None without them."""
         if block.num_messages is not None:
             return block.num_messages
         total, place = None, block.offset + block.length

@@ -1,4 +1,4 @@
-"""The records of MCAP files as bytes: their heads, the runs of them, and the chunks that hold them.
+"""Parsing of MCAP records: record headers, sequences of records and chunks.
 
 Format: https://mcap.dev/spec
 """
@@ -27,7 +27,7 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<QQI")
 MAX_TIME_NS = (1 << 63) - 1
-"""Times are stored as unsigned numbers; ROS knows no later one than this (in the year 2262)."""
+"""Greatest log time accepted [ns] (year 2262). MCAP stores unsigned times, which may exceed int64."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _INDEX_HEAD = struct.Struct("<HI")
 _READERS: dict[int, Any] = {
@@ -40,16 +40,17 @@ Record: TypeAlias = SchemaRecord | ChannelRecord | ChunkIndex | Statistics
 
 
 class Definitions:
-    """The schemas and channels of a file as they are come upon."""
+    """Schemas and channels of a file, collected record by record."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, SchemaRecord] = {}
         self.channels: dict[int, ChannelRecord] = {}
 
-    def take(self, opcode: int, body: Bytes, *, is_certain: bool = True) -> None:
-        """Add a schema or a channel; other records and damaged ones say nothing.
+    def add(self, opcode: int, body: Bytes, *, is_certain: bool = True) -> None:
+        """Add a schema or a channel; other records and damaged ones are ignored.
 
-        One that is not certain, as it stands in a damaged place, counts until a certain one of that number comes.
+        A record that is not certain, because it was found in a damaged part, holds until a certain one with its id is
+        added.
         """
         record = read_record(opcode, body)
         if isinstance(record, SchemaRecord) and (is_certain or record.id not in self.schemas):
@@ -58,12 +59,16 @@ class Definitions:
             self.channels[record.id] = record
 
     def resolved(self) -> dict[int, Channel]:
-        """Every channel with its type's definition as the file gives it."""
+        """Return the channels by id, with the definitions of their types."""
         return {i: _channel(record, self.schemas.get(record.schema_id)) for i, record in self.channels.items()}
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk says of itself; ``start`` and ``length`` are those of its compressed records within its bytes."""
+    """Header of a chunk.
+
+    ``size`` and ``crc`` are length [bytes] and CRC-32 of the uncompressed records (0: no checksum). ``start`` and
+    ``length`` [bytes] locate the compressed records within the chunk's body.
+    """
 
     start_ns: int
     end_ns: int
@@ -75,7 +80,7 @@ class ChunkHead(NamedTuple):
 
 
 def read_record(opcode: int, body: Bytes) -> Record | None:
-    """A schema, channel, chunk index or statistics record; None for other records and damaged ones."""
+    """Parse a schema, channel, chunk index or statistics record; None for other records and damaged ones."""
     if opcode not in _READERS:
         return None
     try:
@@ -86,7 +91,7 @@ def read_record(opcode: int, body: Bytes) -> Record | None:
 
 
 def walk(records: Bytes) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start, end) of each whole record in a run of records."""
+    """Yield (opcode, start, end) of each complete record; start and end delimit its body."""
     position, size = 0, len(records)
     while position + RECORD_HEAD.size <= size:
         opcode, length = RECORD_HEAD.unpack_from(records, position)
@@ -98,7 +103,7 @@ def walk(records: Bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def chunk_head(body: Bytes) -> ChunkHead | None:
-    """What a chunk's first bytes say; None where they contradict themselves or the compression is unknown."""
+    """Parse the header of a chunk; None where its sizes contradict each other or the compression is unknown."""
     if len(body) < _CHUNK_HEAD.size:
         return None
     start_ns, end_ns, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
@@ -113,7 +118,7 @@ def chunk_head(body: Bytes) -> ChunkHead | None:
 
 
 def whole_records(body: Bytes) -> Bytes | None:
-    """The records of a chunk; None where its sizes or its checksum (where it has one) do not fit."""
+    """Return the records of a chunk; None where its sizes or its checksum, if it has one, do not match."""
     head = chunk_head(body)
     if head is None or head.start + head.length != len(body):
         return None
@@ -123,13 +128,13 @@ def whole_records(body: Bytes) -> Bytes | None:
 
 
 def cut_records(body: Bytes) -> Bytes:
-    """The records of a chunk whose end is missing, as far as they can be decompressed."""
+    """Return the records of a chunk that is cut, up to where they can be decompressed."""
     head = chunk_head(body)
     return b"" if head is None else decompress(head.compression, memoryview(body)[head.start :], head.size)
 
 
 def num_indexed(head: Bytes, length: int) -> int:
-    """How many messages a message index record of so many bytes lists, by its first six."""
+    """Return the number of messages in a message index record, from its first 6 bytes and its length [bytes]."""
     if len(head) < _INDEX_HEAD.size:
         return 0
     _, num_bytes = _INDEX_HEAD.unpack_from(head)
@@ -137,7 +142,7 @@ def num_indexed(head: Bytes, length: int) -> int:
 
 
 def _channel(record: ChannelRecord, schema: SchemaRecord | None) -> Channel:
-    """A channel with its type's definition as the file gives it."""
+    """Return a channel with the definition of its type."""
     if schema is None:
         return Channel(record.topic, "", record.message_encoding, "", b"")
     name = normalise_type_name(schema.name) if schema.encoding in ROS_FORMATS else schema.name

@@ -1,4 +1,4 @@
-"""The index of an MCAP file from the summary at its end."""
+"""Index of an MCAP file from the summary at its end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from octoreplay.io.containers.block_log import Block, Index
 from octoreplay.io.containers.mcap_records import FOOTER, MAGIC, MAX_TIME_NS, RECORD_HEAD, Definitions, read_record
 
 CHUNK = "chunk"
-"""The form of a block that is a chunk's record without its head."""
+"""Form of a block that is the body of a chunk record."""
 _PIECE_BYTES = 1 << 20
 _IN_SUMMARY = (
     Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
@@ -24,7 +24,7 @@ _FIRST_PRIVATE_OPCODE = 0x80
 
 
 def index_from_summary(file: IO[bytes]) -> Index | None:
-    """The index that the summary holds; None where there is none, or one that is damaged or leaves something out."""
+    """Return the index that the summary gives; None where the summary is missing, damaged or incomplete."""
     size = file.seek(0, io.SEEK_END)
     footer_start = size - len(MAGIC) - RECORD_HEAD.size - FOOTER.size
     if footer_start < len(MAGIC):
@@ -44,10 +44,10 @@ def index_from_summary(file: IO[bytes]) -> Index | None:
         elif isinstance(record, Statistics):
             statistics = record
         elif record is not None:
-            definitions.take(opcode, body)
+            definitions.add(opcode, body)
         elif opcode not in _IN_SUMMARY and opcode < _FIRST_PRIVATE_OPCODE:
             return None
-    if statistics is None or not _is_complete(statistics, chunks, definitions) or not _follow_each_other(chunks, start):
+    if statistics is None or not _is_complete(statistics, chunks, definitions) or not _are_disjoint(chunks, start):
         return None
     if crc and _checksum(file, start, footer_start + RECORD_HEAD.size + 16) != crc:
         return None
@@ -57,7 +57,7 @@ def index_from_summary(file: IO[bytes]) -> Index | None:
 
 
 def _summary_records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of each record between two bytes; a body that is no part of a summary is left unread."""
+    """Yield (opcode, body) of each record between two bytes; the body is empty for records foreign to a summary."""
     while start + RECORD_HEAD.size <= end:
         file.seek(start)
         opcode, length = RECORD_HEAD.unpack(file.read(RECORD_HEAD.size))
@@ -68,7 +68,7 @@ def _summary_records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[in
 
 
 def _checksum(file: IO[bytes], start: int, end: int) -> int:
-    """The CRC-32 of the bytes between two places."""
+    """Return the CRC-32 of the bytes from ``start`` to ``end``."""
     file.seek(start)
     crc = 0
     for place in range(start, end, _PIECE_BYTES):
@@ -77,7 +77,7 @@ def _checksum(file: IO[bytes], start: int, end: int) -> int:
 
 
 def _is_complete(statistics: Statistics, chunks: list[ChunkIndex], definitions: Definitions) -> bool:
-    """True where the summary names every chunk, channel and schema, and counts every message."""
+    """Return True if the summary lists every chunk, channel and schema and counts every message."""
     counts = statistics.channel_message_counts
     indexed = {channel_id for chunk in chunks for channel_id in chunk.message_index_offsets}
     channels = definitions.channels
@@ -92,8 +92,8 @@ def _is_complete(statistics: Statistics, chunks: list[ChunkIndex], definitions: 
     )
 
 
-def _follow_each_other(chunks: list[ChunkIndex], end: int) -> bool:
-    """True where no chunk overlaps another or goes beyond the data; else a file could be read any number of times."""
+def _are_disjoint(chunks: list[ChunkIndex], end: int) -> bool:
+    """Return True if the chunks lie in the data section without overlap, so that no byte is read twice."""
     place = len(MAGIC)
     for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
         if chunk.chunk_start_offset < place or chunk.chunk_length < RECORD_HEAD.size:
@@ -103,7 +103,7 @@ def _follow_each_other(chunks: list[ChunkIndex], end: int) -> bool:
 
 
 def _has_loose_messages(file: IO[bytes], chunks: list[ChunkIndex], end: int) -> bool:
-    """True where messages stand between the chunks, of which the summary says nothing."""
+    """Return True if there are messages between the chunks, which the summary does not list."""
     place = len(MAGIC)
     for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
         if _has_message(file, place, chunk.chunk_start_offset):
@@ -113,7 +113,7 @@ def _has_loose_messages(file: IO[bytes], chunks: list[ChunkIndex], end: int) -> 
 
 
 def _has_message(file: IO[bytes], start: int, end: int) -> bool:
-    """True where one of the records between two bytes is a message."""
+    """Return True if one of the records between two bytes is a message."""
     while start + RECORD_HEAD.size <= end:
         file.seek(start)
         opcode, length = RECORD_HEAD.unpack(file.read(RECORD_HEAD.size))
@@ -124,7 +124,7 @@ def _has_message(file: IO[bytes], start: int, end: int) -> bool:
 
 
 def _index(statistics: Statistics, chunks: list[ChunkIndex], definitions: Definitions) -> Index:
-    """The index of a file whose summary is complete."""
+    """Return the index given by a complete summary."""
     index = Index(definitions.resolved())
     for channel_id, count in statistics.channel_message_counts.items():
         index.tally.add(channel_id, statistics.message_start_time, count, statistics.message_end_time)
@@ -132,6 +132,10 @@ def _index(statistics: Statistics, chunks: list[ChunkIndex], definitions: Defini
     for chunk in chunks:
         # Without message offsets a chunk may hold any channel.
         channel_ids = frozenset(chunk.message_index_offsets) or None
-        start = chunk.chunk_start_offset + head
-        index.blocks.append(Block(start, chunk.chunk_length - head, chunk.message_start_time, channel_ids, CHUNK))
+        start, start_ns, end_ns = chunk.chunk_start_offset + head, chunk.message_start_time, chunk.message_end_time
+        # Some recorders leave the times of chunks at 0.
+        is_timed = end_ns >= max(start_ns, statistics.message_start_time)
+        index.blocks.append(
+            Block(start, chunk.chunk_length - head, start_ns, end_ns if is_timed else None, channel_ids, CHUNK)
+        )
     return index

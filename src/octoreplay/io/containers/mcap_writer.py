@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2 CDR messages with embedded schemas, as rosbag2 writes them."""
+"""Writer of MCAP files with ROS 2 messages (CDR) and embedded schemas, as rosbag2 writes them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from octoreplay.io.messages.ros_types import typestore
 class RosMcapWriter:
     """Writes one MCAP file with profile ``ros2``; a context manager that finishes the file.
 
-    The same calls give the same bytes: nothing of the clock or the machine is written.
-    Raises OutputError where the file cannot be created or written.
+    Equal calls give equal bytes: no wall-clock time and nothing machine-dependent is written. ``chunk_size`` [bytes] is
+    the size from which a chunk is ended. Raises OutputError where the file cannot be created or written.
     """
 
     def __init__(self, path: Path, *, chunk_size: int = 1 << 20) -> None:
@@ -71,7 +71,7 @@ class RosMcapWriter:
             self._guard(self._file.close)
 
     def _register(self, topic: str, type_name: str) -> int:
-        """The channel of a topic, new."""
+        """Register a topic and return its channel id."""
         if type_name not in self._schemas:
             definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
             self._schemas[type_name] = self._writer.register_schema(
@@ -84,7 +84,7 @@ class RosMcapWriter:
         return self._channels[topic]
 
     def _guard(self, action: Any) -> None:
-        """Run one writing step; a full disk or the like becomes one sentence."""
+        """Run one writing step; raise OutputError for an OSError such as a full disk."""
         try:
             action()
         except OSError as error:

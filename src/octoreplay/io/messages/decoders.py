@@ -1,4 +1,4 @@
-"""Serialised bytes to message objects: ROS 2 (cdr), ROS 1, protobuf and JSON, each by the definition in its log."""
+"""Decoding of serialised messages by the definitions in their log: ROS 2 (CDR), ROS 1, protobuf and JSON."""
 
 from __future__ import annotations
 
@@ -31,36 +31,36 @@ ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 ROS_FORMATS = ("ros1msg", "ros2msg", "ros2idl")
 """Formats of ROS message definitions."""
 
-# What the decoders raise for bytes that do not fit their type. On damaged input rosbags' generated code lets its
-# assertions and index errors through, and JSON may nest too deeply.
+# Exceptions of the decoders for bytes that do not fit the type. rosbags' generated code raises assertion and index
+# errors on damaged input, and JSON may be nested too deeply.
 _DAMAGED = (SerdeError, DecodeError, AssertionError, IndexError, OverflowError, MemoryError, ValueError, RecursionError)
-# rosbags writes a definition as Python code, which is none where a type's name is damaged.
+# rosbags compiles a definition to Python code, which is a SyntaxError where a type's name is damaged.
 _UNDEFINED = (KeyError, TypesysError, McapError, TypeError, DecodeError, ValueError, SyntaxError, RecursionError)
 
 _MAX_PARTS = 10_000
-"""A definition whose arrays of a fixed length have more parts than this in one message is damage: rosbags writes each
-of them as lines of code. An odometry has two arrays of 36 numbers, which count as one part each."""
+"""Greatest number of parts of a message in fixed-length arrays; a definition with more is damage. rosbags generates
+code for each part. An Odometry has two arrays of 36 numbers, which count as one part each."""
 
 
 class DamagedMessageError(InputError):
-    """One message whose bytes do not hold what its type says; the messages around it may be good."""
+    """The bytes of one message do not fit its type; other messages of the log may be intact."""
 
 
 class UndefinedTypeError(InputError):
-    """A message type whose definition is missing, or cannot be understood."""
+    """The definition of a message type is missing or cannot be parsed."""
 
 
 def decode(data: Bytes, type_name: str, encoding: str, definition_format: str, definition: bytes) -> Any:
-    """The message object of serialised bytes: attributes are named as in its definition, arrays are views of ``data``.
+    """Return a message as an object with the fields of its definition; arrays are views of ``data``.
 
-    ``definition`` is the type's definition as the log holds it, in ``definition_format`` (``ros2msg``, ``protobuf``,
-    ...); empty for a ROS type that this package knows. JSON objects become namespaces.
+    ``definition`` is the type's definition in the log, in the language ``definition_format`` (``ros2msg``,
+    ``protobuf``, ...). It may be empty for ROS types that this package knows. JSON objects become namespaces.
     Raises DamagedMessageError where the bytes do not fit the type, UndefinedTypeError for an unknown type or encoding.
     """
     try:
         decoder = _decoder(type_name, encoding, definition_format, definition)
     except _UNDEFINED as error:
-        raise UndefinedTypeError(f"the definition of type '{type_name}' cannot be understood") from error
+        raise UndefinedTypeError(f"the definition of type '{type_name}' cannot be parsed") from error
     try:
         return decoder(data)
     except _DAMAGED as error:
@@ -72,42 +72,44 @@ def decode(data: Bytes, type_name: str, encoding: str, definition_format: str, d
 
 @cache
 def _decoder(type_name: str, encoding: str, definition_format: str, definition: bytes) -> Decoder:
-    """The decoder of a type as the log defines it, or as this package knows it where the log says nothing."""
+    """Return the decoder of a type by its definition in the log, or by a built-in one where the log has none."""
     if encoding == "protobuf":
         return _protobuf_decoder(type_name, definition)
     if encoding == "json":
         return _decode_json
     if encoding not in ENCODINGS:
-        raise UndefinedTypeError(f"message encoding '{encoding}' is not supported; {', '.join(ENCODINGS)} are")
+        raise UndefinedTypeError(
+            f"message encoding '{encoding}' is not supported; supported are {', '.join(ENCODINGS)}"
+        )
     store = _store(type_name, encoding, definition_format, definition.decode("utf-8", "replace"))
     deserialise = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
-    # rosbags annotates only bytes and memoryview, and takes any buffer.
+    # rosbags' annotation allows only bytes and memoryview; any buffer works.
     return lambda data: deserialise(memoryview(data), type_name)
 
 
 def _protobuf_decoder(type_name: str, definition: bytes) -> Decoder:
-    """The decoder of a protobuf type from its FileDescriptorSet."""
+    """Return the decoder of a protobuf type from its FileDescriptorSet."""
     schema = Schema(id=1, data=definition, encoding="protobuf", name=type_name)
     decoder = DecoderFactory().decoder_for("protobuf", schema)
     if decoder is None:
-        raise UndefinedTypeError(f"the definition of type '{type_name}' is no protobuf definition")
+        raise UndefinedTypeError(f"the definition of type '{type_name}' is not a protobuf FileDescriptorSet")
     return lambda data: decoder(bytes(data))
 
 
 def _decode_json(data: Bytes) -> Any:
-    """A JSON text; objects become namespaces."""
+    """Parse a JSON text; objects become namespaces."""
     return json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
 
 
 def _store(type_name: str, encoding: str, definition_format: str, definition: str) -> Typestore:
-    """A type store that decodes one ROS type the way the log's own definition says."""
+    """Return a type store that decodes one ROS type by its definition in the log."""
     known = typestore()
     if not definition:
         return get_typestore(Stores.ROS1_NOETIC) if encoding == "ros1" else known
     try:
         types = _idl_types(definition) if definition_format == "ros2idl" else get_types_from_msg(definition, type_name)
     except TypesysError:
-        # rosbags does not understand all of IDL; ROS's own types are what they are.
+        # rosbags does not parse all of IDL. ROS's own types are known without the definition.
         if encoding == "cdr" and type_name in known.fielddefs:
             return known
         raise
@@ -116,22 +118,22 @@ def _store(type_name: str, encoding: str, definition_format: str, definition: st
     ):
         return known
     if not 0 < _num_parts(type_name, types, ()) <= _MAX_PARTS:
-        raise UndefinedTypeError(f"the definition of type '{type_name}' cannot be that of a message")
+        raise UndefinedTypeError(f"the definition of type '{type_name}' is empty or too large for a message")
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
 
 
 def _num_parts(name: str, types: Mapping[str, Any], above: tuple[str, ...]) -> int:
-    """How many numbers, strings and lists a message has at least, a list of numbers being one of them; 0 without any.
+    """Return the least number of parts (numbers, strings, lists) of a message; a list of numbers is one part.
 
-    Raises UndefinedTypeError for a list of messages that take no bytes, which could be as long as it claims, and for a
-    type that holds itself. ``above`` are the types around it.
+    ``above`` are the types that contain this one. Raises UndefinedTypeError for a list of messages without fields,
+    whose length no number of bytes limits, and for a type that contains itself.
     """
     if name in above:
-        raise UndefinedTypeError(f"the definition of type '{name}' holds itself")
+        raise UndefinedTypeError(f"the definition of type '{name}' contains itself")
     if name not in types:
-        # Built in, as times are, or not defined, which decoding says.
+        # Built-in types such as time, and undefined types, which decoding reports.
         return 1
     total = 0
     for _, (kind, content) in types[name][1]:
@@ -139,7 +141,7 @@ def _num_parts(name: str, types: Mapping[str, Any], above: tuple[str, ...]) -> i
         (item_kind, item), length = content if is_list else ((kind, content), 1)
         parts = 1 if item_kind is Nodetype.BASE else _num_parts(item, types, (*above, name))
         if is_list and parts == 0:
-            raise UndefinedTypeError(f"the definition of type '{name}' holds a list of nothing")
+            raise UndefinedTypeError(f"the definition of type '{name}' contains a list of messages without fields")
         is_unrolled = kind is Nodetype.ARRAY and (item_kind is Nodetype.NAME or item[0] == "string")
         total += parts * length if is_unrolled else 1 if is_list else parts
         if total > _MAX_PARTS:
@@ -148,8 +150,8 @@ def _num_parts(name: str, types: Mapping[str, Any], above: tuple[str, ...]) -> i
 
 
 def _idl_types(definition: str) -> Typesdict:
-    """The types of a definition in IDL: files one after the other, each after a line of '=' and one with its name."""
-    # What the files include stands beside them, and rosbags' grammar has no directives.
+    """Return the types of a definition in IDL: concatenated files, each after a line of '=' and one with its name."""
+    # Included files are part of the definition, and rosbags' grammar has no preprocessor directives.
     plain = re.sub(r"^[ \t]*#.*$", "", definition, flags=re.MULTILINE)
     files = re.split(r"^={80}\nIDL: .*$", plain, flags=re.MULTILINE)
     return {name: fields for file in files if file.strip() for name, fields in get_types_from_idl(file).items()}

@@ -1,4 +1,4 @@
-"""The ROS 2 message types that octoreplay reads and writes, and their CDR encoding (rosbags' typestore)."""
+"""ROS 2 message types that octoreplay reads and writes, and their CDR encoding (rosbags' typestore)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ VISION_MSGS = {
     "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name\n",
     "vision_msgs/msg/LabelInfo": ("std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"),
 }
-"""Definitions of vision_msgs 4 that rosbags' stores lack."""
+"""Definitions of vision_msgs 4 that are missing from rosbags' type stores."""
 
 OCTOREPLAY_MSGS = {
     "octoreplay_msgs/msg/MapState": """\
@@ -97,7 +97,7 @@ octoreplay_msgs/LinkMetrics[] links
 
 @cache
 def typestore() -> Typestore:
-    """The types of ROS 2 Humble with vision_msgs and octoreplay_msgs registered."""
+    """Return the types of ROS 2 Humble, vision_msgs and octoreplay_msgs."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, definition in {**VISION_MSGS, **OCTOREPLAY_MSGS}.items():
         store.register(get_types_from_msg(definition, name))
@@ -105,14 +105,14 @@ def typestore() -> Typestore:
 
 
 def message(type_name: str, **fields: Any) -> Any:
-    """A message of a registered type from its fields."""
+    """Return a message of a registered type from its fields."""
     return typestore().types[type_name](**fields)
 
 
 def stamp_to_ns(stamp: Any) -> int:
-    """Nanoseconds of a builtin_interfaces/Time (ROS 2), time (ROS 1) or google.protobuf.Timestamp, or a JSON time.
+    """Return nanoseconds of a builtin_interfaces/Time (ROS 2), time (ROS 1), google.protobuf.Timestamp or JSON time.
 
-    Raises AttributeError, TypeError or ValueError where it is none of them, or more than 64 bits hold.
+    Raises AttributeError, TypeError or ValueError for other values and for times outside int64.
     """
     if hasattr(stamp, "nanosec"):
         seconds, nanoseconds = stamp.sec, stamp.nanosec
@@ -130,10 +130,10 @@ def stamp_to_ns(stamp: Any) -> int:
 
 
 def time_message(stamp_ns: int) -> Any:
-    """builtin_interfaces/Time of a time in nanoseconds."""
+    """Return a builtin_interfaces/Time from nanoseconds."""
     return message("builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000)
 
 
 def header(stamp_ns: int, frame_id: str) -> Any:
-    """std_msgs/Header with stamp and frame."""
+    """Return a std_msgs/Header with a stamp [ns] and a frame id."""
     return message("std_msgs/msg/Header", stamp=time_message(stamp_ns), frame_id=frame_id)

@@ -1,4 +1,4 @@
-"""Sensor, pose and label messages in one form, whether they are ROS messages or Foxglove's schemas.
+"""Sensor, pose and label messages in one form for ROS message types and Foxglove schemas.
 
 Sources: ROS's common_interfaces, geometry2 and vision_msgs; https://docs.foxglove.dev/docs/sdk/schemas
 """
@@ -21,7 +21,7 @@ from octoreplay.transforms import normalise, pose_matrix
 
 
 class Kind(StrEnum):
-    """What a message says, in the words that users read."""
+    """Kind of a message; the value is the name shown to users."""
 
     IMAGE = "image"
     COMPRESSED_IMAGE = "compressed image"
@@ -37,7 +37,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Image:
-    """A raw image: rows of ``step`` bytes in ``data``; ``encoding`` as in sensor_msgs/image_encodings."""
+    """Raw image: rows of ``step`` bytes in ``data``; ``encoding`` as in sensor_msgs/image_encodings."""
 
     stamp_ns: int
     frame_id: str
@@ -51,7 +51,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CompressedImage:
-    """An encoded image; ``format`` as its sender writes it: 'png', '16UC1; compressedDepth png', ..."""
+    """Compressed image; ``format`` as in the message: 'png', '16UC1; compressedDepth png', ..."""
 
     stamp_ns: int
     frame_id: str
@@ -61,9 +61,9 @@ class CompressedImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Calibration:
-    """A camera as sensor_msgs/CameraInfo describes it: K (3, 3), P (3, 4), distortion coefficients D of ``model``.
+    """Camera parameters as in sensor_msgs/CameraInfo: K (3, 3), P (3, 4), distortion coefficients D of ``model``.
 
-    ``roi`` is (x, y, width, height) in pixels of the full image, before binning; zeros mean the whole image.
+    ``roi`` is (x, y, width, height) in pixels of the full image, before binning; all zeros denote the whole image.
     """
 
     stamp_ns: int
@@ -80,7 +80,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class CloudField:
-    """One field of a point: ``kind`` is numpy's, such as 'f4', without byte order; '' where it is unknown."""
+    """One field of a point: ``kind`` is a NumPy type code without byte order, such as 'f4'; '' if unknown."""
 
     name: str
     offset: int
@@ -90,7 +90,7 @@ class CloudField:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cloud:
-    """Points as packed bytes; ``T_frame_cloud`` (4, 4) where the sensor is not at the origin of ``frame_id``."""
+    """Points as packed bytes; ``T_frame_cloud`` (4, 4) maps them to ``frame_id`` (None: identity)."""
 
     stamp_ns: int
     frame_id: str
@@ -106,7 +106,10 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scan:
-    """A planar scan: ``ranges`` [m] at angles from ``angle_min`` on about z [rad]; good within the two limits [m]."""
+    """Planar scan: ``ranges`` [m] at angles about z [rad] from ``angle_min`` on, valid within the limits [m].
+
+    ``T_frame_scan`` (4, 4) maps the scan's frame to ``frame_id`` (None: identity).
+    """
 
     stamp_ns: int
     frame_id: str
@@ -120,7 +123,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class StampedTransform:
-    """T_parent_child at a stamp: translation (x, y, z) [m], rotation (x, y, z, w); ``child`` is '' where not said."""
+    """T_parent_child at a stamp: translation (x, y, z) [m], rotation (x, y, z, w); ``child`` may be empty."""
 
     stamp_ns: int
     parent: str
@@ -131,7 +134,7 @@ class StampedTransform:
 
 @dataclass(frozen=True, slots=True)
 class Transforms:
-    """All poses or transforms of one message; one that is said once ``holds`` from then on (Foxglove's do)."""
+    """All poses or transforms of one message. With ``holds`` a single one is valid at all times (Foxglove)."""
 
     transforms: tuple[StampedTransform, ...]
     holds: bool = False
@@ -139,7 +142,7 @@ class Transforms:
 
 @dataclass(frozen=True, slots=True)
 class LabelNames:
-    """Raw label to class name, as vision_msgs/LabelInfo gives them."""
+    """Class names by raw label, as in vision_msgs/LabelInfo."""
 
     names: Mapping[int, str]
 
@@ -148,16 +151,16 @@ SensorMessage: TypeAlias = Image | CompressedImage | Calibration | Cloud | Scan 
 
 
 def kind_of(type_name: str) -> Kind | None:
-    """What messages of a type say; None for types that are not used."""
+    """Return the kind of messages of a type; None for types that are not used."""
     entry = _TYPES.get(_plain(type_name))
     return None if entry is None else entry[0]
 
 
 def convert(type_name: str, value: Any) -> SensorMessage:
-    """A decoded message of a type that ``kind_of`` knows in the form above; bytes stay views where they are.
+    """Convert a decoded message of a type that ``kind_of`` knows; bytes are not copied.
 
-    Raises DamagedMessageError where a field is missing or of another kind, as in JSON or in types of the same name, and
-    for a type that is not used, as where one topic carries several.
+    Raises DamagedMessageError where a field is missing or has another type, as in JSON or in a type of the same name,
+    and for a type that is not used, as on a topic with several types.
     """
     entry = _TYPES.get(_plain(type_name))
     if entry is None:
@@ -190,7 +193,7 @@ def _compressed_image(value: Any) -> CompressedImage:
 
 
 def _camera_info(value: Any) -> Calibration:
-    # ROS 1 and Foxglove write these names in capitals.
+    # ROS 1 and Foxglove have these names in upper case.
     def matrix(name: str, shape: tuple[int, ...]) -> Float64Array:
         numbers = getattr(value, name) if hasattr(value, name) else getattr(value, name.lower())
         return np.asarray(list(numbers), dtype=np.float64).reshape(shape)
@@ -208,7 +211,7 @@ def _camera_info(value: Any) -> Calibration:
 
 # --- clouds and scans ------------------------------------------------------------------------------------------------
 
-# sensor_msgs/PointField and foxglove.PackedElementField number the same types in different orders.
+# Type codes of sensor_msgs/PointField and foxglove.PackedElementField, which differ in their order.
 _ROS_FIELDS = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _FOXGLOVE_FIELDS = ("", "u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8")
 
@@ -264,7 +267,7 @@ def _transform_stamped(value: Any) -> Transforms:
 
 
 def _path(value: Any) -> Transforms:
-    # A pose that names no frame is in the path's.
+    # A pose without a frame id is in the path's frame.
     _, frame_id = _head(value)
     heads = [(_head(entry), entry.pose) for entry in value.poses]
     return Transforms(tuple(StampedTransform(stamp, frame or frame_id, "", *_pose(p)) for (stamp, frame), p in heads))
@@ -297,35 +300,35 @@ def _label_info(value: Any) -> LabelNames:
 
 
 def _head(value: Any) -> tuple[int, str]:
-    """Stamp and frame, of a header or of the message itself."""
+    """Return stamp and frame id, of the header or of the message itself."""
     if hasattr(value, "header"):
         return stamp_to_ns(value.header.stamp), str(value.header.frame_id)
     return stamp_to_ns(value.timestamp), str(value.frame_id)
 
 
 def _data(value: Any) -> Bytes:
-    """The bytes of a message; JSON writes them in base 64."""
+    """Return the bytes of a field; JSON has them in base 64."""
     data: Bytes | str = value.data
     return base64.b64decode(data, validate=True) if isinstance(data, str) else memoryview(data)
 
 
 def _count(number: Any) -> int:
-    """A number of things, as ROS and Foxglove write it in 32 bits; JSON may hold any other. Raises ValueError."""
+    """Return an unsigned 32-bit integer; JSON may hold any other number. Raises ValueError."""
     count = int(number)
     if not 0 <= count < 1 << 32:
-        raise ValueError("not a number of 32 bits")
+        raise ValueError("not an unsigned 32-bit integer")
     return count
 
 
 def _finite(number: Any) -> float:
-    """A finite number. Raises ValueError."""
+    """Return a finite number. Raises ValueError."""
     if not math.isfinite(float(number)):
         raise ValueError("not a finite number")
     return float(number)
 
 
 def _row(numbers: Any) -> Float64Array:
-    """A list of numbers, (N,). Raises ValueError."""
+    """Return a list of numbers as (N,) float64. Raises ValueError."""
     row = np.asarray(list(numbers), dtype=np.float64)
     if row.ndim != 1:
         raise ValueError("not a list of numbers")
@@ -337,11 +340,11 @@ def _pose(pose: Any) -> tuple[tuple[float, float, float], tuple[float, float, fl
 
 
 def _pose_matrix(pose: Any) -> Float64Array | None:
-    """A pose as (4, 4); None for the identity, and for a pose that was left out (all zero). Raises ValueError."""
+    """Return a pose as (4, 4); None for the identity and for an unset pose (all zeros). Raises ValueError."""
     position, quaternion = _pose(pose)
     if not any((*position, *quaternion[:3])):
         return None
-    # A rotation that was left out is none.
+    # An unset rotation is the identity.
     rotation = normalise(quaternion) if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
     if rotation is None or not all(map(math.isfinite, position)):
         raise ValueError("not a pose")
@@ -357,7 +360,7 @@ def _xyzw(quaternion: Any) -> tuple[float, float, float, float]:
 
 
 def _plain(type_name: str) -> str:
-    """A type's name as the table below has it: Foxglove's schemas have one name in every encoding."""
+    """Return a type's name as in ``_TYPES``, where Foxglove's schemas have one name for all encodings."""
     return type_name.replace("foxglove_msgs/msg/", "foxglove.")
 
 

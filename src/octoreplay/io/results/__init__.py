@@ -1,1 +1,1 @@
-"""The result of a run as MCAP, and maps as PLY."""
+"""Results of runs as MCAP files, and maps as PLY files."""

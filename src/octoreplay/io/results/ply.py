@@ -1,6 +1,6 @@
-"""Maps as binary PLY files: leaf centres as points, or cubes of the leaves' sizes.
+"""Writers of maps as binary PLY files: leaf centres as points, or leaves as cubes.
 
-CloudCompare, MeshLab and Open3D open them. The ``label`` property survives in Open3D through ``open3d.t.io``.
+CloudCompare, MeshLab and Open3D read them. Open3D keeps the ``label`` property only when reading with ``open3d.t.io``.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ VERTEX_DTYPE = np.dtype(
         ("probability", "<f4"), ("size", "<f4"),
     ]
 )  # fmt: skip
-"""Properties of every vertex: ``label`` is the most probable class_id (0 free), ``size`` the leaf's edge in metres."""
+"""Vertex properties: ``label`` is the most probable class_id (0: free), ``size`` the edge of the leaf [m]."""
 
 _CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
-"""Corners of the unit cube, x fastest."""
+"""Corners of the unit cube, (8, 3); x varies fastest."""
 _FACES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
-"""The cube's faces as corner numbers, counter-clockwise seen from outside."""
+"""Faces of the cube as indices of corners, counter-clockwise as seen from outside."""
 
 
 def write_points(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
-    """Write the leaves' centres as points. ``colors`` is (L, 3) uint8. Raises OutputError."""
+    """Write the centres of the leaves as points. ``colors`` is (L, 3) uint8. Raises OutputError."""
     _write(path, _vertices(leaves, colors, leaves.centers), None, comments)
 
 
 def write_voxels(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
-    """Write every leaf as a cube of its size: 8 vertices and 12 triangles. ``colors`` is (L, 3) uint8.
+    """Write each leaf as a cube of its size: 8 vertices and 12 triangles. ``colors`` is (L, 3) uint8.
 
-    Cubes share no vertices, so that each keeps its own colour. Triangles, because not every viewer takes quads.
+    Cubes share no vertices, so each keeps its colour. Not all viewers support quads, hence triangles.
     Raises OutputError.
     """
     corners = leaves.centers[:, None, :] + _CORNERS[None] * leaves.sizes[:, None, None]
@@ -52,7 +52,7 @@ def write_voxels(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Se
 
 
 def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
-    """One vertex per leaf."""
+    """Return one vertex for each leaf, (L,) of ``VERTEX_DTYPE``."""
     vertices = np.zeros(len(leaves), dtype=VERTEX_DTYPE)
     for axis, name in enumerate("xyz"):
         vertices[name] = positions[:, axis]
@@ -65,7 +65,7 @@ def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
 
 
 def _write(path: Path, vertices: Any, faces: Any, comments: Sequence[str]) -> None:
-    """Write under a temporary name, then rename, so that no half file appears."""
+    """Write under a temporary name, then rename, so that no incomplete file appears."""
     from plyfile import PlyData, PlyElement
 
     elements = [PlyElement.describe(vertices, "vertex")]

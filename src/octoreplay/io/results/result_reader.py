@@ -1,4 +1,4 @@
-"""Reads a result file back: configuration, classes, metrics, map states and poses (docs/result-format.md)."""
+"""Reader of result files: configuration, classes, metrics, map states and poses (docs/result-format.md)."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ from octoreplay.records import (
 class ResultReader:
     """One result file, read lazily; a context manager.
 
-    ``description`` is the metadata record ``octoreplay``; ``config`` the run's configuration, its log paths taken from
-    the result's folder. Raises InputError for a file that is missing, cut off, damaged or no octoreplay result.
+    ``config`` is the run's configuration; its relative log paths are resolved against the result's folder.
+    Raises InputError for a file that is missing, cut, damaged or not an octoreplay result.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,46 +72,46 @@ class ResultReader:
 
     @property
     def description(self) -> dict[str, str]:
-        """The metadata record ``octoreplay``: version, format_version, frame, robots, resolution, prior, rule."""
+        """Metadata record ``octoreplay``: version, format_version, frame, robots, resolution, prior, rule."""
         return self._metadata["octoreplay"]
 
     @property
     def robots(self) -> tuple[str, ...]:
-        """The team's robots in their order."""
+        """Names of the team's robots in their order."""
         return tuple(robot.robot_id for robot in self.config.robots)
 
     @property
     def class_table(self) -> ClassTable:
-        """The occupied classes with their names and colours."""
+        """Occupied classes with their names and colours."""
         if self.config.classes is None:
             raise InputError(f"{self.path}: damaged: the stored configuration has no classes")
         return self.config.classes
 
     @property
     def is_complete(self) -> bool:
-        """False for what an interrupted run left."""
+        """False for the result of an interrupted run."""
         return self._metadata.get("summary", {}).get("complete") == "true"
 
     @property
     def inputs(self) -> dict[str, tuple[int, str, str]]:
-        """Size in bytes, method and fingerprint of every input file by its path, in the order of the robots."""
+        """Size [bytes], method and fingerprint of each input file by its path, in the order of the robots."""
         stored = {name: json.loads(text) for name, text in self._metadata.get("inputs", {}).items()}
         return {name: (entry["size"], entry["method"], entry["fingerprint"]) for name, entry in stored.items()}
 
     @property
     def prior(self) -> float:
-        """h_0, the log-odds of each occupied class in an unobserved cell."""
+        """Log-odds of each occupied class in an unobserved cell, h_0."""
         return float(self.description["prior"])
 
     def metrics(self) -> list[TickMetrics]:
-        """The metrics of all ticks, in order."""
+        """Return the metrics of all ticks, in order."""
         return [_tick_metrics(value) for _, value in self._messages(METRICS_TOPIC)]
 
     def summary(self, metrics: Sequence[TickMetrics]) -> RunSummary:
-        """What the run came to. The wall time is not stored and is NaN.
+        """Return the summary of the run. The wall time is not stored and is NaN.
 
-        For an interrupted run it is counted from ``metrics``, and nothing is known of frames and warnings.
-        Raises InputError where not a single tick is stored.
+        For an interrupted run the summary is computed from ``metrics``, without frame counts and warnings.
+        Raises InputError where no tick is stored.
         """
         if not metrics:
             raise InputError(f"{self.path}: holds no tick; the run was interrupted before its first one")
@@ -128,17 +128,30 @@ class ResultReader:
         return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
 
     def state_times(self, robot_id: str) -> list[tuple[int, int]]:
-        """(tick, stamp_ns) of a robot's stored maps, in order."""
+        """Return (tick, stamp_ns) of a robot's stored maps, in order."""
         return [
             (int(value.tick), stamp_to_ns(value.header.stamp))
             for _, value in self._messages(map_state_topic(self._known(robot_id)))
         ]
 
-    def states(self, robot_id: str, until_ns: int | None = None) -> list[MapState]:
-        """The states that make up a robot's last map with stamp <= ``until_ns`` (None: the last of all).
+    def state_stamp(self, robot_id: str, tick: int) -> int | None:
+        """Return the stamp [ns] of a robot's map stored at a tick; None where none is. Raises as ``states``."""
+        topic = map_state_topic(self._known(robot_id))
+        for first_ns, first in self._messages(topic):
+            # Ticks are one publish period apart, so only the chunks at the tick's time need be read.
+            period_ns = round(self.config.network.publish_period * 1e9)
+            expected_ns = first_ns + (tick - int(first.tick)) * period_ns
+            for stamp_ns, value in self._messages(topic, start_ns=expected_ns, end_ns=expected_ns + 1):
+                if value.tick == tick:
+                    return stamp_ns
+            break
+        return dict(self.state_times(robot_id)).get(tick)
 
-        A key frame first, then the deltas that lead from it to that map. Raises InputError for an unknown robot, where
-        nothing is stored that early, or where a state in between is missing.
+    def states(self, robot_id: str, until_ns: int | None = None) -> list[MapState]:
+        """Return the states of a robot's last map with a stamp of at most ``until_ns`` (None: the last of all).
+
+        The first is a key frame, the others are the deltas from it to that map. Only the chunks that hold them are
+        read. Raises InputError for an unknown robot, a time before the first stored map, and a missing state.
         """
         end = None if until_ns is None else until_ns + 1
         chain: list[MapState] = []
@@ -159,12 +172,12 @@ class ResultReader:
         raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for")
 
     def all_states(self) -> Iterator[MapState]:
-        """Every stored state of all robots and of the centralised map, in the order of time."""
+        """Yield all stored states of the robots and of the centralised map, in order of time."""
         for _, value in self._messages(*map(map_state_topic, (*self.robots, CENTRAL))):
             yield _map_state(value)
 
     def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
-        """A robot's sensor poses: stamps [ns], and (P, 7) x, y, z, qx, qy, qz, qw in the team's frame."""
+        """Return a robot's sensor poses: stamps [ns], and (P, 7) x, y, z, qx, qy, qz, qw in the team's frame."""
         stamps, rows = [], []
         for stamp_ns, value in self._messages(pose_topic(self._known(robot_id))):
             position, turn = value.pose.position, value.pose.orientation
@@ -173,7 +186,7 @@ class ResultReader:
         return stamps, np.array(rows, dtype=np.float64).reshape(-1, 7)
 
     def changed_inputs(self) -> list[str]:
-        """A sentence for every input file that is missing or no longer what this result was made from."""
+        """Return a sentence for each input file that is missing or has changed since the run."""
         sentences = []
         for name, stored in self.inputs.items():
             path = self.path.parent / name
@@ -186,7 +199,7 @@ class ResultReader:
         return sentences
 
     def _open(self) -> tuple[SeekingReader, dict[str, dict[str, str]]]:
-        """The container, and all its metadata records by name."""
+        """Return the container's reader and all metadata records by name."""
         try:
             reader = SeekingReader(self._file, validate_crcs=True)
             return reader, {record.name: dict(record.metadata) for record in reader.iter_metadata()}
@@ -194,14 +207,14 @@ class ResultReader:
             raise InputError(f"{self.path}: not a finished MCAP file; {_NOT_A_RESULT}") from error
 
     def _read_config(self) -> RunConfig:
-        """The stored configuration."""
+        """Parse the stored configuration."""
         try:
             return parse_team(self._metadata["config"]["team_file"], name=str(self.path), folder=self.path.parent)
         except (ConfigError, KeyError) as error:
             raise InputError(f"{self.path}: damaged: its configuration cannot be read: {error}") from error
 
     def _check_kind(self) -> None:
-        """Refuse other MCAP files, and results of a later format."""
+        """Raise InputError for other MCAP files and for results of another format version."""
         if "octoreplay" not in self._metadata or "config" not in self._metadata:
             raise InputError(f"{self.path}: an MCAP file, but no result of octoreplay; {_NOT_A_RESULT}")
         version = self.description.get("format_version")
@@ -212,15 +225,19 @@ class ResultReader:
             )
 
     def _known(self, robot_id: str) -> str:
-        """The robot_id, if it is one of the team's, or the centralised map's name."""
+        """Return the name of a robot or of the centralised map; raise InputError for any other."""
         if robot_id not in (*self.robots, CENTRAL):
             raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
         return robot_id
 
-    def _messages(self, *topics: str, end_ns: int | None = None, reverse: bool = False) -> Iterator[tuple[int, Any]]:
-        """(log time, message) on some topics, before ``end_ns``, in log-time order or the reverse of it."""
+    def _messages(
+        self, *topics: str, start_ns: int | None = None, end_ns: int | None = None, reverse: bool = False
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield (log time, message) with ``start_ns`` <= log time < ``end_ns`` in order of log time, or in reverse."""
         try:
-            for schema, _, record in self._reader.iter_messages(topics, ending_before=end_ns, reverse=reverse):
+            for schema, _, record in self._reader.iter_messages(
+                topics, starting_at=start_ns, ending_before=end_ns, reverse=reverse
+            ):
                 name = schema.name if schema is not None else ""
                 yield record.log_time, typestore().deserialize_cdr(record.data, name)
         except _DAMAGE as error:
@@ -228,12 +245,12 @@ class ResultReader:
 
 
 _DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
-"""What reading a damaged file raises."""
+"""Exceptions raised by reading a damaged file."""
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
 
 
 def _tick_metrics(value: Any) -> TickMetrics:
-    """TickMetrics from its message."""
+    """Return TickMetrics from its message."""
     plain = ("tick", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
              "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change")  # fmt: skip
     return TickMetrics(
@@ -245,12 +262,12 @@ def _tick_metrics(value: Any) -> TickMetrics:
 
 
 def _fields(kind: Any, value: Any) -> dict[str, Any]:
-    """The fields of a record from the message that has the same names."""
+    """Return the fields of the dataclass ``kind`` from the fields of a message with the same names."""
     return {item.name: getattr(value, item.name) for item in dataclasses.fields(kind)}
 
 
 def _map_state(value: Any) -> MapState:
-    """MapState from its message."""
+    """Return a MapState from its message."""
     return MapState(
         robot_id=value.robot_id,
         stamp_ns=stamp_to_ns(value.header.stamp),
@@ -263,7 +280,7 @@ def _map_state(value: Any) -> MapState:
 
 
 def _frame_counts(stored: dict[str, Any]) -> FrameCounts:
-    """FrameCounts from JSON, whose keys are text; counts that an older version had beside them are left out."""
+    """Return FrameCounts from JSON, where keys are text; counts of older versions that are unknown are ignored."""
     by_number = {
         name: {int(number): count for number, count in stored.get(name, {}).items()}
         for name in ("unknown_label_pixels", "unknown_colors")
@@ -273,7 +290,7 @@ def _frame_counts(stored: dict[str, Any]) -> FrameCounts:
 
 
 def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> RunSummary:
-    """What can be said of a run that did not end by itself."""
+    """Compute the summary of an interrupted run from its metrics."""
     published = [robot for tick in metrics for robot in tick.robots if robot.packet_bytes]
 
     def mean(name: str) -> float:

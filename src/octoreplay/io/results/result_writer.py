@@ -1,4 +1,4 @@
-"""Writes a run's result: one self-contained MCAP of ROS 2 messages (docs/result-format.md)."""
+"""Writer of a run's result: one self-contained MCAP file of ROS 2 messages (docs/result-format.md)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from octoreplay.records import Float64Array, LeafTable, MapState, RobotPose, Run
 from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
-"""Counts incompatible changes of the result format."""
+"""Version of the result format; it increases with each incompatible change."""
 TEAM_FRAME = "team"
-"""The frame that every map and pose in a result is given in."""
+"""Frame of all maps and poses in a result."""
 
 METRICS_TOPIC = "/metrics"
 GRAPH_TOPIC = "/graph"
@@ -45,8 +45,8 @@ VIEW_FIELDS = (
     ("size", "<f4", 16, _FLOAT32),
     ("probability", "<f4", 20, _FLOAT32),
 )
-"""One point of a map view: name, NumPy format, offset, PointField datatype. ``rgb`` holds the integer 0x00RRGGBB and is
-declared as a float32, which is PCL's habit and what viewers look for."""
+"""Fields of a point in a map view: name, NumPy format, offset, PointField datatype. ``rgb`` holds the integer
+0x00RRGGBB and is declared as float32, a convention of PCL that viewers follow."""
 VIEW_DTYPE = np.dtype(
     {
         "names": [name for name, *_ in VIEW_FIELDS],
@@ -61,37 +61,37 @@ _LINE_LIST, _TEXT_VIEW_FACING, _ADD, _DELETE = 5, 9, 0, 2
 
 
 def map_state_topic(robot_id: str) -> str:
-    """Topic of a robot's stored map states."""
+    """Return the topic of a robot's stored map states."""
     return f"/{robot_id}/map_state"
 
 
 def map_view_topic(robot_id: str) -> str:
-    """Topic of a robot's map for viewing."""
+    """Return the topic of a robot's map for viewers."""
     return f"/{robot_id}/map"
 
 
 def pose_topic(robot_id: str) -> str:
-    """Topic of a robot's sensor pose."""
+    """Return the topic of a robot's sensor pose."""
     return f"/{robot_id}/pose"
 
 
 def packet_topic(robot_id: str) -> str:
-    """Topic of the radio packets that a robot sent."""
+    """Return the topic of the packets that a robot sent."""
     return f"/{robot_id}/packet"
 
 
 def partial_path(path: Path) -> Path:
-    """Where a result is written until it is complete: ``x.partial.mcap`` for ``x.mcap``."""
+    """Return the path of a result until it is complete: ``x.partial.mcap`` for ``x.mcap``."""
     stem = path.stem if path.suffix == ".mcap" else path.name
     return path.with_name(f"{stem}.partial.mcap")
 
 
 class ResultWriter:
-    """Writes a result beside its own name and renames it when it is complete.
+    """Writes a result to a temporary file, which ``complete`` renames; a context manager.
 
-    A context manager: without ``complete`` the unfinished file is removed, except that after a KeyboardInterrupt it is
-    finished and stays as ``x.partial.mcap``. The same calls give
-    the same bytes: nothing of the clock or the machine is written.
+    Without ``complete`` the file is removed at exit. After a KeyboardInterrupt it is finished instead and kept as
+    ``x.partial.mcap``. ``config`` is resolved: all robots and topics are given. Equal calls give equal bytes: no
+    wall-clock time and nothing machine-dependent is written.
 
     Raises OutputError where the result cannot be written or would overwrite an input, and InputError where an input
     cannot be read for its fingerprint.
@@ -127,7 +127,7 @@ class ResultWriter:
             self.discard()
 
     def write_state(self, state: MapState) -> None:
-        """Store one robot's map, a key frame or a delta, on ``/<robot>/map_state``."""
+        """Write one robot's map, a key frame or a delta, to ``/<robot>/map_state``."""
         self._start(state.stamp_ns)
         type_name = "octoreplay_msgs/msg/MapState"
         value = message(
@@ -138,7 +138,7 @@ class ResultWriter:
         self._writer.write(map_state_topic(state.robot_id), type_name, value, state.stamp_ns)
 
     def write_metrics(self, metrics: TickMetrics) -> None:
-        """Store the team's metrics after one tick on ``/metrics``."""
+        """Write the team's metrics after one tick to ``/metrics``."""
         self._start(metrics.stamp_ns)
         fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
         del fields["stamp_ns"]
@@ -153,7 +153,7 @@ class ResultWriter:
         self._writer.write(METRICS_TOPIC, type_name, value, metrics.stamp_ns)
 
     def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable) -> None:
-        """Store the occupied leaves of one robot's map as a point cloud for viewing on ``/<robot>/map``."""
+        """Write the occupied leaves of one robot's map as a point cloud for viewers to ``/<robot>/map``."""
         self._start(stamp_ns)
         points = self._view_points(leaves)
         type_name = "sensor_msgs/msg/PointCloud2"
@@ -169,7 +169,7 @@ class ResultWriter:
         self._writer.write(map_view_topic(robot_id), type_name, value, stamp_ns)
 
     def write_poses(self, stamp_ns: int, poses: Sequence[RobotPose]) -> None:
-        """Store where the robots' sensors are: ``/<robot>/pose`` and ``/tf`` (team -> ``<robot>/sensor``)."""
+        """Write the robots' sensor poses to ``/<robot>/pose`` and ``/tf`` (team -> ``<robot>/sensor``)."""
         self._start(stamp_ns)
         transforms = []
         for pose in poses:
@@ -186,7 +186,7 @@ class ResultWriter:
             self._write_transforms(TF_TOPIC, stamp_ns, transforms)
 
     def write_graph(self, stamp_ns: int, links: Sequence[tuple[str, str]], poses: Sequence[RobotPose]) -> None:
-        """Store the tick's links (pairs of robots, each once) as lines between the robots, named, on ``/graph``."""
+        """Write the tick's links (pairs of robots, each once) as lines and the robots' names to ``/graph``."""
         self._start(stamp_ns)
         positions = {pose.robot_id: _vector(pose.T_team_sensor) for pose in poses}
         points = [_point(positions[end]) for link in links if positions.keys() >= set(link) for end in link]
@@ -205,7 +205,7 @@ class ResultWriter:
         self._writer.write(GRAPH_TOPIC, type_name, message(type_name, markers=[lines, *names]), stamp_ns)
 
     def write_packet(self, robot_id: str, stamp_ns: int, tick: int, data: bytes) -> None:
-        """Store one packet as it was sent on ``/<robot>/packet``."""
+        """Write one packet as sent to ``/<robot>/packet``."""
         self._start(stamp_ns)
         type_name = "octoreplay_msgs/msg/Packet"
         value = message(
@@ -215,7 +215,7 @@ class ResultWriter:
         self._writer.write(packet_topic(robot_id), type_name, value, stamp_ns)
 
     def complete(self, summary: RunSummary) -> None:
-        """Store what the run came to, finish the file and give it its own name."""
+        """Write the summary of the run, finish the file and rename it to its final name."""
         try:
             self._writer.write_metadata("summary", _summary_values(summary))
             self._writer.finish()
@@ -225,7 +225,7 @@ class ResultWriter:
         self._open = False
 
     def keep_partial(self) -> None:
-        """Finish the file under its partial name, so that it can be opened, and leave the result's own name alone."""
+        """Finish the file under its temporary name, so that it can be opened, without replacing the final file."""
         self._writer.write_metadata("summary", {"complete": "false", "stop_reason": "interrupted"})
         self._writer.finish()
         self._open = False
@@ -239,7 +239,7 @@ class ResultWriter:
             self.partial_path.unlink()
 
     def _check_path(self) -> None:
-        """Refuse a result that cannot be written before any work is done."""
+        """Raise OutputError for a path that cannot be written, or that is an input of the run."""
         if self.path.is_dir():
             raise OutputError(f"{self.path}: is a folder; give a file name such as {self.path / 'out.mcap'}")
         if not self.path.parent.is_dir():
@@ -251,13 +251,13 @@ class ResultWriter:
                         raise OutputError(f"{self.path}: is an input of robot '{robot.robot_id}'; name another output")
 
     def _inputs(self) -> dict[str, Fingerprint]:
-        """Fingerprints of all input files by absolute path, in the order of the robots."""
+        """Return the fingerprints of all input files by absolute path, in the order of the robots."""
         whole = self._config.output.hash
         files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
 
     def _write_description(self, inputs: dict[str, Fingerprint]) -> None:
-        """The metadata that says what this file is and how to make it again."""
+        """Write the metadata: format, configuration, classes and fingerprints of the inputs."""
         config, folder = self._config, self.path.parent.resolve()
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         self._writer.write_metadata(
@@ -289,7 +289,7 @@ class ResultWriter:
         )
 
     def _start(self, stamp_ns: int) -> None:
-        """Before the first message: the robots' map frames, which viewers need at or before everything else."""
+        """Before the first message, write the robots' map frames, which viewers need at or before other messages."""
         if self._started:
             return
         self._started = True
@@ -301,7 +301,7 @@ class ResultWriter:
         self._writer.write(topic, type_name, message(type_name, transforms=transforms), stamp_ns)
 
     def _view_points(self, leaves: LeafTable) -> Any:
-        """The occupied leaves as an array of VIEW_DTYPE."""
+        """Return the occupied leaves as an array of ``VIEW_DTYPE``."""
         label = best_labels(leaves.log_odds)
         occupied = np.flatnonzero(label)
         label = label[occupied]
@@ -317,12 +317,12 @@ class ResultWriter:
 
 
 def _relative(path: str, folder: Path) -> str:
-    """A path as the stored team file gives it: relative to the result's folder where it lies below."""
+    """Return a path as in the stored team file: relative to the result's folder if it lies below it."""
     return str(Path(path).relative_to(folder)) if Path(path).is_relative_to(folder) else path
 
 
 def _summary_values(summary: RunSummary) -> dict[str, str]:
-    """A run's summary as metadata: numbers and lists as JSON; without the wall time, so that equal runs are equal."""
+    """Return a summary as metadata, with numbers and lists as JSON; without the wall time, which differs by run."""
     values = {"complete": "true"}
     for item in dataclasses.fields(summary):
         if item.name in ("wall_seconds", "last", "links", "frame_counts"):
@@ -336,14 +336,14 @@ def _summary_values(summary: RunSummary) -> dict[str, str]:
 
 
 def _static_transform(stamp_ns: int, robot: RobotConfig) -> Any:
-    """From the team's frame to ``<robot>/map``, the frame of the poses in the robot's log."""
+    """Return the transform from the team's frame to ``<robot>/map``, the frame of the poses in the robot's log."""
     x, y, z, *rotation = robot.T_team_map
     quaternion = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", rotation, strict=True)))
     return _transform(stamp_ns, f"{robot.robot_id}/map", np.array([x, y, z]), quaternion)
 
 
 def _transform(stamp_ns: int, child_frame: str, position: Float64Array, rotation: Any) -> Any:
-    """geometry_msgs/TransformStamped from the team's frame."""
+    """Return a geometry_msgs/TransformStamped from the team's frame."""
     return message(
         "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, TEAM_FRAME), child_frame_id=child_frame,
         transform=message(
@@ -366,7 +366,7 @@ def _marker(
     text: str = "",
     position: Float64Array | None = None,
 ) -> Any:
-    """visualization_msgs/Marker in the team's frame; what a line list or a text does not use stays empty."""
+    """Return a visualization_msgs/Marker in the team's frame; fields unused by lines and texts are empty."""
     point = _point(np.zeros(3) if position is None else position)
     identity = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     empty_bytes = np.zeros(0, dtype=np.uint8)
@@ -397,6 +397,6 @@ def _vector(transform: Float64Array) -> Float64Array:
 
 
 def _quaternion(transform: Float64Array) -> Any:
-    """geometry_msgs/Quaternion of a transform's rotation."""
+    """Return the geometry_msgs/Quaternion of a transform's rotation."""
     x, y, z, w = rotation_to_quaternion(transform[:3, :3])
     return message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

@@ -114,10 +114,13 @@ class RobotLog:
     ) -> Iterator[Frame]:
         """The robot's frames in order of stamp, decoded as they are taken; ``counts`` says what became of the rest.
 
-        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. Reading ends
-        when ``is_wanted`` says no, which it is asked for every message. Every call starts from the beginning, with
-        fresh counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for
-        images whose sizes differ, and for frames that TF never joins.
+        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. With a
+        ``start``, reading begins some seconds before it, and late, duplicate, undecodable and damaged messages before
+        that are not counted. The logs are read from their beginning where the delay between stamps and log times
+        changes by more than 10 s, or where Foxglove's transforms, which hold from their first message on, are needed.
+        Reading ends when ``is_wanted`` returns False, which is checked for every message. Every call starts with fresh
+        counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for images
+        whose sizes differ, and for frames that TF never joins.
         """
         self.counts = FrameCounts(truncated_files=self._damage())
         if self._labels is not None:
@@ -127,12 +130,19 @@ class RobotLog:
         self._stamp_check, self._num_beyond = StampCheck(self._offset_ns), 0
         thinning = Thinning(self._time, start_ns - self._offset_ns)
         poses = self.pose_source()
-        for settled in self._settled(poses, thinning, is_wanted):
+        log_start_ns = self._log_start_ns(thinning.needed_from_ns, poses)
+        if log_start_ns is not None:
+            self._check_first_stamps()
+        for settled in self._settled(poses, thinning, log_start_ns, is_wanted):
             if thinning.keeps(settled.stamp_ns):
                 yield from self._frame(settled, poses)
         # Reading on may have come upon more damage than opening did.
         self.counts.truncated_files = self._damage()
         if self.counts.used == 0 and self.counts.no_pose > 0:
+            if log_start_ns is not None:
+                # Transforms in the part that was not read may connect the frames.
+                for message in self._messages(poses.topics, None, log_start_ns):
+                    self._give(message, poses)
             poses.check_connected()
             self._check_within_reach()
 
@@ -148,14 +158,17 @@ class RobotLog:
         )
         return self._known_poses
 
-    def pose_messages(self, poses: PoseSource) -> Iterator[RawMessage]:
-        """Gives a pose source its messages one by one, and each of them when it has been taken."""
-        for message in self._messages(poses.topics):
+    def pose_messages(self, poses: PoseSource, needed_from_ns: int) -> Iterator[RawMessage]:
+        """Gives a pose source its messages one by one, and each of them when it has been taken.
+
+        Messages that no pose from the stamp ``needed_from_ns`` (without the clock offset) on needs may be left out.
+        """
+        for message in self._messages(poses.topics, self._log_start_ns(needed_from_ns, poses)):
             self._give(message, poses)
             yield message
 
     def _settled(
-        self, poses: PoseSource, thinning: Thinning, is_wanted: Callable[[], bool]
+        self, poses: PoseSource, thinning: Thinning, log_start_ns: int | None, is_wanted: Callable[[], bool]
     ) -> Iterator[Settled[RawMessage]]:
         """The sensor's messages in the order of their stamps, with what goes with them."""
         partner_topics = self._maker.partner_topics
@@ -167,19 +180,11 @@ class RobotLog:
             num_partners=len(partner_topics),
         )
         topics = {self.sensor_topic, *poses.topics, *partner_topics}
-        last_log_time_ns: int | None = None
-        num_left = sum(t.num_messages for log in self._logs for t in log.topics if t.name == self.sensor_topic)
-        for number, message in enumerate(self._messages(topics)):
+        for number, message in enumerate(self._until_sensor_ends(self._messages(topics, log_start_ns))):
             if not is_wanted():
                 return
-            if last_log_time_ns is not None and message.log_time_ns > last_log_time_ns:
-                break
             if self._is_over(thinning, queue.newest_ns, message.log_time_ns):
                 break
-            if message.topic == self.sensor_topic:
-                num_left -= 1
-                if num_left == 0:
-                    last_log_time_ns = message.log_time_ns + _LOG_DELAY_NS
             self._take(message, queue, poses, partner_topics)
             while (ready := queue.pop(final=False)) is not None:
                 yield ready
@@ -188,6 +193,51 @@ class RobotLog:
                 poses.forget_before(queue.needed_from_ns(self.first_stamp_ns - self._offset_ns))
         while (ready := queue.pop(final=True)) is not None:
             yield ready
+
+    def _until_sensor_ends(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+        """Messages up to ``_LOG_DELAY_NS`` after the last one of the sensor."""
+        end_ns: int | None = None
+        for message in messages:
+            if message.topic == self.sensor_topic:
+                end_ns = message.log_time_ns + _LOG_DELAY_NS
+            elif end_ns is not None and message.log_time_ns > end_ns:
+                following = next(self._messages((self.sensor_topic,), message.log_time_ns), None)
+                if following is None:
+                    return
+                end_ns = following.log_time_ns
+            yield message
+
+    def _log_start_ns(self, needed_from_ns: int | None, poses: PoseSource) -> int | None:
+        """Log time from which to read for stamps from ``needed_from_ns`` on; None for the log's beginning."""
+        if needed_from_ns is None:
+            return None
+        # Delays are taken to differ from that of the first message by at most _LOG_DELAY_NS.
+        delay_ns = self.first_log_time_ns - (self.first_stamp_ns - self._offset_ns)
+        log_start_ns = needed_from_ns + delay_ns - _LOG_DELAY_NS
+        if log_start_ns <= self.first_log_time_ns or self._has_holding_transforms(poses):
+            return None
+        # A clock that was set, or that runs at another speed than the log's, shows in the delay at this place.
+        try:
+            delays = [
+                message.log_time_ns - self._stamp_of(message, StampCheck(self._offset_ns))
+                for message in islice(self._messages((self.sensor_topic,), log_start_ns), _NUM_FIRST)
+            ]
+        except DamagedMessageError:
+            return None
+        is_steady = bool(delays) and all(abs(delay - delay_ns) <= _LOG_DELAY_NS for delay in delays)
+        return log_start_ns if is_steady else None
+
+    def _has_holding_transforms(self, poses: PoseSource) -> bool:
+        """True where one of the pose topics carries transforms that hold from their first message on (Foxglove's)."""
+        types = {topic.type_name for log in self._logs for topic in log.topics if topic.name in poses.topics}
+        return any(kind_of(name) is Kind.TF and name.startswith("foxglove") for name in types)
+
+    def _check_first_stamps(self) -> None:
+        """Pass each topic's first stamps to the stamp check, which compares later stamps with them."""
+        for topic in (self.sensor_topic, *self._maker.partner_topics):
+            for message in islice(self._messages((topic,)), _NUM_FIRST):
+                with contextlib.suppress(DamagedMessageError):
+                    self._stamp_of(message, self._stamp_check)
 
     def _is_over(self, thinning: Thinning, newest_ns: int | None, log_time_ns: int) -> bool:
         """True once nothing can come that is wanted, by the stamps and by the log's time: one stamp may be wrong."""
@@ -262,9 +312,12 @@ class RobotLog:
             raise InputError(f"{self._name}: {missing} for '{self.sensor_topic}'; give intrinsics: [fx, fy, cx, cy]")
         return DepthFrameMaker(self.robot, self._labels, message)
 
-    def _messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of some topics of all the robot's logs, in order of log time."""
-        return heapq.merge(*(log.messages(topics) for log in self._logs), key=lambda message: message.log_time_ns)
+    def _messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """The messages of some topics of all the robot's logs in a range of log time, in order of log time."""
+        streams = (log.messages(topics, start_ns, stop_ns) for log in self._logs)
+        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     @staticmethod
     def _give(message: RawMessage, poses: PoseSource) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
 from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
+from octoreplay.io.containers.log_reader import RawMessage
 from octoreplay.io.robots.body_box import body_box_at
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import BodyBox, Frame
@@ -25,7 +26,8 @@ class BodyTrack:
         self._robot = robot
         self._log = RobotLog(robot, time, None)
         self._poses = self._log.pose_source()
-        self._messages = self._log.pose_messages(self._poses)
+        self._messages: Iterator[RawMessage] | None = None
+        self._pose_gap_ns = round(time.pose_gap * 1e9)
         self._offset_ns = robot.clock_offset_ns
 
     def __enter__(self) -> Self:
@@ -40,6 +42,8 @@ class BodyTrack:
         """Make the poses from a stamp to another known, as far as the log has them, and drop the ones before."""
         start_ns, end_ns = start_ns - self._offset_ns, end_ns - self._offset_ns
         self._poses.forget_before(start_ns)
+        if self._messages is None:
+            self._messages = self._log.pose_messages(self._poses, start_ns - self._pose_gap_ns)
         while not self._poses.is_known(end_ns):
             message = next(self._messages, None)
             if message is None:

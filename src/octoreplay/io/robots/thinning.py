@@ -24,6 +24,11 @@ class Thinning:
         self._numbers = itertools.count()
         self._last_period: int | None = None
 
+    @property
+    def needed_from_ns(self) -> int | None:
+        """Stamp before which no message or pose affects a frame that is taken; None where the first frames are."""
+        return self._start_ns - self._hold_ns if self._has_start else None
+
     def keeps(self, stamp_ns: int) -> bool:
         """True where the next message, with this stamp, is taken."""
         # Without a start what comes before the first stamp is taken too.

@@ -21,7 +21,7 @@ _UNLABELLED = np.int16(1)
 """Kind of a point in a scan without labels: class 1."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
-"""Counters: runs, and points of which the end point is stored."""
+"""Counters: number of runs, and number of stored end points."""
 
 IS_OWN = 3
 """Row of a box after those of the three axes; its first number is 1 for the robot's own body, 0 for another robot's."""

@@ -77,7 +77,7 @@ def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, c
 
 @inline_kernel
 def _prefetch_block(bricks, rows_at, index):
-    """Prefetch the block of brick ``index`` of ``bricks``, the rows of which start at the address ``rows_at``."""
+    """Prefetch the block of brick ``index`` of ``bricks``; ``rows_at`` is the address of the rows."""
     ahead = np.int64(bricks.blocks[index])
     for offset in range(0, BRICK_CELLS * 4, 64):
         prefetch_line(rows_at + ahead * ROW_BYTES + offset)

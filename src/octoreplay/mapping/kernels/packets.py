@@ -150,7 +150,7 @@ def _compare_cells(block, rows, octets, is_vector, changes):
 
 @kernel
 def _uniform_octets(mask):
-    """Return the first cell of each octet of which all cells are in the ``mask`` uint64."""
+    """Return the first cell of each octet that is completely in the ``mask`` uint64."""
     mask &= mask >> np.uint64(4)
     mask &= mask >> np.uint64(2)
     return mask & (mask >> ONE) & FIRST_CELLS

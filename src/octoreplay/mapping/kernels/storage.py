@@ -428,7 +428,7 @@ def fill_table(bricks, indices, since, table, column):
 def load_brick(target_at, table, n, column, layout, known, m, num_classes):
     """Write a brick to an address, in the layout of another brick that has all its known cells and class rows.
 
-    Cells that the brick does not know get 0.
+    Cells that are unknown in the brick get 0.
 
     - ``target_at``: address of the target rows.
     - ``table``, ``n``, ``column``: the brick is row ``n`` of the table's ``column``.

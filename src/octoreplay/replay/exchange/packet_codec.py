@@ -26,9 +26,14 @@ class PacketCodec:
     """The team's packets.
 
     A packet is encoded once, however many robots send it, and decoded once per tick, however many robots receive it.
+    ``decodes`` is True where receivers decode packets instead of sharing the sender's state.
     """
 
+    always_decodes = False
+    """True to decode in every run, whatever ``decode_packets`` says: the tests set it."""
+
     def __init__(self, config: PacketConfig) -> None:
+        self.decodes = config.decode_packets or self.always_decodes
         self._format = PacketFormat(
             content=config.content,
             step=config.int8_step,

@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Update
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.robots.consensus import ConsensusTeam
@@ -15,7 +15,7 @@ from octoreplay.replay.robots.flood import FloodTeam
 from octoreplay.replay.robots.ratio import RatioTeam
 from octoreplay.replay.robots.robot import Robot, Team
 
-TEAMS: Mapping[str, Callable[[RunConfig, int, PacketCodec], Team[Any]]] = MappingProxyType(
+TEAMS: Mapping[str, Callable[[ResolvedRun, PacketCodec], Team[Any]]] = MappingProxyType(
     {
         "gradient": partial(ConsensusTeam, update=Update.GRADIENT),
         "bayes": partial(ConsensusTeam, update=Update.BAYES),
@@ -29,9 +29,9 @@ TEAMS: Mapping[str, Callable[[RunConfig, int, PacketCodec], Team[Any]]] = Mappin
 """Team of every rule in ``config.rules.RULES``."""
 
 
-def make_team(config: RunConfig, num_classes: int, packet_codec: PacketCodec) -> Team[Robot]:
+def make_team(config: ResolvedRun, packet_codec: PacketCodec) -> Team[Robot]:
     """The robots of a run, without evidence.
 
     Raises ConfigError where the rule cannot hold the log-odds of the sensor model.
     """
-    return TEAMS[config.consensus.rule](config, num_classes, packet_codec)
+    return TEAMS[config.consensus.rule](config, packet_codec)
