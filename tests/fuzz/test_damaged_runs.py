@@ -1,4 +1,4 @@
-"""A run over damaged logs ends with exit code 3 and one sentence for each of them."""
+"""A run of damaged logs ends with exit code 3 and one warning for each log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rewrite_in_small_chunks(source: Path, target: Path) -> None:
         writer.finish()
 
 
-def test_a_run_over_damaged_logs_says_once_what_was_skipped(tmp_path):
+def test_a_run_of_damaged_logs_warns_once_for_each_log(tmp_path):
     for name in ("team.yaml", "husky_2.mcap"):
         shutil.copy(PAIR / name, tmp_path / name)
     cut, damaged = tmp_path / "husky_2.mcap", tmp_path / "husky_1.mcap"

@@ -1,4 +1,4 @@
-"""Committed logs that are damaged, or whose messages lie, come to a map or to one sentence; never anything else."""
+"""Damaged logs and logs with false messages give a map, or are refused with a sentence; nothing else is raised."""
 
 from __future__ import annotations
 
@@ -76,6 +76,6 @@ def test_one_broken_pose_does_not_end_a_run(tmp_path):
     assert counts.used > good.used / 2
 
 
-def test_warnings_of_numpy_are_errors_here():
+def test_numpy_warnings_are_errors():
     with pytest.raises(RuntimeWarning):
         np.float64(1e308) * np.array([1e308])

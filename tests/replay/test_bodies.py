@@ -1,3 +1,5 @@
+"""Body boxes of other robots in maps."""
+
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
@@ -50,7 +52,7 @@ def num_occupied(config, *, hides):
         return [int(np.count_nonzero(octree.leaves(0.0).log_odds[:, 0] > 0)) for octree in last.maps]
 
 
-def test_what_a_robot_sees_of_another_is_not_mapped(config):
+def test_body_boxes_of_other_robots_are_not_mapped(config):
     seen, hidden = num_occupied(config, hides=False), num_occupied(config, hides=True)
     assert seen[0] > 10
     # The robot in front frees the cells that it drives through, and its own box is no one else's.
@@ -58,7 +60,7 @@ def test_what_a_robot_sees_of_another_is_not_mapped(config):
     assert hidden[1] == seen[1] > 10
 
 
-def test_a_run_hides_robots_where_it_is_told_to(config):
+def test_hide_robots_changes_the_map_of_the_robot_behind(config):
     volumes = {}
     for hides in (False, True):
         summary = replay_team(config.with_parameters({"hide_robots": hides}), None)

@@ -115,7 +115,7 @@ def _evidence(session):
 
 @pytest.mark.parametrize("name", ["full", "delta", "key frames, broadcast"])
 @pytest.mark.parametrize("topology", ["line", "ring"])
-def test_flood_brings_evidence_one_hop_per_tick(topology, name):
+def test_flood_moves_evidence_one_hop_per_tick(topology, name):
     session = _session(_config(rule="flood", topology=topology, **PACKETS[name]))
     index = np.arange(4)
     hops = np.abs(index[:, None] - index)
@@ -160,7 +160,7 @@ def test_flood_ends_with_the_oracle_over_a_bad_radio(name, topology):
     _assert_all_have_the_oracle(tick, 1e-5)
 
 
-def test_settling_waits_for_the_next_whole_map_where_nobody_acknowledges():
+def test_without_acknowledgements_settling_waits_for_the_next_key_frame():
     """What a lost delta held comes with the next key frame, which may be many ticks without any change away."""
     packets = {"packets": "delta", "acknowledge": False, "key_frame_every": 25}
     for seed in (0, 1, 2):
@@ -175,7 +175,7 @@ def test_settling_waits_for_packets_that_take_many_ticks():
 
 
 @pytest.mark.parametrize("name", ["full", "delta"])
-def test_flood_goes_on_with_what_a_robot_that_is_gone_delivered(name):
+def test_flood_keeps_the_delivered_map_of_a_robot_that_is_off(name):
     schedule = (ScheduleEntry(5.0, robots_off=("robot_1",)),)
     session, tick = _run(rule="flood", topology="ring", schedule=schedule, **PACKETS[name])
     assert tick.graph.active == (0, 2, 3)
@@ -201,7 +201,7 @@ def test_flood_goes_on_with_what_a_robot_that_is_gone_delivered(name):
 
 @pytest.mark.parametrize("radio", [{}, {"loss": 0.3, "latency": 0.6, "jitter": 0.5}], ids=["good", "bad"])
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_robot_that_forgot_gets_its_earlier_life_back_from_the_others(name, radio):
+def test_flood_returns_the_map_of_an_earlier_restart_epoch(name, radio):
     schedule = (ScheduleEntry(5.0, 8.0, robots_off=("robot_1",), forget=True),)
     session, tick = _run(rule="flood", topology="ring", schedule=schedule, **PACKETS[name], **radio)
     assert session.team.robots[1].source == Source(1, 1)
@@ -215,7 +215,7 @@ def test_a_robot_that_forgot_gets_its_earlier_life_back_from_the_others(name, ra
 
 
 @pytest.mark.parametrize("name", ["full", "delta"])
-def test_all_have_the_oracle_again_where_a_robot_told_everything_before_it_forgot(name):
+def test_flood_ends_with_the_oracle_if_a_robot_published_everything_before_its_restart(name):
     """With eight ticks a second, every scan is published before the next one comes."""
     pause = ScheduleEntry(6.0, 8.0, robots_off=("robot_1",), forget=True)
     session, tick = _run(rule="flood", schedule=(pause,), publish_period=0.125, **PACKETS[name])
@@ -227,7 +227,7 @@ def test_all_have_the_oracle_again_where_a_robot_told_everything_before_it_forgo
 # --- ratio -----------------------------------------------------------------------------------------------------------
 
 
-def test_ratio_is_bayes_where_nothing_fails():
+def test_ratio_equals_bayes_without_faults():
     sessions = [_session(_config(rule=rule, settle=0)) for rule in ("ratio", "bayes")]
     num_joined = []
     for ratio, bayes in zip(*(session.ticks() for session in sessions), strict=True):
@@ -266,13 +266,13 @@ RATIO_FAULTS = {
 
 
 @pytest.mark.parametrize("name", RATIO_FAULTS)
-def test_ratio_loses_nothing(name):
+def test_ratio_ends_with_the_oracle_despite_faults(name):
     _, tick = _run(rule="ratio", **RATIO_FAULTS[name])
     assert tick.graph.active == (0, 1, 2, 3)
     _assert_all_have_the_oracle(tick, RATIO_TOLERANCE)
 
 
-def test_bayes_loses_where_links_carry_one_way_and_ratio_does_not():
+def test_on_one_way_links_bayes_drifts_and_ratio_does_not():
     deviations = {
         rule: _from_oracle(_run(rule=rule, topology="ring", one_way=ONE_WAY_RING)[1]) for rule in ("ratio", "bayes")
     }
@@ -297,14 +297,14 @@ def test_bayes_loses_where_links_carry_one_way_and_ratio_does_not():
         ({"rule": "merge"}, "rule 'merge' counts received evidence again in every tick"),
     ],
 )
-def test_a_run_says_what_its_rule_cannot_do(parameters, sentence):
+def test_a_run_warns_of_faults_that_its_rule_does_not_tolerate(parameters, sentence):
     config = load_team_file(PAIR_TEAM).with_parameters({"settle": 0, **parameters})
     summary = replay_team(config, None)
     assert sum(sentence in warning for warning in summary.warnings) == 1
 
 
 @pytest.mark.parametrize("rule", ["bayes", "ratio", "flood", "gradient"])
-def test_a_run_without_faults_warns_of_no_rule(rule):
+def test_a_run_without_faults_has_no_warning(rule):
     assert rule_warnings(_config(rule=rule), is_symmetric=True) == ()
 
 
@@ -319,7 +319,7 @@ def test_a_run_without_faults_warns_of_no_rule(rule):
         ({"packets": "delta", "budget": 4096}, "maps that a budget holds back"),
     ],
 )  # fmt: skip
-def test_bayes_is_warned_of_by_its_cause(parameters, cause):
+def test_the_warning_of_bayes_names_the_cause(parameters, cause):
     (warning,) = rule_warnings(_config(rule="bayes", **parameters), is_symmetric=True)
     assert f"with {cause} it drifts" in warning
     assert rule_warnings(_config(rule="natural", **parameters), is_symmetric=True) == ()
@@ -335,7 +335,7 @@ def test_bayes_is_warned_of_by_its_cause(parameters, cause):
         ({"schedule": (ScheduleEntry(1.0, robots_silent=("robot_0",)),)}, False),
     ],
 )
-def test_bayes_is_warned_of_links_that_do_not_carry_the_same_both_ways(parameters, is_symmetric):
+def test_bayes_is_warned_of_asymmetric_weights(parameters, is_symmetric):
     config = _config(rule="bayes", settle=0, **parameters)
     session = _session(config)
     for _ in session.ticks():
@@ -345,7 +345,7 @@ def test_bayes_is_warned_of_links_that_do_not_carry_the_same_both_ways(parameter
 
 
 @pytest.mark.parametrize("rule", ["flood", "bayes"])
-def test_what_is_stored_of_a_robot_that_forgot_is_what_it_has(rule, tmp_path):
+def test_stored_maps_after_a_restart_equal_the_metrics(rule, tmp_path):
     """A delta takes no bricks away: the first state of a new life is a whole map, and its metrics are its own."""
     schedule = (ScheduleEntry(2.0, 3.0, robots_off=("husky_1",), forget=True),)
     config = load_team_file(PAIR_TEAM)
@@ -367,7 +367,7 @@ def test_what_is_stored_of_a_robot_that_forgot_is_what_it_has(rule, tmp_path):
 
 @pytest.mark.parametrize("topology", ["complete", "line"])
 @pytest.mark.parametrize("mode", ["sync", "on-arrival"])
-def test_merge_is_its_twin(mode, topology):
+def test_merge_equals_its_twin(mode, topology):
     config = _config(rule="merge", mode=mode, topology=topology, settle=0)
     recording = _recording()
     twin = Twin(config, recording, with_metrics=False)
@@ -417,7 +417,7 @@ LOSSY = {
 
 @pytest.mark.parametrize("packets", ["full", "delta"])
 @pytest.mark.parametrize("name", LOSSY)
-def test_what_packets_round_away_is_not_lost_to_the_team(name, packets):
+def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     session = _session(_config(rule="bayes", settle_max=8, **LOSSY[name], **PACKETS[packets]))
     rounded = 0.0
     for tick in session.ticks():
@@ -431,7 +431,7 @@ def test_what_packets_round_away_is_not_lost_to_the_team(name, packets):
 
 @pytest.mark.parametrize("mode", ["sync", "on-arrival"])
 @pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "merge"])
-def test_deltas_give_the_very_maps_of_whole_packets(rule, mode):
+def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
     parameters = {"rule": rule, "mode": mode, "topology": "ring", "settle": 3, "settle_max": 4}
     sessions = [_session(_config(**parameters, **PACKETS[name])) for name in ("full", "delta", "key frames, broadcast")]
     for ticks in zip(*(session.ticks() for session in sessions), strict=True):
@@ -454,7 +454,7 @@ def test_deltas_give_the_very_maps_of_whole_packets(rule, mode):
     ),
     ids=str,
 )  # fmt: skip
-def test_within_a_budget_all_evidence_floods_in_the_end(topology, packets, radio):
+def test_flood_ends_with_the_oracle_within_a_budget(topology, packets, radio):
     session = _session(_config(rule="flood", topology=topology, packets="delta", **packets, **radio))
     whole = _session(_config(rule="flood", topology=topology))
     lag = 0.0
@@ -474,7 +474,7 @@ def test_within_a_budget_all_evidence_floods_in_the_end(topology, packets, radio
     one_in(2, [{"budget": 2200}, {"budget": 640, "content": "int8"}], ["bayes", "natural", "gradient"]),
     ids=str,
 )
-def test_a_budget_does_not_drive_maps_apart(packets, rule):
+def test_maps_converge_within_a_budget(packets, rule):
     """What waits makes the others' maps older, not wrong: nobody goes far beyond the evidence, and all come closer."""
     session = _session(_config(rule=rule, packets="delta", settle_max=50, **packets))
     peak = 0.0
@@ -487,7 +487,7 @@ def test_a_budget_does_not_drive_maps_apart(packets, rule):
     assert all(robot.agreement > 0.8 for robot in tick.metrics.robots)
 
 
-def test_a_budget_that_holds_no_brick_is_refused():
+def test_a_budget_smaller_than_one_brick_is_refused():
     for packets in ({"budget": 512}, {"budget": 512, "content": "int8"}):
         with pytest.raises(ConfigError, match=r"budget: 512 bytes may not hold one brick .* give at least \d+"):
             _session(_config(packets="delta", **packets))
@@ -529,7 +529,7 @@ def test_robots_publish_when_they_are_due(rule):
 
 
 @pytest.mark.parametrize("rule", ["natural", "bayes", "flood", "ratio"])
-def test_a_silent_robot_hears_and_says_nothing(rule):
+def test_a_silent_robot_receives_and_sends_nothing(rule):
     schedule = (ScheduleEntry(3.0, 9.0, robots_silent=("robot_1",)),)
     session = _session(_config(rule=rule, schedule=schedule, settle=0))
     during = None
@@ -556,7 +556,7 @@ def test_a_silent_robot_hears_and_says_nothing(rule):
 # --- stamps ----------------------------------------------------------------------------------------------------------
 
 
-def test_frames_that_are_ages_away_end_the_run_instead_of_idle_ticks(monkeypatch):
+def test_frames_beyond_the_largest_number_of_ticks_end_the_run(monkeypatch):
     monkeypatch.setattr(session_module, "MAX_TICKS", 50)
     config = _config(settle=0)
     frames = [frame for frame in _scenario().frames if frame.robot_id == config.robots[0].robot_id]

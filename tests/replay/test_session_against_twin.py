@@ -1,4 +1,4 @@
-"""The octree run against the reference twin: the same frames into both, compared tick by tick and robot by robot."""
+"""Sessions on octrees against the reference twin, compared in every tick for every robot."""
 
 from __future__ import annotations
 
@@ -340,7 +340,7 @@ def test_a_robot_that_never_scans(rule, mode):
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("evidence", ["sum", "time-average", "cell-average"])
-def test_a_scan_that_touches_nothing_counts(rule, evidence):
+def test_an_empty_scan_is_counted(rule, evidence):
     empty = dataclasses.replace(cloud(np.zeros((0, 3)), []), stamp_ns=ray("a", 2.3, 1).stamp_ns)
     frames = [ray("a", 0.0, 1), ray("b", 0.4, 2), ray("b", 1.0, 2), empty, ray("b", 5.0, 1)]
     outcome = _compare_frames(team_config("ab", rule=rule, evidence=evidence, settle=0), frames, with_metrics=True)
@@ -382,7 +382,7 @@ def test_threads_do_not_change_a_byte(rule, mode):
 
 @pytest.mark.parametrize("rule", ["gradient", "bayes", "natural"])
 @pytest.mark.parametrize("topology", ["complete", "line"])
-def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
+def test_skipping_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
     scenario = _scenario(1, SMALL)
     config = scenario.config(rule=rule, topology=topology, settle=3)
     right, since_of_steps = consensus_module.team_step, []
@@ -552,7 +552,7 @@ MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious|iterations d
         ("natural", "sync", _neighbours_cells_are_not_taken, "cells are missing"),
     ],
 )  # fmt: skip
-def test_a_fault_turns_the_comparison_red(monkeypatch, rule, mode, fault, message):
+def test_the_comparison_fails_with_a_fault(monkeypatch, rule, mode, fault, message):
     parameters = {"topology": "line", "rule": rule, "mode": mode, "settle": 0, "every": 5}
     _compare(SMALL, **parameters)
     fault(monkeypatch)
@@ -572,7 +572,7 @@ def test_a_fault_turns_the_comparison_red(monkeypatch, rule, mode, fault, messag
         ("robots", lambda robots: _each_robot(robots, "num_cells", 1)),
     ],
 )  # fmt: skip
-def test_a_wrong_metric_turns_the_comparison_red(monkeypatch, name, wrong):
+def test_the_comparison_fails_with_a_wrong_metric(monkeypatch, name, wrong):
     right = TickMeasurer.measure
 
     def measure(self, *args, **kwargs):

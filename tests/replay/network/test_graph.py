@@ -1,3 +1,5 @@
+"""Communication graphs: links, weights, eigenvalues and bounds of the step size."""
+
 from __future__ import annotations
 
 import itertools
@@ -72,7 +74,7 @@ def test_one_robot_has_no_link_and_two_have_one(topology):
     assert pair.weights.tolist() == [[0.0, 0.5], [0.5, 0.0]]
 
 
-def test_links_stand_among_active_robots_only():
+def test_links_join_active_robots_only():
     ring = _build(5, "ring", active=[True, True, False, True, True])
     assert ring.active == (0, 1, 3, 4)
     assert ring.pairs == ((0, 1), (0, 4), (3, 4))
@@ -87,7 +89,7 @@ def test_links_stand_among_active_robots_only():
     assert nobody.is_symmetric
 
 
-def test_a_one_way_pair_carries_from_the_first_to_the_second():
+def test_a_one_way_pair_links_the_first_to_the_second():
     graph = _build(3, "line", one_way=_name((1, 0)))
     assert graph.links == ((1, 0), (1, 2), (2, 1))
     assert graph.pairs == ((0, 1), (1, 2))
@@ -98,7 +100,7 @@ def test_a_one_way_pair_carries_from_the_first_to_the_second():
     assert _build(3, "line", one_way=_name((0, 2))).pairs == ((0, 1), (1, 2))
 
 
-def test_the_schedule_takes_links_down_and_brings_them_up():
+def test_a_schedule_sets_links_down_and_up():
     schedule = (
         ScheduleEntry(10.0, 20.0, links_down=_name((1, 0)), links_up=_name((3, 0))),
         ScheduleEntry(20.0, 30.0, groups=((NAMES[0], NAMES[1]), (NAMES[2],))),
@@ -111,14 +113,14 @@ def test_the_schedule_takes_links_down_and_brings_them_up():
     assert dormant.pairs == ((1, 2),)
 
 
-def test_the_schedule_has_the_last_word_about_one_way_pairs():
+def test_the_schedule_overrides_one_way_pairs():
     schedule = (ScheduleEntry(10.0, 20.0, links_up=_name((0, 1))),)
     team = _team(2, one_way=_name((0, 1)), schedule=schedule)
     seen = [team.at(t, [True] * 2, _nowhere(2)).links for t in (0.0, 10.0, 20.0)]
     assert seen == [((0, 1),), ((0, 1), (1, 0)), ((0, 1),)]
 
 
-def test_robots_that_are_off_take_no_part_and_silent_ones_hear():
+def test_robots_that_are_off_have_no_links_and_silent_ones_only_receive():
     schedule = (
         ScheduleEntry(5.0, 6.0, robots_off=NAMES[1:2], links_up=_name((1, 3)), forget=True),
         ScheduleEntry(6.0, 7.0, robots_silent=NAMES[1:2]),
@@ -133,7 +135,7 @@ def test_robots_that_are_off_take_no_part_and_silent_ones_hear():
     assert silent.weights[:, 1].tolist() == [0.0] * 4
 
 
-def test_robots_that_are_off_are_nobodys_nearest():
+def test_robots_that_are_off_are_not_among_the_nearest():
     schedule = (ScheduleEntry(5.0, 6.0, robots_off=NAMES[1:2]),)
     team = _team(3, "nearest", num_nearest=1, schedule=schedule)
     positions = np.array([(0.0, 0, 0), (1, 0, 0), (2, 0, 0)])
@@ -141,7 +143,7 @@ def test_robots_that_are_off_are_nobodys_nearest():
     assert team.at(5.0, [True] * 3, positions).pairs == ((0, 2),)
 
 
-def test_the_same_graph_comes_back_until_something_changes():
+def test_the_graph_object_is_reused_until_something_changes():
     team = _team(3, "range", radio_range=10.0, schedule=(ScheduleEntry(3.0, 4.0, links_down=_name((0, 1))),))
     near = np.array([(0.0, 0, 0), (1, 0, 0), (2, 0, 0)])
     first = team.at(0.0, [True] * 3, near)
@@ -166,7 +168,7 @@ def test_every_robot_needs_an_activity():
 # --- weights and steps, by hand --------------------------------------------------------------------------------------
 
 
-def test_an_edge_that_is_listed_twice_is_one_link_and_the_later_weight_counts():
+def test_the_later_weight_of_a_repeated_edge_counts():
     edges = _edges((0, 1), (1, 2), (1, 0), weights=[0.9, 0.25, 0.5])
     graph = _build(3, "edges", edges=edges, weights="given")
     assert graph.pairs == ((0, 1), (1, 2))
@@ -221,7 +223,7 @@ def test_degrees_of_one_way_links_are_those_of_the_receivers():
     assert largest.weights.tolist() == metropolis.weights.tolist()
 
 
-def test_given_weights_hold_in_the_direction_that_is_left():
+def test_given_weights_apply_to_the_remaining_direction():
     edges = _edges((0, 1), (1, 2), weights=[0.9, 0.4])
     # Both ways robot 1 would give 1.3.
     graph = _build(3, "edges", edges=edges, weights="given", one_way=_name((1, 0)))
@@ -236,7 +238,7 @@ def test_eigenvalues_of_a_ring_of_four():
     assert ring.lambda_2(0.1) == pytest.approx(1 - 0.2 * 2 / 3)
 
 
-def test_complex_eigenvalues_of_a_ring_that_carries_one_way():
+def test_complex_eigenvalues_of_a_one_way_ring():
     # mu = (1 - exp(2 pi i k / 3)) w: Re(mu) = 1.5 w, |mu|^2 = 3 w^2, so the bound is 0.5 / w.
     ring = _directed(3, (0, 1), (1, 2), (2, 0), weights="degree")
     assert ring.lambda_max == pytest.approx(math.sqrt(3.0))
@@ -246,7 +248,7 @@ def test_complex_eigenvalues_of_a_ring_that_carries_one_way():
     assert _directed(3, (0, 1), (1, 2), (2, 0)).epsilon_bound == pytest.approx(1.0)
 
 
-def test_a_robot_that_hears_somebody_and_that_nobody_hears():
+def test_a_robot_without_outgoing_links():
     graph = _directed(2, (0, 1))
     assert graph.weights.tolist() == [[0, 0], [0.5, 0]]
     assert graph.epsilon_bound == pytest.approx(2.0)
@@ -260,7 +262,7 @@ def test_a_robot_that_hears_somebody_and_that_nobody_hears():
     assert between.epsilon_bound == pytest.approx(1.5)
 
 
-def test_repeated_eigenvalues_of_a_line_that_carries_one_way():
+def test_repeated_eigenvalues_of_a_one_way_line():
     line = _directed(7, *((i, i + 1) for i in range(6)), weights="degree")  # all six are 1, with one eigenvector
     assert line.epsilon_bound == pytest.approx(1.0)
     assert line.lambda_2(0.25) == pytest.approx(0.5)
@@ -292,7 +294,7 @@ def test_settle_ticks_max():
     assert settle_ticks_max(_build(1), ConsensusConfig(), 0.5) == 21
 
 
-def test_arrays_cannot_be_written():
+def test_arrays_are_read_only():
     graph = _build(3)
     for array in (graph.weights, graph.laplacian):
         with pytest.raises(ValueError, match="read-only"):
@@ -340,7 +342,7 @@ def test_every_state_of_the_schedule_is_checked_before_a_run():
     check_team_graph(always, ConsensusConfig(epsilon=0.6), NAMES[:3])
 
 
-def test_graphs_by_position_are_checked_when_they_occur():
+def test_graphs_by_position_are_checked_during_the_run():
     network = NetworkConfig(topology="range", radio_range=5.0, weights="degree")
     consensus = ConsensusConfig(epsilon=0.6)
     check_team_graph(network, consensus, NAMES[:3])
@@ -354,7 +356,7 @@ def test_graphs_by_position_are_checked_when_they_occur():
         check_team_graph(NetworkConfig(topology="range", schedule=(twice,)), consensus, NAMES[:3])
 
 
-def test_a_part_of_the_team_can_have_a_lower_bound():
+def test_a_part_of_the_team_may_have_a_lower_bound():
     network, consensus = NetworkConfig(weights="degree"), ConsensusConfig(epsilon=0.6)
     check_team_graph(network, consensus, NAMES[:3])
     with pytest.raises(ConfigError, match=r"below 0\.5, the bound .* 2 of 3 robots active"):
@@ -371,7 +373,7 @@ def test_row_sums_above_one_are_refused(rule):
     TeamNetwork(above, ConsensusConfig(rule=rule), NAMES[:3]).at(0.0, [True, True, False], _nowhere(3))
 
 
-def test_row_sums_that_a_schedule_brings_above_one_are_refused_with_the_time():
+def test_row_sums_above_one_in_a_schedule_are_refused_with_the_time():
     network = NetworkConfig(
         topology="edges", weights="given", edges=_edges((0, 1), (1, 2), weights=[0.7, 0.5]),
         one_way=_name((1, 0)), schedule=(ScheduleEntry(4.0, links_up=_name((0, 1))),),
@@ -380,7 +382,7 @@ def test_row_sums_that_a_schedule_brings_above_one_are_refused_with_the_time():
         check_team_graph(network, ConsensusConfig(), NAMES[:3])
 
 
-def test_a_link_that_the_schedule_brings_up_needs_a_weight_where_weights_are_given():
+def test_a_scheduled_link_needs_a_weight_if_weights_are_given():
     schedule = (ScheduleEntry(4.0, links_up=_name((0, 2))),)
     edges = _edges((0, 1), (1, 2), weights=[0.5, 0.5])
     with pytest.raises(ConfigError, match=r"^schedule: links_up 'husky_1' - 'husky_3' has no weight; add it to edges"):
@@ -388,12 +390,12 @@ def test_a_link_that_the_schedule_brings_up_needs_a_weight_where_weights_are_giv
 
 
 @pytest.mark.parametrize("weight", [math.nan, math.inf])
-def test_weights_that_are_no_numbers_are_refused(weight):
+def test_weights_that_are_not_finite_are_refused(weight):
     with pytest.raises(ConfigError, match="husky_1"):
         _build(2, "edges", edges=_edges((0, 1), weights=[weight]), weights="given")
 
 
-def test_one_way_pairs_that_make_no_sense_are_refused():
+def test_invalid_one_way_pairs_are_refused():
     with pytest.raises(ConfigError, match=r"^one_way: 'husky_1' cannot have a link to itself"):
         NetworkConfig(one_way=_name((0, 0)))
     with pytest.raises(ConfigError, match=r"^one_way: husky_2 -> husky_1 and husky_1 -> husky_2 are both listed; keep"):
@@ -459,7 +461,7 @@ def _graph(tick, consensus=None):
     st.sampled_from(["gradient", "bayes", "local", "flood"]),
     st.integers(1, 30),
 )
-def test_every_graph_is_that_of_the_reference(tick, epsilon, rule, settle):
+def test_every_graph_equals_the_reference(tick, epsilon, rule, settle):
     network, robot_ids, active, elapsed_s = tick
     consensus = ConsensusConfig(epsilon=epsilon, rule=rule, settle=settle)
     try:
@@ -496,7 +498,7 @@ def test_every_graph_is_that_of_the_reference(tick, epsilon, rule, settle):
 
 
 @given(_networks(), st.sampled_from(["gradient", "local"]), st.none() | st.floats(0.05, 1.2))
-def test_the_check_before_a_run_is_the_reference_on_the_whole_team_at_all_times(shape, rule, epsilon):
+def test_the_check_before_a_run_equals_the_reference_at_all_times(shape, rule, epsilon):
     num_robots, network = shape
     robot_ids, consensus = NAMES[:num_robots], ConsensusConfig(epsilon=epsilon, rule=rule)
     try:
@@ -514,7 +516,7 @@ def test_the_check_before_a_run_is_the_reference_on_the_whole_team_at_all_times(
 
 
 @given(_ticks())
-def test_row_sums_are_at_most_one_and_weights_stand_on_links_only(tick):
+def test_row_sums_are_at_most_one_and_only_links_have_weights(tick):
     graph = _graph(tick)
     assert (graph.weights >= 0).all()
     assert (graph.weights.sum(axis=1) <= 1 + 1e-9).all()
@@ -556,7 +558,7 @@ def test_the_default_step_size_is_stable_on_every_graph(tick):
 
 
 @given(_ticks())
-def test_a_partition_leaves_the_parts_of_the_graph_that_lie_within_groups(tick):
+def test_a_partition_leaves_the_links_within_groups(tick):
     network, robot_ids, active, _ = tick
     whole = NetworkConfig(topology="random", prob_link=0.7, network_seed=network.network_seed)
     cuts = (robot_ids[::2], robot_ids[1::2]) if len(robot_ids) > 1 else ()
@@ -569,7 +571,7 @@ def test_a_partition_leaves_the_parts_of_the_graph_that_lie_within_groups(tick):
     assert sorted(map(sorted, nx.connected_components(after))) == sorted(map(sorted, expected))
 
 
-def test_importing_the_module_leaves_networkx_out():
+def test_importing_the_module_does_not_import_networkx():
     code = "import sys, octoreplay.replay.network.graph; print('networkx' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
