@@ -32,7 +32,7 @@ def test_exact_whole_maps_are_much_smaller_than_the_grid(rule, octree, packet):
 
 @pytest.mark.parametrize(("rule", "times"), [("bayes", 50.0), ("flood", 100.0)])
 def test_small_packets_keep_the_agreement(rule, times):
-    """Most of a few seconds' map is new; on logs of a minute it is 200 times."""
+    """The factor is lower than the 200 of one-minute logs, because most cells of a short log are new."""
     exact, small = _replayed(rule=rule), _replayed(rule=rule, packets="delta", content="int8")
     assert small.mean_grid_bytes > times * small.mean_packet_bytes
     assert abs(_worst(small) - _worst(exact)) <= 0.002
@@ -52,7 +52,7 @@ def test_flood_tolerates_a_loss_of_99_percent():
 
 @pytest.mark.parametrize("rule", ["bayes", "ratio"])
 def test_a_merged_team_agrees_within_ten_ticks(rule, tmp_path):
-    """The logs end with the partition, so that nothing new hides what was left of it."""
+    """The partition ends with the logs, so that new scans do not hide its remains."""
     config = load_team_file(TRIO_TEAM).with_parameters({"rule": rule, "settle_max": 10})
     robot_ids = [robot.robot_id for robot in config.robots]
     whole = replay_team(config, None)
