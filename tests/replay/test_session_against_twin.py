@@ -57,7 +57,7 @@ def test_six_robots(rule, mode, topology):
 
 @pytest.mark.parametrize(("rule", "mode", "topology"), one_in(3, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
-    """The tolerance is far above float32's rounding, so that both stop settling in the same tick."""
+    """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""
     outcome = compare(
         SMALL, topology=topology, rule=rule, mode=mode, settle=6, settle_tolerance=1e-3, every=4, with_metrics=True
     )

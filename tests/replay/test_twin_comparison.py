@@ -21,7 +21,7 @@ from support.twin_comparison import SMALL, compare
 
 
 def _change_steps(monkeypatch, change):
-    """Every robot's iterations are done as ``change`` describes them."""
+    """Apply ``change`` to every consensus step."""
     right = consensus_module.team_step
 
     def wrong(steps, **kwargs):
@@ -42,7 +42,7 @@ def _wrong_gradient_sign(monkeypatch):
 
 
 def _change_arrivals(monkeypatch, change):
-    """Before anybody iterates, ``change`` says of every map that arrived which one it is."""
+    """Replace every map that arrived by ``change`` before the robots iterate."""
     right = Session._iterate
 
     def wrong(self, graph, factor, number):
@@ -75,7 +75,7 @@ def _maps_of_the_tick_before(monkeypatch):
 
 
 def _free_is_not_reset(monkeypatch):
-    """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
+    """Keep the step of free space, g_0 = -sum of the others, out of the log-odds of the classes."""
     right = consensus_module.team_step
 
     def wrong(steps, **kwargs):

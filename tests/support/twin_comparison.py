@@ -38,7 +38,7 @@ EDGES = {
 
 @dataclass
 class Outcome:
-    """What a comparison went through: ticks, the last of both, and the largest difference of any log-odds."""
+    """Numbers of a comparison, its last ticks, and the largest difference of log-odds."""
 
     num_ticks: int = 0
     num_settling_ticks: int = 0
@@ -65,7 +65,7 @@ def sources_of(config, frames):
 
 
 def configured(scenario, topology, **parameters):
-    """The scenario's configuration with a topology; a list of edges comes with given weights."""
+    """Return the configuration of a scenario with a topology; topology 'edges' has given weights."""
     if topology != "edges":
         return scenario.config(topology=topology, **parameters)
     edges = EDGES[len(scenario.robot_ids)]
@@ -73,7 +73,7 @@ def configured(scenario, topology, **parameters):
 
 
 def compare(shape, *, seed=1, topology="complete", sensor_parameters=None, every=10, with_metrics=False, **parameters):
-    """Run both on a scenario and compare them; see compare_frames."""
+    """Run session and twin on a scenario and compare them as compare_frames does."""
     scenario = scenario_of(seed, shape)
     sensor_parameters = sensor_parameters or {}
     recording = recording_of(seed, shape, tuple(sensor_parameters.items()))
@@ -82,16 +82,19 @@ def compare(shape, *, seed=1, topology="complete", sensor_parameters=None, every
 
 
 def compare_frames(config, frames, recording=None, *, every=1, with_metrics=False):
-    """Run both in step. Raises AssertionError at the first difference; maps are compared in every ``every``-th tick, in
-    the first settling tick and in the last, everything else in all of them."""
+    """Run session and twin tick by tick, and raise AssertionError at the first difference.
+
+    Maps are compared in every ``every``-th tick, in the first settling tick and in the last one; everything else in all
+    ticks.
+    """
     recording = recording or record(config, frames)
     twin = Twin(config, recording, with_metrics=with_metrics)
     session = Session(config, sources_of(config, frames), ThreadPoolExecutor(1))
     outcome = Outcome()
     was_settling = False
     for expected, tick in itertools.zip_longest(twin.ticks(), session.ticks()):
-        assert expected is not None, f"the octree run goes on after tick {outcome.num_ticks - 1}"
-        assert tick is not None, f"the octree run ends before tick {expected.tick}"
+        assert expected is not None, f"the session continues after tick {outcome.num_ticks - 1}"
+        assert tick is not None, f"the session ends before tick {expected.tick}"
         _compare_course(expected, tick)
         if with_metrics:
             outcome.peak_all = max(outcome.peak_all, expected.metrics.total_distance_all)
@@ -108,7 +111,7 @@ def compare_frames(config, frames, recording=None, *, every=1, with_metrics=Fals
 
 
 def _compare_course(expected, tick):
-    """What a tick consists of, its maps apart."""
+    """Compare everything of a tick but its maps and metrics."""
     assert (tick.number, tick.stamp_ns, tick.settling) == (expected.tick, expected.stamp_ns, expected.settling)
     robots = tick.metrics.robots
     assert tuple(robot.active for robot in robots) == expected.active, f"active robots differ in tick {tick.number}"
@@ -118,7 +121,7 @@ def _compare_course(expected, tick):
 
 
 def _compare_maps(keys, expected, tick, config, outcome):
-    """Every robot's map and the oracle, both ways."""
+    """Compare the map of every robot and the oracle, both ways."""
     for index, octree in enumerate(tick.maps):
         difference = compare_map(keys, expected, index, octree.leaves(expected.prior), config.map.resolution)
         where = f"robot {index}, tick {tick.number}: {difference}"
@@ -134,7 +137,7 @@ def _compare_maps(keys, expected, tick, config, outcome):
 
 
 def _compare_metrics(expected, metrics, peak_all):
-    """The tick's metrics. Labels may differ only where two log-odds are all but equal."""
+    """Compare the metrics of a tick; labels may differ only where two log-odds are nearly equal."""
     theirs = expected.metrics
     rounding = 1e-10 * peak_all
     assert metrics.total_distance == pytest.approx(theirs.total_distance, rel=1e-3, abs=rounding)
@@ -166,6 +169,6 @@ def _absolute(deviation, prior):
 
 
 def _near_ties(deviation, prior):
-    """Where the two largest log-odds are within NEAR_TIE."""
+    """Return where the two largest log-odds are within NEAR_TIE."""
     top = np.partition(_absolute(deviation, prior), -2, axis=-1)[..., -2:]
     return top[..., 1] - top[..., 0] < NEAR_TIE
