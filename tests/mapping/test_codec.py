@@ -1,4 +1,4 @@
-"""Packets: maps as bytes and back."""
+"""Map packets: lossless round trips, number formats and compression."""
 
 from __future__ import annotations
 
@@ -7,24 +7,34 @@ import zlib
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from octoreplay.errors import PacketError
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import MapVersion, PacketFormat
-from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
-from octoreplay.mapping.quantise import CONTENTS
+from octoreplay.mapping.quantise import CONTENTS, quantised
 from octoreplay.mapping.streams import leaf_list, leaf_values
 from support.octree_factory import cells_of, cube, octree_of
-from support.packets import (
+from support.packet_format import (
+    CHAIN,
     HEADER,
     LIMIT,
-    PLAIN,
-    code_of,
+    code_of_key,
+    coded_payload,
+    compressed_packet,
+    counts_of,
     naive_cells,
+    naive_codes,
     octrees,
+    slot_of,
+    words_of,
 )
+
+PLAIN = PacketFormat(zstd_level=None)
 
 
 @settings(max_examples=60, deadline=None)
@@ -66,8 +76,8 @@ def test_delta_replaces_its_bricks(before, after, data):
     chosen = chosen[chosen < after.num_bricks]
     packet = codec.encode_delta(after, chosen)
     codes = set(after.codes[chosen].tolist())
-    expected = {key: value for key, value in cells_of(before).items() if code_of(key) not in codes}
-    expected |= {key: value for key, value in cells_of(after).items() if code_of(key) in codes}
+    expected = {key: value for key, value in cells_of(before).items() if code_of_key(key) not in codes}
+    expected |= {key: value for key, value in cells_of(after).items() if code_of_key(key) in codes}
     codec.apply_delta(before, packet, revision=7)
     assert cells_of(before) == expected
     assert set(before.codes[before.revisions == 7].tolist()) == codes
@@ -168,3 +178,148 @@ def test_merging_with_tolerance_stays_within_its_bound():
 
 def test_grid_bytes():
     assert codec.grid_bytes(10, 5) == 10 * (8 + 6 * 4)
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    octree=octrees(), content=st.sampled_from(CONTENTS), step=st.sampled_from([0.05, 0.3, 1e-3]), level=st.booleans(),
+    every=st.integers(1, 3),
+)  # fmt: skip
+def test_quantised_maps_are_restored_bit_for_bit(octree, content, step, level, every):
+    octree = quantised(octree, content, step)
+    packet_format = PacketFormat(content, step, 1 if level else None)
+    packet = codec.encode_packet(octree, packet_format=packet_format)
+    decoded = codec.decode_packet(packet)
+    assert cells_of(decoded) == cells_of(octree)
+    # Equal maps give equal bytes, whatever they were quantised from.
+    assert codec.encode_packet(decoded, packet_format=packet_format) == packet
+    chosen = np.arange(0, octree.num_bricks, every)
+    receiver = SemanticOctree(octree.resolution, octree.num_classes)
+    codec.apply_delta(receiver, codec.encode_delta(octree, chosen, packet_format=packet_format))
+    codes = set(octree.codes[chosen].tolist())
+    assert cells_of(receiver) == {key: value for key, value in cells_of(octree).items() if code_of_key(key) in codes}
+
+
+def test_values_that_a_content_cannot_represent_are_refused():
+    octree = octree_of({(0, 0, 0): [0.1, 0.15]})
+    for content in ("float16", "int8"):
+        packet_format = PacketFormat(content, step=0.2)
+        with pytest.raises(ValueError, match=f"{content} cannot represent"):
+            codec.encode_packet(octree, packet_format=packet_format)
+        with pytest.raises(ValueError, match=f"{content} cannot represent"):
+            codec.encode_delta(octree, np.arange(1), packet_format=packet_format)
+    for content, step in [("float64", 0.2), ("int8", 0.0), ("int8", 1e-60), ("int8", 1e60), ("int8", float("nan"))]:
+        with pytest.raises(ValueError, match="step" if content == "int8" else "content 'float64'"):
+            codec.encode_packet(SemanticOctree(0.25, 2), packet_format=PacketFormat(content, step))
+
+
+def test_midpoints_of_merged_values_that_are_no_steps_are_refused():
+    octree = octree_of(cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [1.5, 0.0]})
+    packet_format = PacketFormat("int8", step=0.5)
+    assert codec.encode_packet(octree, packet_format=packet_format, tolerance=0.4)
+    with pytest.raises(ValueError, match="int8 cannot represent"):
+        codec.encode_packet(octree, packet_format=packet_format, tolerance=0.5)
+
+
+def test_siblings_made_equal_by_quantisation_are_one_leaf():
+    """Across rows, octets, bricks and classes."""
+    rng = np.random.default_rng(5)
+    cells = {key: rng.uniform(0.96, 1.04, 3) for key in cube((0, 0, 0), 8, 0.0)}
+    octree = octree_of(cells, num_classes=3)
+    assert codec.read_header(codec.encode_packet(octree)).num_leaves == 512
+    packet_format = PacketFormat("int8", step=0.1)
+    packet = codec.encode_packet(quantised(octree, "int8", 0.1), packet_format=packet_format)
+    header = codec.read_header(packet)
+    assert (header.num_leaves, header.num_vectors) == (1, 0)
+    exact = octree_of(dict.fromkeys(cells, float(np.float32(0.1) * np.float32(10))), num_classes=3)
+    assert codec.encode_packet(exact, packet_format=packet_format) == packet
+
+
+@settings(max_examples=60, deadline=None)
+@given(octree=octrees(), content=st.sampled_from(CONTENTS), prune=st.booleans())
+def test_compressed_payload_follows_the_documented_format(octree, content, prune):
+    octree = quantised(octree, content, 0.05)
+    plain = codec.encode_packet(octree, packet_format=PacketFormat(content, zstd_level=None), prune=prune)
+    packet = codec.encode_packet(octree, packet_format=PacketFormat(content), prune=prune)
+    header = codec.read_header(packet)
+    assert header.raw_bytes == len(plain) - codec.HEADER_BYTES
+    expected = plain[codec.HEADER_BYTES :]
+    if content != "int8":
+        width = 4 if content == "float32" else 2
+        expected = coded_payload(expected, counts_of(header), width, octree.num_classes)
+    assert zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :]) == expected
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    numbers=st.lists(st.sampled_from([0, 1, 2, 255, 256, 2**16 - 1, 2**31, 2**32 - 1, 0xC0A00000, 377, 754, 1131])),
+    width=st.sampled_from([2, 4]),
+)
+def test_codes_and_literals_equal_the_naive_ones_in_both_directions(numbers, width):
+    numbers = np.array([number % 2 ** (8 * width) for number in numbers], np.uint32)
+    codes, literals = np.empty(numbers.size, np.uint8), np.empty((4, numbers.size), np.uint8)
+    num_literals = packets.write_codes(numbers, np.zeros(256, np.uint32), codes, literals)
+    coded = codes.tobytes() + literals[:width, :num_literals].tobytes()
+    assert coded == naive_codes([number.tobytes()[:width] for number in numbers.astype("<u4")])
+    padded = np.zeros((4, num_literals + 1), np.uint8)
+    padded[:, :-1] = literals[:, :num_literals]
+    again = np.empty_like(numbers)
+    codes.flags.writeable = False
+    packets.read_codes(codes, padded, np.zeros(256, np.uint32), again)
+    assert again.tolist() == numbers.tolist()
+
+
+def test_arbitrary_codes_follow_the_documented_format():
+    """Empty slots hold 0. Literals are written to their slot, even if it already holds the same number."""
+    first = next(value for value in range(2, 10000) if slot_of(value) == 1)  # same slot as 0
+    codes = bytes([255, 0, 0, slot_of(1.0), 0, 9, 1, slot_of(1.0)])
+    literals = b"".join(bytes(plane) for plane in zip(*(struct.pack("<f", n) for n in (1.0, 1.0, first)), strict=True))
+    packet = compressed_packet(words_of(*CHAIN, 0xAAAA) + codes + literals, (19, 8, 0, 0))
+    expected = {
+        tuple(-LIMIT + (child >> axis & 1) for axis in range(3)): np.full(2, value, np.float32).tobytes()
+        for child, value in enumerate([0.0, 1.0, 1.0, 1.0, first, 0.0, first, 1.0])
+    }
+    assert cells_of(codec.decode_packet(packet)) == expected
+
+
+@pytest.mark.parametrize("change", [-1, 1])
+def test_codes_with_another_number_of_literals_are_refused(change):
+    octree = octree_of({(0, 0, 0): [1.0, 2.0], (1, 0, 0): [1.0, 1.0]})
+    packet = codec.encode_packet(octree)
+    counts = counts_of(codec.read_header(packet))
+    payload = zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :])
+    assert codec.decode_packet(compressed_packet(payload, counts)).num_cells == 2
+    wrong = payload + bytes(4) if change > 0 else payload[:-1]
+    with pytest.raises(PacketError, match="size"):
+        codec.decode_packet(compressed_packet(wrong, counts))
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A map with a few hundred different values in random order, which zstd cannot predict."""
+    rng = np.random.default_rng(3)
+    palette = rng.normal(0, 2, 300).astype(np.float32)
+    cells = {}
+    for key in cube((-8, 0, -8), 16, 0.0):
+        shared, own = palette[rng.geometric(0.02, 2) % 300]
+        cells[key] = [shared, own if rng.random() < 0.2 else shared]
+    return octree_of(cells)
+
+
+def test_codes_and_separate_blocks_make_packets_smaller(noisy):
+    plain = codec.encode_packet(noisy, packet_format=PLAIN)[codec.HEADER_BYTES :]
+    packet = codec.encode_packet(noisy)
+    coded = coded_payload(plain, counts_of(codec.read_header(packet)))
+    in_one_piece = zstandard.ZstdCompressor(level=1).compress(coded)
+    assert len(packet) < 0.98 * len(in_one_piece) < 0.8 * len(zstandard.ZstdCompressor(level=1).compress(plain))
+
+
+def test_level_does_not_change_the_decompressed_payload(noisy):
+    packets_of_levels = [codec.encode_packet(noisy, packet_format=PacketFormat(zstd_level=n)) for n in (1, 3, 19)]
+    assert len(set(packets_of_levels)) == 3
+    assert packets_of_levels[0] == codec.encode_packet(noisy)
+    payloads = {zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :]) for packet in packets_of_levels}
+    assert len(payloads) == 1

@@ -1,4 +1,4 @@
-"""Damaged and hostile packets."""
+"""Map packets that are damaged, malformed or of other versions."""
 
 from __future__ import annotations
 
@@ -17,15 +17,7 @@ from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.quantise import CONTENTS, quantised
 from support.octree_factory import cells_of, cube, octree_of
-from support.packets import (
-    CHAIN,
-    coded_payload,
-    counts_of,
-    forged,
-    naive_cells,
-    octrees,
-    packed,
-)
+from support.packet_format import CHAIN, coded_payload, counts_of, forged, naive_cells, octrees, words_of
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +141,7 @@ def test_header_round_trip(map_version, base, content, step, level):
 
 
 def test_int8_below_its_range_is_refused():
-    words = packed(*CHAIN, 2)
+    words = words_of(*CHAIN, 2)
     packet = forged(words + b"\x81", content=2, step=0.5, counts=(19, 1, 0, 0))
     expected = np.full(2, -63.5, np.float32).tobytes()
     assert set(cells_of(codec.decode_packet(packet)).values()) == {expected}
@@ -163,21 +155,23 @@ def test_int8_below_its_range_is_refused():
 @pytest.mark.parametrize(
     ("payload", "counts"),
     [
-        pytest.param(packed(*CHAIN, 2) + bytes(8), (19, 2, 0, 0), id="more values than leaves"),
-        pytest.param(packed(*CHAIN, 2), (19, 0, 0, 0), id="fewer values than leaves"),
-        pytest.param(packed(*CHAIN, 2) + bytes(4) + b"\1" + bytes(4), (19, 1, 1, 1), id="a mask for a scalar leaf"),
-        pytest.param(packed(*CHAIN, 3) + bytes(4), (19, 1, 0, 0), id="no mask for a vector leaf"),
-        pytest.param(packed(*CHAIN, 3) + bytes(4) + b"\1", (19, 1, 1, 0), id="fewer values than the mask names"),
-        pytest.param(packed(*CHAIN, 3) + bytes(4) + b"\1" + bytes(8), (19, 1, 1, 2), id="more than the mask names"),
-        pytest.param(packed(*CHAIN, 3) + bytes(4) + b"\4" + bytes(4), (19, 1, 1, 1), id="a class that is none"),
-        pytest.param(packed(*CHAIN, 1), (19, 0, 0, 0), id="an inner node at the finest level"),
-        pytest.param(packed(*CHAIN), (18, 0, 0, 0), id="words that end too early"),
-        pytest.param(packed(*CHAIN, 2, 0) + bytes(4), (20, 1, 0, 0), id="words that are not reached"),
-        pytest.param(packed(0) + bytes(4), (1, 1, 0, 0), id="a value without a leaf"),
+        pytest.param(words_of(*CHAIN, 2) + bytes(8), (19, 2, 0, 0), id="more values than leaves"),
+        pytest.param(words_of(*CHAIN, 2), (19, 0, 0, 0), id="fewer values than leaves"),
+        pytest.param(words_of(*CHAIN, 2) + bytes(4) + b"\1" + bytes(4), (19, 1, 1, 1), id="a mask for a scalar leaf"),
+        pytest.param(words_of(*CHAIN, 3) + bytes(4), (19, 1, 0, 0), id="no mask for a vector leaf"),
+        pytest.param(words_of(*CHAIN, 3) + bytes(4) + b"\1", (19, 1, 1, 0), id="fewer values than the mask names"),
+        pytest.param(words_of(*CHAIN, 3) + bytes(4) + b"\1" + bytes(8), (19, 1, 1, 2), id="more than the mask names"),
+        pytest.param(words_of(*CHAIN, 3) + bytes(4) + b"\4" + bytes(4), (19, 1, 1, 1), id="a class that is none"),
+        pytest.param(words_of(*CHAIN, 1), (19, 0, 0, 0), id="an inner node at the finest level"),
+        pytest.param(words_of(*CHAIN), (18, 0, 0, 0), id="words that end too early"),
+        pytest.param(words_of(*CHAIN, 2, 0) + bytes(4), (20, 1, 0, 0), id="words that are not reached"),
+        pytest.param(words_of(0) + bytes(4), (1, 1, 0, 0), id="a value without a leaf"),
         pytest.param(bytes(4), (0, 1, 0, 0), id="a value without a word"),
-        pytest.param(packed(2) + bytes(4), (1, 1, 0, 0), id="a leaf of an eighth of the key space"),
+        pytest.param(words_of(2) + bytes(4), (1, 1, 0, 0), id="a leaf of an eighth of the key space"),
         pytest.param(
-            packed(*[1] * 7, 3) + bytes(4) + b"\1" + bytes(4), (8, 1, 1, 1), id="a vector leaf of 2^11 cells each side"
+            words_of(*[1] * 7, 3) + bytes(4) + b"\1" + bytes(4),
+            (8, 1, 1, 1),
+            id="a vector leaf of 2^11 cells each side",
         ),
     ],
 )
@@ -245,7 +239,7 @@ def test_bytes_after_the_compressed_payload_are_refused():
 )
 def test_any_words_give_an_octree_or_a_packet_error(words, leaves, masks, data):
     own = data.draw(st.sampled_from([sum(mask.bit_count() for mask in masks), data.draw(st.integers(0, 40))]))
-    payload = packed(*words) + bytes(4 * leaves) + bytes(masks) + bytes(4 * own)
+    payload = words_of(*words) + bytes(4 * leaves) + bytes(masks) + bytes(4 * own)
     try:
         octree = codec.decode_packet(forged(payload, counts=(len(words), leaves, len(masks), own)))
     except PacketError:
@@ -264,7 +258,7 @@ def test_damaged_words_follow_the_format_or_give_a_packet_error(octree, prune, d
         new = data.draw(st.lists(st.sampled_from([0, 1, 2, 3, 0x5555, 0xAAAA, 0xFFFF, 0x9000, 0x4002]), max_size=2))
         words[place : place + data.draw(st.integers(0, 2))] = new
     expected = naive_cells(words, streams, 2)
-    payload = packed(*words) + b"".join(array.tobytes() for array in streams[1:])
+    payload = words_of(*words) + b"".join(array.tobytes() for array in streams[1:])
     counts = (len(words), *(len(array) for array in streams[1:]))
     packet = forged(payload, resolution=octree.resolution, counts=counts)
     refusal, decoded = "", None

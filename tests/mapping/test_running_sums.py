@@ -1,4 +1,4 @@
-"""Running sums on octrees against the reference twin, one call at a time."""
+"""Ratio consensus on octrees against the reference on dense arrays, bit for bit."""
 
 from __future__ import annotations
 
@@ -28,43 +28,21 @@ from octoreplay.mapping.running_sums import (
 )
 from reference import ratio
 from reference.ratio import quantised
+from support.masses import (
+    NUM_CLASSES,
+    assert_equal,
+    changed_bricks,
+    log_odds_octree,
+    mass_of,
+    random_cells,
+    revised_bricks,
+    signed,
+    sum_of,
+    units_of,
+)
 from support.octree_factory import cells_of, cube, octree_of
-from support.running_sum_maps import NUM_CLASSES, mass_of, octree_with, signed_of, units_of, value_of
 
-
-def _random_cells(rng, *, of_log_odds=False):
-    """Whole bricks, smaller cubes and single cells, with one value or one for each class; some overlap."""
-    cells = {}
-    most = rng.choice([1.0, 5.0, 900.0]) if of_log_odds else rng.choice([3, 1 << 17, MAX_MASS])
-    for _ in range(rng.integers(0, 5)):
-        edge = int(rng.choice([1, 3, 4]))
-        corner = (rng.integers(-2, 2, 3) * (4 if edge == 4 else 3)).tolist()
-        values = rng.uniform(-most, most, NUM_CLASSES).astype(np.float32)
-        values = values if of_log_odds else np.rint(values.astype(np.float64)).astype(np.int64)
-        cells.update(cube(corner, edge, values if rng.random() < 0.5 else np.full(NUM_CLASSES, values[0])))
-    return cells
-
-
-def _sum(*terms):
-    """{key: signed sum of factor x cells} of the cells known in any of the terms (factor, cells)."""
-    keys = set().union(*(cells for _, cells in terms))
-    return {key: signed_of(sum(factor * value_of(cells, key) for factor, cells in terms)) for key in keys}
-
-
-def _assert_equal(found, expected):
-    assert found.keys() == expected.keys()
-    assert all((found[key] == expected[key]).all() for key in expected)
-
-
-def _changed_bricks(before, after):
-    """Codes of the bricks with a cell that has another value or became known."""
-    changed = {key for key in after if key not in before or (before[key] != after[key]).any()}
-    return {int(storage.key_to_code(*key)) >> storage.CELL_BITS for key in changed}
-
-
-def _revised(octree, revision):
-    return set(octree.codes[octree.revisions == revision].tolist())
-
+# --- one call ---------------------------------------------------------------------------------------------------------
 
 seeds = st.integers(0, 1_000_000)
 
@@ -73,17 +51,17 @@ seeds = st.integers(0, 1_000_000)
 @given(seed=seeds, num_receivers=st.integers(0, 7), is_first=st.booleans())
 def test_share_out_equals_the_reference(seed, num_receivers, is_first):
     rng = np.random.default_rng(seed)
-    masses, totals = _random_cells(rng), {} if is_first else _random_cells(rng)
+    masses, totals = random_cells(rng), {} if is_first else random_cells(rng)
     mass, total = mass_of(masses), mass_of(totals)
     share_out(mass, total, num_receivers, 7)
     if num_receivers == 0:
-        _assert_equal(units_of(mass), masses)
-        _assert_equal(units_of(total), totals)
+        assert_equal(units_of(mass), masses)
+        assert_equal(units_of(total), totals)
         return
     shares = {key: ratio.share_of(value, num_receivers) for key, value in masses.items()}
-    _assert_equal(units_of(mass), _sum((1, masses), (-num_receivers, shares)))
-    _assert_equal(units_of(total), _sum((1, totals), (1, shares)))
-    assert _revised(total, 7) == _changed_bricks(totals, units_of(total))
+    assert_equal(units_of(mass), sum_of((1, masses), (-num_receivers, shares)))
+    assert_equal(units_of(total), sum_of((1, totals), (1, shares)))
+    assert revised_bricks(total, 7) == changed_bricks(totals, units_of(total))
 
 
 @pytest.mark.parametrize("num_receivers", [1, 2, 3, 5, 6, 9, 49])
@@ -94,7 +72,7 @@ def test_shares_are_rounded_to_nearest(num_receivers):
     halves = (2 * np.array([1, 1001, 5_000_001]) + 1) * parts // 2
     units = np.concatenate([units, MAX_MASS + units[units <= 0], -MAX_MASS - 1 + units[units >= 0], halves, -halves])
     masses = {(n, 0, 0): np.full(NUM_CLASSES, value) for n, value in enumerate(units)}
-    total = octree_with({})
+    total = log_odds_octree({})
     share_out(mass_of(masses), total, num_receivers, 1)
     for key, share in units_of(total).items():
         assert share[0] == round(Fraction(int(masses[key][0]), parts))
@@ -104,31 +82,31 @@ def test_shares_are_rounded_to_nearest(num_receivers):
 @given(seed=seeds, num_senders=st.integers(0, 4))
 def test_receive_equals_the_reference(seed, num_senders):
     rng = np.random.default_rng(seed)
-    masses = _random_cells(rng)
+    masses = random_cells(rng)
     mass = mass_of(masses)
     arrivals, terms = [], [(1, masses)]
     for _ in range(num_senders):
-        old = _random_cells(rng)
+        old = random_cells(rng)
         # Some of the old cells changed.
         new = {key: value + rng.integers(0, 2) * rng.integers(MODULUS) for key, value in old.items()}
-        new |= _random_cells(rng)
+        new |= random_cells(rng)
         arrivals.append((mass_of(new), mass_of(old) if rng.random() < 0.7 else None))
         terms += [(1, new), (-1, old if arrivals[-1][1] else {})]
     receive(mass, arrivals, 7)
-    _assert_equal(units_of(mass), _sum(*terms))
-    assert _revised(mass, 7) >= _changed_bricks(masses, units_of(mass))
-    assert _revised(mass, 7) <= {code for new, _ in arrivals for code in new.codes.tolist()}
+    assert_equal(units_of(mass), sum_of(*terms))
+    assert revised_bricks(mass, 7) >= changed_bricks(masses, units_of(mass))
+    assert revised_bricks(mass, 7) <= {code for new, _ in arrivals for code in new.codes.tolist()}
 
 
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, with_threads=st.booleans())
 def test_receive_team_equals_receive_robot_by_robot(seed, with_threads):
     rng = np.random.default_rng(seed)
-    masses = [mass_of(_random_cells(rng)) for _ in range(4)]
-    old = [mass_of(_random_cells(rng)) for _ in range(4)]
+    masses = [mass_of(random_cells(rng)) for _ in range(4)]
+    old = [mass_of(random_cells(rng)) for _ in range(4)]
     new = [octree.copy() for octree in old]
     for octree in new:
-        receive(octree, [(mass_of(_random_cells(rng)), None)], 5)
+        receive(octree, [(mass_of(random_cells(rng)), None)], 5)
     arrivals = [
         [(new[j], old[j] if rng.random() < 0.7 else None) for j in range(4) if rng.random() < 0.6] for _ in range(4)
     ]
@@ -139,7 +117,7 @@ def test_receive_team_equals_receive_robot_by_robot(seed, with_threads):
         receive_team(list(zip(masses, arrivals, strict=True)), 7, threads if with_threads else None)
     for mass, other in zip(masses, alone, strict=True):
         assert cells_of(mass) == cells_of(other)
-        assert _revised(mass, 7) == _revised(other, 7)
+        assert revised_bricks(mass, 7) == revised_bricks(other, 7)
 
 
 @pytest.mark.parametrize("num_classes", [1, 11])
@@ -175,9 +153,9 @@ def test_receive_team_without_robots():
 @given(seed=seeds)
 def test_add_evidence_equals_the_reference(seed):
     rng = np.random.default_rng(seed)
-    masses, last = _random_cells(rng), _random_cells(rng, of_log_odds=True)
-    now = last | _random_cells(rng, of_log_odds=True)
-    mass, evidence, last_evidence = mass_of(masses), octree_with(now), octree_with(last)
+    masses, last = random_cells(rng), random_cells(rng, of_log_odds=True)
+    now = last | random_cells(rng, of_log_odds=True)
+    mass, evidence, last_evidence = mass_of(masses), log_odds_octree(now), log_odds_octree(last)
     evidence.revisions[:] = rng.integers(0, 4, evidence.num_bricks)
     add_evidence(mass, evidence, last_evidence, 2, 7)
     seen = set(evidence.codes[evidence.revisions >= 2].tolist())
@@ -185,21 +163,21 @@ def test_add_evidence_equals_the_reference(seed):
     terms += [(-1, {key: quantised(value) for key, value in last.items()})]
     steps = {
         key: step
-        for key, step in _sum(*terms).items()
+        for key, step in sum_of(*terms).items()
         if int(storage.key_to_code(*key)) >> storage.CELL_BITS in seen
     }  # fmt: skip
-    _assert_equal(units_of(mass), _sum((1, masses), (1, steps)))
-    assert _changed_bricks(masses, units_of(mass)) == _revised(mass, 7)
+    assert_equal(units_of(mass), sum_of((1, masses), (1, steps)))
+    assert changed_bricks(masses, units_of(mass)) == revised_bricks(mass, 7)
 
 
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds)
 def test_difference_added_to_the_old_sum_gives_the_new_sum(seed):
     rng = np.random.default_rng(seed)
-    old = _random_cells(rng)
-    new = old | _random_cells(rng)
+    old = random_cells(rng)
+    new = old | random_cells(rng)
     grown = difference(mass_of(new), mass_of(old))
-    _assert_equal(units_of(grown), _sum((1, new), (-1, old)))
+    assert_equal(units_of(grown), sum_of((1, new), (-1, old)))
     total = mass_of(old)
     receive(total, [(grown, None)], 2)
     assert cells_of(total) == cells_of(mass_of(new))
@@ -214,13 +192,16 @@ def test_shares_of_a_weight_add_up_to_it():
             assert share == (weight // (1 + num_receivers) if num_receivers else 0)
 
 
+# --- the map ----------------------------------------------------------------------------------------------------------
+
+
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, weight=st.integers(LEAST_WEIGHT, 6 * WHOLE_WEIGHT), tolerance=st.sampled_from([0.0, 1e-3]))
 def test_recovered_map_is_mass_over_weight(seed, weight, tolerance):
     rng = np.random.default_rng(seed)
-    before, after = _random_cells(rng), _random_cells(rng)
+    before, after = random_cells(rng), random_cells(rng)
     after = before | {key: value for key, value in after.items() if rng.random() < 0.7}
-    octree = octree_with({})
+    octree = log_odds_octree({})
     recover_map(mass_of(before), weight, octree, 3, tolerance)
     old = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
     change = recover_map(mass_of(after), weight, octree, 7, tolerance)
@@ -232,12 +213,12 @@ def test_recovered_map_is_mass_over_weight(seed, weight, tolerance):
     most = max((float(abs(found[key] - old.get(key, 0)).max()) for key in found), default=0.0)
     assert change == pytest.approx(most, rel=1e-6)
     assert change == 0.0 or change > tolerance
-    assert _revised(octree, 7) == _changed_bricks(old, found)
+    assert revised_bricks(octree, 7) == changed_bricks(old, found)
 
 
 def test_a_map_of_one_value_is_pruned():
     mass = mass_of(cube((0, 0, 0), 8, np.full(NUM_CLASSES, 5 << 17)) | {(1, 1, 1): np.full(NUM_CLASSES, 9 << 17)})
-    octree = octree_with({})
+    octree = log_odds_octree({})
     assert recover_map(mass, WHOLE_WEIGHT, octree, 1) == 9.0
     assert len(octree.leaves()) == 7 + 7 + 8
     grown = mass_of({(1, 1, 1): np.full(NUM_CLASSES, -4 << 17)})
@@ -251,7 +232,7 @@ def test_a_map_of_one_value_is_pruned():
 
 def test_changes_within_the_tolerance_are_not_written():
     cells = cube((0, 0, 0), 3, np.array([1, 2, 3]) << 17)
-    octree = octree_with({})
+    octree = log_odds_octree({})
     recover_map(mass_of(cells), WHOLE_WEIGHT, octree, 1)
     before = cells_of(octree)
     moved = {key: value + np.array([2, -2, 0]) for key, value in cells.items()}
@@ -259,6 +240,9 @@ def test_changes_within_the_tolerance_are_not_written():
     assert cells_of(octree) == before
     assert (octree.revisions == 1).all()
     assert recover_map(mass_of(moved), WHOLE_WEIGHT, octree, 2, tolerance=UNIT) == pytest.approx(2 * UNIT, rel=0.1)
+
+
+# --- masses as bits of floats -----------------------------------------------------------------------------------------
 
 
 def test_copies_and_packets_keep_all_bits():
@@ -269,11 +253,11 @@ def test_copies_and_packets_keep_all_bits():
     }
     cells |= cube((4, 4, 4), 4, np.full(NUM_CLASSES, 3))
     mass = mass_of(cells)
-    signed = {key: signed_of(value) for key, value in cells.items()}
-    grown = octree_with({})
+    expected = {key: signed(value) for key, value in cells.items()}
+    grown = log_odds_octree({})
     grown.overwrite(mass, np.arange(mass.num_bricks))
     for octree in (mass, mass.copy(), grown, decode_packet(encode_packet(mass))):
-        _assert_equal(units_of(octree), signed)
+        assert_equal(units_of(octree), expected)
 
 
 def test_brick_of_two_different_denormals_is_not_pruned():

@@ -1,4 +1,4 @@
-"""Teams that exchange running sums over faulty links."""
+"""Teams of robots with running sums: conservation, convergence and drift."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from octoreplay.mapping.running_sums import (
 )
 from reference import ratio
 from reference.ratio import RatioRobot, quantised
+from support.masses import NUM_CLASSES, log_odds_octree, mass_of, signed, units_of, value_at
 from support.octree_factory import cells_of, cube
-from support.running_sum_maps import NUM_CLASSES, mass_of, octree_with, signed_of, units_of, value_of
 
 KEYS = (*cube((0, 0, 0), 2, 0), (2, 2, 2), (5, 1, 0), (9, 9, 9), (-3, 0, 4))
 
@@ -30,22 +30,22 @@ KEYS = (*cube((0, 0, 0), 2, 0), (2, 2, 2), (5, 1, 0), (9, 9, 9), (-3, 0, 4))
 def _dense(octree):
     """Integers (M, C) of a mass at KEYS, 0 where it is unknown."""
     cells = units_of(octree)
-    return np.array([value_of(cells, key) for key in KEYS])
+    return np.array([value_at(cells, key) for key in KEYS])
 
 
 def _of_dense(values):
     """The octree of log-odds (M, C) at KEYS."""
-    return octree_with(dict(zip(KEYS, values, strict=True)))
+    return log_odds_octree(dict(zip(KEYS, values, strict=True)))
 
 
 class Robot:
     """State of a robot as in a session, and of its reference."""
 
     def __init__(self):
-        self.mass, self.total, self.map = (octree_with({}) for _ in range(3))
+        self.mass, self.total, self.map = (log_odds_octree({}) for _ in range(3))
         self.weight, self.total_weight = WHOLE_WEIGHT, 0
-        self.evidence, self.last_evidence = octree_with({}), octree_with({})
-        self.heard = {}
+        self.evidence, self.last_evidence = log_odds_octree({}), log_odds_octree({})
+        self.last_received = {}
         self.twin = RatioRobot((len(KEYS), NUM_CLASSES))
 
     def observe(self, log_odds):
@@ -64,15 +64,15 @@ class Robot:
         """Content of a packet: sigma and eta, and those of the reference."""
         return self.total.copy(), self.total_weight, self.twin.total, self.twin.total_weight
 
-    def start_hearing(self, sender, sums):
+    def start_link(self, sender, sums):
         """A link comes up: earlier shares are not for this receiver."""
-        self.heard[sender], self.twin.heard[sender] = sums[:2], sums[2:]
+        self.last_received[sender], self.twin.last_received[sender] = sums[:2], sums[2:]
 
     def receive(self, sender, sums):
-        old, old_weight = self.heard.get(sender, (None, 0))
+        old, old_weight = self.last_received.get(sender, (None, 0))
         receive(self.mass, [(sums[0], old)], 0)
         self.weight += sums[1] - old_weight
-        self.heard[sender] = sums[:2]
+        self.last_received[sender] = sums[:2]
         self.twin.receive(sender, *sums[2:])
 
     def recover(self):
@@ -135,15 +135,15 @@ def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
         masses, weight = sum(_dense(robot.mass) for robot in robots), sum(robot.weight for robot in robots)
         for sender, robot in enumerate(robots):
             for receiver in receivers[sender]:
-                octree, old_weight = robots[receiver].heard.get(sender, (octree_with({}), 0))
+                octree, old_weight = robots[receiver].last_received.get(sender, (log_odds_octree({}), 0))
                 masses = masses + _dense(robot.total) - _dense(octree)
                 weight += robot.total_weight - old_weight
         evidence = sum(robot.twin.evidence for robot in robots)
-        assert (signed_of(masses) == evidence).all()
+        assert (signed(masses) == evidence).all()
         assert weight == len(robots) * WHOLE_WEIGHT
         for robot in robots:
             assert (_dense(robot.mass) == robot.twin.mass).all()
-            assert (_dense(robot.total) == signed_of(robot.twin.total)).all()
+            assert (_dense(robot.total) == signed(robot.twin.total)).all()
             assert (robot.weight, robot.total_weight) == (robot.twin.weight, robot.twin.total_weight)
 
 
@@ -192,7 +192,9 @@ def test_no_drift_over_a_day_of_ticks():
     for tick in range(86_400):
         if tick in (0, 43_000, 86_360):
             octrees = [(_of_units(twin.mass), _of_units(twin.total)) for twin in twins]
-            heard = [_of_units(twins[i].heard.get(i - 1, (twins[i].total * 0, 0))[0]) for i in (0, 1, 2)]
+            last_received = [
+                _of_units(twins[i].last_received.get(i - 1, (twins[i].total * 0, 0))[0]) for i in (0, 1, 2)
+            ]
         arrives = rng.random(3) >= 0.3
         for twin in twins:
             twin.share_out(1)
@@ -205,12 +207,12 @@ def test_no_drift_over_a_day_of_ticks():
             share_out(mass, total, 1, tick)
         for i in np.flatnonzero(arrives):
             sums = octrees[i - 1][1].copy()
-            receive(octrees[i][0], [(sums, heard[i])], tick)
-            heard[i] = sums
+            receive(octrees[i][0], [(sums, last_received[i])], tick)
+            last_received[i] = sums
         if tick in (39, 43_039, 86_399):
             for twin, (mass, total) in zip(twins, octrees, strict=True):
                 assert (_dense(mass) == twin.mass).all()
-                assert (_dense(total) == signed_of(twin.total)).all()
+                assert (_dense(total) == signed(twin.total)).all()
                 num_wraps = int(abs(twin.total).min() // MODULUS)
             octrees = None
     assert num_wraps > 1000
@@ -244,7 +246,7 @@ def test_newcomer_converges_at_the_rate_of_lambda_2():
     num_ticks = math.ceil(math.log(0.01) / math.log(second))
     assert num_ticks == 12
     for sender, receiver in ((0, 5), (4, 5), (5, 0), (5, 4)):
-        robots[receiver].start_hearing(sender, robots[sender].sums())
+        robots[receiver].start_link(sender, robots[sender].sums())
     start = abs(robots[5].recover() - mean).max()
     assert start > 1.0
     for _ in range(num_ticks):

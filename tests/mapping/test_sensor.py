@@ -1,4 +1,4 @@
-"""Ray casting against the reference twin, and layouts of the input."""
+"""Cells that a scan touches, against the reference."""
 
 from __future__ import annotations
 
@@ -10,25 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.config.sensor import MapConfig
-from octoreplay.mapping.sensor import (
-    ScanCaster,
-)
+from octoreplay.config.sensor import MapConfig, SensorConfig
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.mapping.kernels import storage
 from octoreplay.records import CloudFrame, DepthFrame
 from reference.hand_made import cloud, depth_frame, facing_x
-from reference.scenarios import TeamShape, make_scenario
-from support.scans import (
-    MAP,
-    NUM_CLASSES,
-    SENSOR,
-    agree,
-    random_cloud,
-    random_depth,
-    random_pose,
-    read_only,
-    scan_cells,
-    strided,
-)
+from support.scans import SENSOR, cells_of_scan, check_scan, random_cloud, random_depth
+
+# --- against the reference -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
@@ -40,7 +29,7 @@ def test_random_scans(seed, rays):
     for frame in (
         random_depth(rng), random_depth(rng, np.uint16), random_cloud(rng), random_cloud(rng, np.float64),
     ):  # fmt: skip
-        freed, hit = agree(frame, sensor, region)
+        freed, hit = check_scan(frame, sensor, region)
         assert freed
         assert hit
 
@@ -53,7 +42,7 @@ def test_random_scans_in_a_region(bounds):
     for _ in range(4):
         for rays in ("cells", "all"):
             frame, sensor = random_depth(rng), dataclasses.replace(SENSOR, rays=rays)
-            agree(frame, sensor, MapConfig(resolution=0.2, bounds=bounds))
+            check_scan(frame, sensor, MapConfig(resolution=0.2, bounds=bounds))
 
 
 @pytest.mark.parametrize(("resolution", "low", "high"), [(0.7, 89.25, 91.35), (0.3, -0.45, 0.15), (0.2, 0.5, 0.7)])
@@ -61,7 +50,7 @@ def test_bounds_through_cell_centres(resolution, low, high):
     pose = np.eye(4)
     pose[:3, 3] = (0.01, 0.02, low - 3 * resolution)
     frame = CloudFrame("r", 0, np.array([[0.0, 0.0, 10 * resolution]]), None, pose)
-    freed, _ = agree(frame, dataclasses.replace(SENSOR, max_range=50.0), MapConfig(resolution, bounds=(low, high)))
+    freed, _ = check_scan(frame, dataclasses.replace(SENSOR, max_range=50.0), MapConfig(resolution, bounds=(low, high)))
     assert freed
 
 
@@ -76,7 +65,7 @@ def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
     pose = np.eye(4)
     pose[:3, 3] = np.array(origin) / 8
     frame = CloudFrame("r", 0, np.array(ends) / 8, None, pose)
-    agree(frame, dataclasses.replace(SENSOR, rays=rays, max_range=100.0), MapConfig(resolution=0.25))
+    check_scan(frame, dataclasses.replace(SENSOR, rays=rays, max_range=100.0), MapConfig(resolution=0.25))
 
 
 @pytest.mark.parametrize("resolution", [0.1, 0.2, 0.3])
@@ -87,7 +76,7 @@ def test_walls_at_decimal_places(resolution):
     for origin in itertools.product(places[::2], places[1::3], places[::5]):
         pose = np.eye(4)
         pose[:3, 3] = origin
-        agree(CloudFrame("r", 0, ends, None, pose), SENSOR, MapConfig(resolution=resolution))
+        check_scan(CloudFrame("r", 0, ends, None, pose), SENSOR, MapConfig(resolution=resolution))
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
@@ -103,7 +92,7 @@ def test_long_rays(seed, rays):
     pose = np.eye(4)
     pose[:3, 3] = rng.uniform(-20, 20, 3)
     frame = CloudFrame("r", 0, points, rng.integers(0, 3, 60).astype(np.uint8), pose)
-    freed, _ = agree(frame, dataclasses.replace(SENSOR, rays=rays, max_range=35.0), MapConfig(resolution=0.1))
+    freed, _ = check_scan(frame, dataclasses.replace(SENSOR, rays=rays, max_range=35.0), MapConfig(resolution=0.1))
     assert len(freed) > 5000
 
 
@@ -120,7 +109,7 @@ def test_ray_is_a_path_of_face_neighbours(origin, point, resolution, rays):
     pose[:3, 3] = origin
     frame = CloudFrame("r", 0, np.array([point]), None, pose)
     sensor = dataclasses.replace(SENSOR, rays=rays, max_range=100.0)
-    freed, hit = scan_cells(frame, sensor, MapConfig(resolution=resolution))
+    freed, hit = cells_of_scan(frame, sensor, MapConfig(resolution=resolution))
     if not np.any(point):
         assert not freed
         return
@@ -144,7 +133,7 @@ def test_rays_along_an_axis(axis, sign, rays):
     point = np.zeros(3)
     point[axis] = 2.0 * sign
     sensor = dataclasses.replace(SENSOR, rays=rays)
-    freed, hit = agree(cloud([point], [3]), sensor, MapConfig(resolution=0.25))
+    freed, hit = check_scan(cloud([point], [3]), sensor, MapConfig(resolution=0.25))
     end = [2, 2, 2]
     end[axis] += 8 if sign > 0 else -8
     assert hit == {tuple(end): 3}
@@ -153,7 +142,7 @@ def test_rays_along_an_axis(axis, sign, rays):
 
 def test_negative_coordinates_by_hand():
     frame = depth_frame(np.array([[1.0]], np.float32), [[2]], pose=facing_x(-3.1, -0.5, -2.5))
-    freed, hit = agree(frame, SENSOR, MapConfig(resolution=1.0))
+    freed, hit = check_scan(frame, SENSOR, MapConfig(resolution=1.0))
     assert freed == {(-4, -1, -3)}
     assert hit == {(-3, -1, -3): 2}
 
@@ -163,7 +152,7 @@ def test_point_at_exactly_max_range_is_a_hit(distance):
     for frame in (
         depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2]),
     ):  # fmt: skip
-        freed, hit = agree(frame, SENSOR, MapConfig(resolution=1.0))
+        freed, hit = check_scan(frame, SENSOR, MapConfig(resolution=1.0))
         within = float(np.float32(distance) if isinstance(frame, DepthFrame) else distance) <= 4.0
         assert hit == ({(int(distance + 0.5), 0, 0): 2} if within else {})
         assert len(freed) == int(min(distance, 4.0) + 0.5)
@@ -173,29 +162,29 @@ def test_point_at_exactly_min_range_is_used():
     sensor = dataclasses.replace(SENSOR, min_range=2.0)
     for distance, used in ((2.0, True), (np.nextafter(np.float32(2.0), np.float32(0)), False)):
         for frame in (depth_frame(np.array([[distance]], np.float32), [[2]]), cloud([[distance, 0, 0]], [2])):
-            assert bool(agree(frame, sensor, MapConfig(resolution=1.0))[0]) == used
+            assert bool(check_scan(frame, sensor, MapConfig(resolution=1.0))[0]) == used
 
 
 def test_scan_in_the_cell_of_the_origin():
-    assert agree(cloud([[0.01, 0.0, 0.0]], [1])) == (set(), {(2, 2, 2): 1})
-    assert agree(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), {})
-    freed, hit = agree(cloud([[0.01, 0.0, 0.0], [1.0, 0.0, 0.0]], [1, 2]))
+    assert check_scan(cloud([[0.01, 0.0, 0.0]], [1])) == (set(), {(2, 2, 2): 1})
+    assert check_scan(cloud([[0.01, 0.0, 0.0]], [0])) == (set(), {})
+    freed, hit = check_scan(cloud([[0.01, 0.0, 0.0], [1.0, 0.0, 0.0]], [1, 2]))
     assert (2, 2, 2) in hit
     assert (2, 2, 2) not in freed
 
 
 def test_majority_of_points_wins_and_ties_go_to_the_lower_id():
     near = np.array([[2.0, 0.0, 0.0]]) + np.arange(6)[:, None] * 1e-3
-    assert set(agree(cloud(near, [4, 2, 2, 4, 4, 0]))[1].values()) == {4}
-    assert set(agree(cloud(near, [4, 2, 2, 4, 0, 0]))[1].values()) == {2}
-    assert agree(cloud(near, [0] * 6))[1] == {}
+    assert set(check_scan(cloud(near, [4, 2, 2, 4, 4, 0]))[1].values()) == {4}
+    assert set(check_scan(cloud(near, [4, 2, 2, 4, 0, 0]))[1].values()) == {2}
+    assert check_scan(cloud(near, [0] * 6))[1] == {}
 
 
 def test_scans_without_points():
-    assert agree(cloud(np.zeros((0, 3)), [])) == (set(), {})
-    assert agree(cloud([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]], [1, 1, 1])) == (set(), {})
-    assert agree(depth_frame(np.zeros((3, 4), np.uint16), unit=0.001)) == (set(), {})
-    assert agree(depth_frame(np.zeros((0, 0), np.float32))) == (set(), {})
+    assert check_scan(cloud(np.zeros((0, 3)), [])) == (set(), {})
+    assert check_scan(cloud([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]], [1, 1, 1])) == (set(), {})
+    assert check_scan(depth_frame(np.zeros((3, 4), np.uint16), unit=0.001)) == (set(), {})
+    assert check_scan(depth_frame(np.zeros((0, 0), np.float32))) == (set(), {})
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
@@ -208,44 +197,40 @@ def test_values_without_information(dtype):
     options += [{"no_return_depth": (float(np.iinfo(dtype).max),)}] if dtype != np.float32 else []
     options += [{"no_return_depth": (np.nan, np.inf, -1.0)}, {"no_return_depth": (2.1, np.nan), "min_range": 1.5}]
     for option in options:
-        agree(depth_frame(image), dataclasses.replace(SENSOR, max_range=7.5, **option), MapConfig(resolution=0.5))
+        check_scan(depth_frame(image), dataclasses.replace(SENSOR, max_range=7.5, **option), MapConfig(resolution=0.5))
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-def test_memory_layout_of_images_does_not_change_the_result(dtype):
-    frame = random_depth(np.random.default_rng(1), dtype)
-    expected = scan_cells(frame)
-    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], lambda a: read_only(a)):
-        other = dataclasses.replace(
-            frame, depth_image=layout(frame.depth_image), class_image=layout(frame.class_image),
-            T_team_sensor=np.asfortranarray(frame.T_team_sensor),
-        )  # fmt: skip
-        assert scan_cells(other) == expected
-    big_endian = dataclasses.replace(
-        frame, depth_image=frame.depth_image.astype(frame.depth_image.dtype.newbyteorder(">"))
-    )
-    assert scan_cells(big_endian) == expected
-    assert scan_cells(dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32))) == scan_cells(
-        dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32).astype(np.float64))
-    )
+# --- the edge of the key space ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_memory_layout_of_clouds_does_not_change_the_result(dtype):
-    frame = random_cloud(np.random.default_rng(2), dtype)
-    expected = scan_cells(frame)
-    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], read_only):
-        other = dataclasses.replace(frame, points=layout(frame.points), class_ids=layout(frame.class_ids))
-        assert scan_cells(other) == expected
-    swapped = dataclasses.replace(frame, points=frame.points.astype(frame.points.dtype.newbyteorder(">")))
-    assert scan_cells(swapped) == expected
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_scans_that_leave_the_key_space_are_refused(axis, sign):
+    region = MapConfig(resolution=0.25)
+    reach = storage.KEY_OFFSET * 0.25
+    pose = np.eye(4)
+    pose[axis, 3] = sign * (reach - 3.1)
+    point = np.zeros(3)
+    point[axis] = sign * 1.0
+    inside = CloudFrame("r", 0, np.array([point]), None, pose)
+    freed, hit = check_scan(inside, SENSOR, region)
+    assert len(freed) == 4
+    assert len(hit) == 1
+    far = CloudFrame("robot_7", 5, np.array([point * 3.5]), None, pose)
+    with pytest.raises(
+        InputError, match=r"robot 'robot_7', 5 ns: the scan lies outside the map, which reaches 65536 m"
+    ):
+        cells_of_scan(far, SENSOR, region)
+    pose = pose.copy()
+    pose[axis, 3] = sign * (reach + 1.0)
+    for origin in (pose, np.full((4, 4), np.nan), pose * 1e30):
+        with pytest.raises(InputError, match="outside the map"):
+            cells_of_scan(CloudFrame("r", 0, np.array([-2.0 * point]), None, origin), SENSOR, region)
+        with pytest.raises(InputError, match="outside the map"):
+            cells_of_scan(CloudFrame("r", 0, np.zeros((0, 3)), None, origin), SENSOR, region)
 
 
-def test_reused_caster_equals_a_new_one():
-    """Its scratch grid grows, shrinks and moves; no marks of an earlier scan may remain."""
-    scenario = make_scenario(3, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), sensors="mixed"))
-    caster = ScanCaster(SENSOR, MAP, NUM_CLASSES)
-    rng = np.random.default_rng(0)
-    for frame in scenario.frames:
-        moved = dataclasses.replace(frame, T_team_sensor=random_pose(rng, spread=50.0))
-        assert scan_cells(moved, caster=caster) == scan_cells(moved)
+def test_resolution_too_fine_for_the_range_is_refused():
+    frame = cloud([[100.0, 100.0, 100.0]], [1])
+    with pytest.raises(ConfigError, match=r"resolution: 0.01 m is too fine for max_range 500 m"):
+        cells_of_scan(frame, SensorConfig(max_range=500.0), MapConfig(resolution=0.01))

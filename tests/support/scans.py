@@ -1,4 +1,4 @@
-"""Scans and their expected evidence for tests of ray casting."""
+"""Random scans, and the cells that they touch, from the caster and from the reference."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SENSOR = SensorConfig(max_range=4.0)
 MAP = MapConfig(resolution=0.2)
 
 
-def scan_cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
+def cells_of_scan(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, caster=None):
     """(freed keys, {hit key: class_id}) of a scan, from the caster."""
     freed, hit = weighted_cells(frame, sensor, region, num_classes, caster)
     return freed, {key: class_id for key, (class_id, _) in hit.items()}
@@ -44,16 +44,21 @@ def weighted_cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, ca
     return freed, {key: (kind - 1, strength) for key, (kind, strength) in content.items() if kind > 1}
 
 
-def weighted_expected(frame, sensor=SENSOR, region=MAP):
+def expected_cells(frame, sensor=SENSOR, region=MAP):
+    freed, hit = expected_weighted_cells(frame, sensor, region)
+    return freed, {key: class_id for key, (class_id, _) in hit.items()}
+
+
+def expected_weighted_cells(frame, sensor=SENSOR, region=MAP):
     update = scan_update(frame, sensor, region)
     winners = zip(update.hit_classes.tolist(), update.hit_strengths.tolist(), strict=True)
     freed = {tuple(key) for key in update.freed.tolist()}
     return freed, dict(zip(map(tuple, update.hit.tolist()), winners, strict=True))
 
 
-def agree(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES):
+def check_scan(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES):
     freed, hit = weighted_cells(frame, sensor, region, num_classes)
-    expected_freed, expected_hit = weighted_expected(frame, sensor, region)
+    expected_freed, expected_hit = expected_weighted_cells(frame, sensor, region)
     assert hit == expected_hit
     assert freed - expected_freed == set()
     assert expected_freed - freed == set()
@@ -96,10 +101,13 @@ def strided(array):
     return view
 
 
-def read_only(array):
+def read_only_copy(array):
     copy = array.copy()
     copy.setflags(write=False)
     return copy
+
+
+# --- confidences, bodies, lenses -------------------------------------------------------------------------------------
 
 
 def with_confidences(frame, confidences):
@@ -118,7 +126,10 @@ def random_boxes(rng, frame, count):
     return tuple(boxes)
 
 
-def sums_of(frames, increments, num_classes=NUM_CLASSES, sensor=SENSOR, region=MAP):
+# --- sums ------------------------------------------------------------------------------------------------------------
+
+
+def sum_of_scans(frames, increments, num_classes=NUM_CLASSES, sensor=SENSOR, region=MAP):
     octree = SemanticOctree(region.resolution, num_classes)
     caster = ScanCaster(sensor, region, NUM_CLASSES)
     for revision, frame in enumerate(frames):

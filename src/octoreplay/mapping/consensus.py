@@ -98,17 +98,10 @@ def team_step(
     if not steps:
         return []
     run: Run = map if threads is None else threads.map
-    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
-    column_of = {id(octree): column for column, octree in enumerate(octrees)}
-    all_since = [step.since for step in steps if step.since is not None]
-    since = min(all_since, default=0)
-    codes = union_codes(octrees, since if len(all_since) == len(steps) else None)
-    table = brick_table(octrees, codes, since, run)
-    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
-    shape = (len(steps), codes.size)
+    since, codes, table, columns = _locate_bricks(steps, run)
+    shape, num_classes = (len(steps), codes.size), steps[0].own.num_classes
     needs_update, known_changed, is_even = np.zeros((3, *shape), np.bool_)
-    changes = np.zeros(shape, np.float32)
-    indices = np.empty(shape, np.int64)
+    changes, indices = np.zeros(shape, np.float32), np.empty(shape, np.int64)
     layouts, known = np.empty((*shape, table.masks.shape[2]), np.uint64), np.empty(shape, np.uint64)
 
     def prepare(n: int) -> None:
@@ -123,7 +116,6 @@ def team_step(
     first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
     weights = np.concatenate([[0.0] * FIRST_NEIGHBOUR + list(step.step_weights) for step in steps]).astype(np.float32)
     gammas = np.array([step.gamma for step in steps], np.float32)
-    num_classes = steps[0].own.num_classes
 
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
@@ -132,18 +124,31 @@ def team_step(
             needs_update, *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
-    parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
-    list(run(work, [part for part in parts if part.size]))
+    list(run(work, parts_of(codes.size, threads)))
 
     def finish(n: int) -> float:
-        return float(
-            consensus_kernels.finish_step(
-                steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n],
-                revision,
-            )
-        )  # fmt: skip
+        largest = consensus_kernels.finish_step(
+            steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n], revision
+        )
+        return float(largest)
 
     return list(run(finish, range(len(steps))))
+
+
+def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, BrickTable, list[Int64Array]]:
+    """Return the lowest ``since``, the codes (n,) of the bricks to update, their table, and each step's columns."""
+    since = min((step.since for step in steps if step.since is not None), default=0)
+    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
+    column_of = {id(octree): column for column, octree in enumerate(octrees)}
+    codes = union_codes(octrees, None if any(step.since is None for step in steps) else since)
+    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
+    return since, codes, brick_table(octrees, codes, since, run), columns
+
+
+def parts_of(num_bricks: int, threads: Executor | None) -> list[Int64Array]:
+    """Return the positions 0 to ``num_bricks`` - 1 in non-empty parts of consecutive ones: one part without threads."""
+    parts = np.array_split(np.arange(num_bricks), 1 if threads is None else NUM_PARTS)
+    return [part for part in parts if part.size]
 
 
 def _octrees(step: Step) -> list[SemanticOctree]:

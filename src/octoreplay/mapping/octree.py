@@ -252,7 +252,7 @@ class SemanticOctree:
         codes, depths, is_vector = leaf_list(streams)
         with np.errstate(invalid="ignore"):
             keys = np.floor(np.asarray(coords, np.float64) / self.resolution)
-            inside = np.all((keys >= -storage.KEY_OFFSET) & (keys < storage.KEY_OFFSET), axis=1)
+            inside = np.all((keys >= -KEY_OFFSET) & (keys < KEY_OFFSET), axis=1)
             keys = np.where(inside[:, None], keys, 0).astype(np.int64)
         cell_codes = keys_to_codes(keys)
         leaf = np.searchsorted(codes, cell_codes, side="right") - 1

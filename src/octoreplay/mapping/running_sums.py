@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.mapping.consensus import NUM_PARTS, expand_to_columns, union_codes
+from octoreplay.mapping.consensus import expand_to_columns, parts_of, union_codes
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import running_sums as kernels
 from octoreplay.mapping.kernels import storage
@@ -201,8 +201,7 @@ def _add_differences(
             _scratch(num_classes), is_changed,
         )  # fmt: skip
 
-    parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
-    list(run(work, [part for part in parts if part.size]))
+    list(run(work, parts_of(codes.size, threads)))
 
     def finish(n: int) -> None:
         changes = np.maximum(is_changed[n], rows[n].known_changed)

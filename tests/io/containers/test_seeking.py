@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from log_factory import ROS1, SECOND, ros2
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -22,6 +21,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from octoreplay.io.containers.db3_log import Db3Log
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.ros_types import typestore
+from support.log_factory import ROS1, SECOND, ros2
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "containers"
 STRING = "std_msgs/msg/String"

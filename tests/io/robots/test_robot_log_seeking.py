@@ -7,7 +7,14 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from log_factory import (
+
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import InputError
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_bodies import BodyTrack
+from octoreplay.io.sensors.labels import class_table_from_names
+from support.log_factory import (
     IDENTITY,
     NAMES,
     OPTICAL,
@@ -24,13 +31,6 @@ from log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import InputError
-from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.robots.team_bodies import BodyTrack
-from octoreplay.io.sensors.labels import class_table_from_names
 
 TABLE = class_table_from_names({"r": NAMES})
 START = 100 * SECOND

@@ -69,7 +69,7 @@ def test_a_robot_whose_poses_have_ended_has_no_box(tmp_path):
         assert others(bodies, 0, START + 5 * SECOND + 1) == ()
 
 
-def test_poses_are_read_only_as_far_as_they_are_wanted(tmp_path):
+def test_poses_are_read_only_up_to_the_span(tmp_path):
     robots = (robot_of(tmp_path, "a"), robot_of(tmp_path, "b", num_frames=400, body_box=BOX))
     with TeamBodies(robots, TimeConfig()) as bodies:
         bodies.advance(START, START + SECOND)

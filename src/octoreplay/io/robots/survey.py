@@ -193,7 +193,7 @@ def _sample(log: LogReader, topic: TopicInfo) -> TopicSample | None:
 
 
 def _owners_by_name(topics: tuple[TopicInfo, ...], samples: Mapping[str, TopicSample]) -> dict[str, str]:
-    """Robot of each topic by the first part of its name; at least two such parts need a sensor and a pose each."""
+    """Robot of each topic by the first part of its name, where two or more such parts have a sensor and a pose."""
     found = []
     for name in dict.fromkeys(first_part(topic) for topic, sample in samples.items() if sample.is_sensor):
         own = [topic for topic in topics if first_part(topic.name) == name and topic.name.count("/") > 1]

@@ -1,4 +1,4 @@
-"""Where the robots' bodies are, so that what one robot sees of another does not become part of the map."""
+"""Body boxes of the other robots of a team, whose points do not become part of a robot's map."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from octoreplay.io.robots.body_box import body_box_at
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import BodyBox, Frame
 
-# Poses are looked for this much further in the log than the time they are wanted for.
+# Poses are read up to this much log time past the stamp that they are needed for.
 _LOOK_AHEAD_NS = 10_000_000_000
 
 
 class BodyTrack:
-    """The box of one robot over time, from its own reading of the poses in its log; a context manager."""
+    """Box of one robot over time, with its own reader of the log's poses; a context manager."""
 
     def __init__(self, robot: ResolvedRobot, time: TimeConfig) -> None:
         self._robot = robot
@@ -39,7 +39,7 @@ class BodyTrack:
         self._log.close()
 
     def advance(self, start_ns: int, end_ns: int) -> None:
-        """Make the poses from a stamp to another known, as far as the log has them, and drop the ones before."""
+        """Read the poses between two stamps and drop earlier ones."""
         start_ns, end_ns = start_ns - self._offset_ns, end_ns - self._offset_ns
         self._poses.forget_before(start_ns)
         if self._messages is None:
@@ -54,7 +54,7 @@ class BodyTrack:
                 return
 
     def box_at(self, stamp_ns: int) -> BodyBox | None:
-        """The robot's box at a stamp; None where its pose is not known there."""
+        """Return the robot's box at a stamp; None where its pose is not known."""
         stamp_ns -= self._offset_ns
         T_map_sensor = self._poses.at(stamp_ns)
         if T_map_sensor is None:
@@ -63,7 +63,7 @@ class BodyTrack:
 
 
 class TeamBodies:
-    """The boxes of all robots that have one (``body_box``); a context manager.
+    """Boxes of all robots with a ``body_box``; a context manager.
 
     It opens the logs a second time: poses are needed up to the end of a tick before any robot's frames of it are given.
     ``advance`` is called for a span of time before the boxes in it are asked for, which threads may then do.

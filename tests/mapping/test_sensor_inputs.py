@@ -1,4 +1,4 @@
-"""Confidences, body boxes and lenses in ray casting."""
+"""Memory layouts, confidences, robots' bodies and lenses of scans, against the reference."""
 
 from __future__ import annotations
 
@@ -12,24 +12,73 @@ from hypothesis import strategies as st
 from octoreplay.config.sensor import MapConfig
 from octoreplay.mapping.kernels import ends
 from octoreplay.mapping.sensor import (
+    ScanCaster,
     clamped_increments,
 )
 from octoreplay.records import BodyBox, CameraModel, CloudFrame
 from reference.hand_made import cloud, depth_frame, facing_x
+from reference.scenarios import TeamShape, make_scenario
 from support.octree_factory import cells_of
 from support.scans import (
+    MAP,
+    NUM_CLASSES,
     SENSOR,
-    agree,
+    cells_of_scan,
+    check_scan,
     random_boxes,
     random_cloud,
     random_depth,
-    read_only,
-    scan_cells,
+    random_pose,
+    read_only_copy,
     strided,
-    sums_of,
+    sum_of_scans,
     weighted_cells,
     with_confidences,
 )
+
+# --- layouts of the input --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_memory_layout_of_images_does_not_change_the_result(dtype):
+    frame = random_depth(np.random.default_rng(1), dtype)
+    expected = cells_of_scan(frame)
+    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], lambda a: read_only_copy(a)):
+        other = dataclasses.replace(
+            frame, depth_image=layout(frame.depth_image), class_image=layout(frame.class_image),
+            T_team_sensor=np.asfortranarray(frame.T_team_sensor),
+        )  # fmt: skip
+        assert cells_of_scan(other) == expected
+    big_endian = dataclasses.replace(
+        frame, depth_image=frame.depth_image.astype(frame.depth_image.dtype.newbyteorder(">"))
+    )
+    assert cells_of_scan(big_endian) == expected
+    assert cells_of_scan(
+        dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32))
+    ) == cells_of_scan(
+        dataclasses.replace(frame, T_team_sensor=frame.T_team_sensor.astype(np.float32).astype(np.float64))
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_memory_layout_of_clouds_does_not_change_the_result(dtype):
+    frame = random_cloud(np.random.default_rng(2), dtype)
+    expected = cells_of_scan(frame)
+    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], read_only_copy):
+        other = dataclasses.replace(frame, points=layout(frame.points), class_ids=layout(frame.class_ids))
+        assert cells_of_scan(other) == expected
+    swapped = dataclasses.replace(frame, points=frame.points.astype(frame.points.dtype.newbyteorder(">")))
+    assert cells_of_scan(swapped) == expected
+
+
+def test_reused_caster_equals_a_new_one():
+    """Its scratch grid grows, shrinks and moves; no marks of an earlier scan may remain."""
+    scenario = make_scenario(3, TeamShape(num_robots=2, num_ticks=12, image=(12, 9), sensors="mixed"))
+    caster = ScanCaster(SENSOR, MAP, NUM_CLASSES)
+    rng = np.random.default_rng(0)
+    for frame in scenario.frames:
+        moved = dataclasses.replace(frame, T_team_sensor=random_pose(rng, spread=50.0))
+        assert cells_of_scan(moved, caster=caster) == cells_of_scan(moved)
 
 
 def _random_slopes(rng, size, holes=0.05):
@@ -78,7 +127,7 @@ def test_random_scans_with_confidences_boxes_and_lenses(
 ):
     sensor = dataclasses.replace(SENSOR, rays=rays, min_range=0.4, no_return_depth=(7.0,), invalid_depth=(0.0,))
     frame = _random_frame(seed, num_classes, kind, confident=confident, num_boxes=num_boxes, bent=bent)
-    agree(frame, sensor, MapConfig(resolution), num_classes)
+    check_scan(frame, sensor, MapConfig(resolution), num_classes)
 
 
 def test_labels_are_weighted_by_their_confidences():
@@ -93,7 +142,7 @@ def test_labels_are_weighted_by_their_confidences():
     ):
         frame = with_confidences(cloud(near, class_ids), confidences)
         assert list(weighted_cells(frame)[1].values()) == [winner]
-        agree(frame)
+        check_scan(frame)
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
@@ -101,7 +150,7 @@ def test_points_with_zero_confidence_free_their_ray_and_hit_nothing(rays):
     sensor = dataclasses.replace(SENSOR, rays=rays)
     for frame in (cloud([[2.0, 0, 0]], [1]), cloud([[2.0, 0, 0]], None), depth_frame(np.array([[2.0]], np.float32))):
         shape = (1,) if isinstance(frame, CloudFrame) else (1, 1)
-        freed, hit = agree(with_confidences(frame, np.zeros(shape)), sensor, MapConfig(0.25))
+        freed, hit = check_scan(with_confidences(frame, np.zeros(shape)), sensor, MapConfig(0.25))
         assert len(freed) == 8
         assert not hit
 
@@ -137,7 +186,7 @@ def test_points_on_robots_bodies(rays):
             ((), 8, 1), ((beside,), 8, 1), ((other,), 8, 0), ((own,), 0, 0), ((own, other), 0, 0), ((other, own), 0, 0),
             ((beside, other), 8, 0),
         ):  # fmt: skip
-            freed, hit = agree(dataclasses.replace(frame, boxes=boxes), sensor, MapConfig(0.25))
+            freed, hit = check_scan(dataclasses.replace(frame, boxes=boxes), sensor, MapConfig(0.25))
             assert (len(freed), len(hit)) == (num_freed, num_hits)
 
 
@@ -145,7 +194,7 @@ def test_points_on_robots_bodies(rays):
 def test_boxes_do_not_affect_cut_rays(is_own):
     everywhere = _box([-99] * 3, [99] * 3, is_own=is_own)
     for frame in (cloud([[9.0, 0, 0]], [1]), depth_frame(np.array([[9.0]], np.float32))):
-        freed, hit = agree(dataclasses.replace(frame, boxes=(everywhere,)), SENSOR, MapConfig(0.25))
+        freed, hit = check_scan(dataclasses.replace(frame, boxes=(everywhere,)), SENSOR, MapConfig(0.25))
         assert (len(freed), hit) == (16, {})
 
 
@@ -154,7 +203,7 @@ def test_boxes_are_transformed_to_their_frame():
     # The box is 1/8 m thick along its frame's z, which is the team's x.
     ahead = _box([0, 0, 0], [0, 0, 0.125], is_own=True, pose=T_box_team)
     points = [[2.0, 0, 0], [2.125, 0, 0], [2.0, 0.125, 0], [2.0, 0, 0.125]]
-    hits = [agree(dataclasses.replace(cloud([point], [1]), boxes=(ahead,)))[1] for point in points]
+    hits = [check_scan(dataclasses.replace(cloud([point], [1]), boxes=(ahead,)))[1] for point in points]
     assert [len(hit) for hit in hits] == [0, 0, 1, 1]
 
 
@@ -176,7 +225,7 @@ def test_image_with_distortion_equals_the_cloud_of_its_points(dtype, rays):
         same = CloudFrame("r", 0, points.reshape(-1, 3), frame.class_image.ravel(), frame.T_team_sensor, boxes=boxes)
         same = with_confidences(same, confidences.ravel())
         steps = clamped_increments(sensor)
-        maps = [cells_of(sums_of([each], steps, sensor=sensor, region=region)) for each in (frame, same)]
+        maps = [cells_of(sum_of_scans([each], steps, sensor=sensor, region=region)) for each in (frame, same)]
         assert maps[0] == maps[1]
         assert len(maps[0]) > 300
 
@@ -189,7 +238,7 @@ def test_slopes_of_a_pinhole_equal_the_pinhole():
     slopes = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
     # With slopes, the intrinsics are not used.
     bent = dataclasses.replace(frame, camera=CameraModel(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0, slopes))
-    assert scan_cells(bent) == scan_cells(frame)
+    assert cells_of_scan(bent) == cells_of_scan(frame)
 
 
 @pytest.mark.parametrize("rays", ["cells", "all"])
@@ -205,5 +254,5 @@ def test_memory_layout_of_confidences_and_slopes_does_not_change_the_result(rays
         return dataclasses.replace(frame, camera=camera, confidence_image=layout(confidences))
 
     expected = weighted_cells(bent(np.array), sensor)
-    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], read_only):
+    for layout in (np.asfortranarray, strided, lambda a: a[::-1][::-1], read_only_copy):
         assert weighted_cells(bent(layout), sensor) == expected

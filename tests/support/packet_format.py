@@ -1,4 +1,4 @@
-"""Octrees and packets for tests of the codec."""
+"""Naive implementation of docs/packet-format.md, forged packets, and random octrees."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import struct
 import zlib
 
 import numpy as np
+import zstandard
 from hypothesis import strategies as st
 
-from octoreplay.mapping.codec import PacketFormat
 from octoreplay.mapping.kernels import storage
 from support.octree_factory import brick_code, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
-PLAIN = PacketFormat(zstd_level=None)
 HEADER = "<4sBBBBdqHHIIIfIIIIII"
+DTYPES = {"float32": "<f4", "float16": "<f2", "int8": "i1"}
 VALUES = st.sampled_from([0.0, -5.0, 5.0, -0.3, 1.0, 1e-30, -3e38, float(np.float32(0.1))])
 
 
@@ -73,8 +73,11 @@ def naive_cells(words, streams, num_classes):
     return None if any(rest) else content
 
 
-def code_of(key):
+def code_of_key(key):
     return brick_code(tuple(k >> storage.BRICK_BITS for k in key))
+
+
+# --- compression ------------------------------------------------------------------------------------------------------
 
 
 def naive_codes(numbers):
@@ -107,6 +110,14 @@ def counts_of(header):
     return header.num_words, header.num_leaves, header.num_vectors, header.num_own_values
 
 
+def slot_of(value):
+    return max((int.from_bytes(struct.pack("<f", value), "little") * 2654435761 % 2**32) // 2**24, 1)
+
+
+def compressed_packet(payload, counts):
+    return forged(zstandard.ZstdCompressor().compress(payload), counts=counts, compression=1)
+
+
 def forged(
     payload, *, version=3, kind=0, content=0, compression=0, num_classes=2, resolution=0.25, map_version=(0, 0, 0, 0),
     weight=0, step=0.0, counts,
@@ -120,7 +131,7 @@ def forged(
     return struct.pack(HEADER, *fields, checksum) + payload
 
 
-def packed(*words):
+def words_of(*words):
     return np.array(words, "<u2").tobytes()
 
 

@@ -1,4 +1,4 @@
-"""Ray casting at the edge of the key space, and sums of evidence."""
+"""Evidence of many scans in an octree, against the reference."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from octoreplay.config.sensor import MapConfig, SensorConfig
-from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
@@ -20,59 +19,11 @@ from octoreplay.mapping.sensor import (
 )
 from octoreplay.records import CloudFrame
 from reference.evidence import Evidence, IndexedScan
-from reference.hand_made import FACING_X, cloud, depth_frame
+from reference.hand_made import FACING_X, depth_frame
 from reference.scenarios import TeamShape, make_scenario
 from reference.sensor import scan_update
 from support.octree_factory import cells_of
-from support.scans import (
-    MAP,
-    NUM_CLASSES,
-    SENSOR,
-    agree,
-    random_boxes,
-    scan_cells,
-    sums_of,
-    weighted_expected,
-    with_confidences,
-)
-
-
-def _expected(frame, sensor=SENSOR, region=MAP):
-    freed, hit = weighted_expected(frame, sensor, region)
-    return freed, {key: class_id for key, (class_id, _) in hit.items()}
-
-
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_scans_that_leave_the_key_space_are_refused(axis, sign):
-    region = MapConfig(resolution=0.25)
-    reach = storage.KEY_OFFSET * 0.25
-    pose = np.eye(4)
-    pose[axis, 3] = sign * (reach - 3.1)
-    point = np.zeros(3)
-    point[axis] = sign * 1.0
-    inside = CloudFrame("r", 0, np.array([point]), None, pose)
-    freed, hit = agree(inside, SENSOR, region)
-    assert len(freed) == 4
-    assert len(hit) == 1
-    far = CloudFrame("robot_7", 5, np.array([point * 3.5]), None, pose)
-    with pytest.raises(
-        InputError, match=r"robot 'robot_7', 5 ns: the scan lies outside the map, which reaches 65536 m"
-    ):
-        scan_cells(far, SENSOR, region)
-    pose = pose.copy()
-    pose[axis, 3] = sign * (reach + 1.0)
-    for origin in (pose, np.full((4, 4), np.nan), pose * 1e30):
-        with pytest.raises(InputError, match="outside the map"):
-            scan_cells(CloudFrame("r", 0, np.array([-2.0 * point]), None, origin), SENSOR, region)
-        with pytest.raises(InputError, match="outside the map"):
-            scan_cells(CloudFrame("r", 0, np.zeros((0, 3)), None, origin), SENSOR, region)
-
-
-def test_resolution_too_fine_for_the_range_is_refused():
-    frame = cloud([[100.0, 100.0, 100.0]], [1])
-    with pytest.raises(ConfigError, match=r"resolution: 0.01 m is too fine for max_range 500 m"):
-        scan_cells(frame, SensorConfig(max_range=500.0), MapConfig(resolution=0.01))
+from support.scans import NUM_CLASSES, SENSOR, expected_cells, random_boxes, sum_of_scans, with_confidences
 
 
 @pytest.mark.parametrize("increments", ["clamped", "unclamped", "count"])
@@ -84,10 +35,10 @@ def test_sums_of_many_scans_equal_the_reference(increments):
     num_classes = 1 if increments == "count" else NUM_CLASSES
     scenario = make_scenario(2, TeamShape(num_robots=2, num_ticks=15, image=(12, 9), resolution=0.4, sensors="mixed"))
     region = MapConfig(resolution=0.4)
-    octree = sums_of(scenario.frames, steps, num_classes, sensor, region)
+    octree = sum_of_scans(scenario.frames, steps, num_classes, sensor, region)
     expected = {}
     for frame in scenario.frames:
-        freed, hit = _expected(frame, sensor, region)
+        freed, hit = expected_cells(frame, sensor, region)
         for key in freed | hit.keys():
             change = np.full(num_classes, steps.miss)
             if key in hit:
@@ -120,7 +71,7 @@ def test_full_confidence_equals_no_confidences():
         (NUM_CLASSES, clamped_increments(sensor)), (NUM_CLASSES, unclamped_increments(sensor)),
         (1, clamped_increments(sensor)), (1, COUNT_SCANS),
     ):  # fmt: skip
-        maps = [cells_of(sums_of(frames, steps, num_classes, sensor, region)) for frames in (plain, sure)]
+        maps = [cells_of(sum_of_scans(frames, steps, num_classes, sensor, region)) for frames in (plain, sure)]
         assert maps[0] == maps[1]
 
 
@@ -182,7 +133,7 @@ def test_saturated_free_space_becomes_uniform_and_does_not_change():
     pose = np.eye(4)
     pose[:3, 3] = 0.8
     frame = CloudFrame("r", 0, points, np.zeros(len(points), np.uint8), pose)
-    octree = sums_of([frame] * 20, clamped_increments(SENSOR))
+    octree = sum_of_scans([frame] * 20, clamped_increments(SENSOR))
     centre = octree.find(np.array([storage.key_to_code(0, 0, 0) >> storage.CELL_BITS]))[0]
     assert octree.bricks.blocks[centre] == -1
     assert octree.bricks.values[centre] == -5.0
