@@ -23,7 +23,9 @@ def test_tables_files_and_figures(trio_result: Path, tmp_path: Path) -> None:
     assert (tmp_path / "e.csv").read_text() == evaluation_csv(expected)
     assert (tmp_path / "e.json").read_text() == evaluation_json(expected)
     for scores in expected.final.maps:
-        assert re.search(rf"{scores.robot_id} +{scores.mean_iou:.3f} +{scores.mean_iou_known:.3f} ", done.stdout)
+        assert re.search(
+            rf"{scores.robot_id} +{scores.truth.mean_iou:.3f} +{scores.truth.mean_iou_known:.3f} ", done.stdout
+        )
     for part in ("IoU of the classes", "Over time", "\nmean ", "\ncentral "):
         assert part in done.stdout
     made = [tmp_path / "e.csv", tmp_path / "e.json", *(tmp_path / "figures").iterdir()]

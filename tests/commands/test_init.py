@@ -32,7 +32,7 @@ def test_missing_inputs_are_reported(tmp_path: Path) -> None:
     team_file = tmp_path / "team.yaml"
     done = octoreplay("init", FIXTURES / "containers" / "foxglove_json.mcap", "-o", team_file)
     assert done.returncode == 0
-    assert "missing for a run: labels on " in done.stderr
+    assert "missing for a run: no LabelInfo names the labels on " in done.stderr
     (tmp_path / "empty.bag").touch()
     assert_fails(1, "the file is empty", "init", tmp_path / "empty.bag", "-o", tmp_path / "x.yaml")
     assert not (tmp_path / "x.yaml").exists()

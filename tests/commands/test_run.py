@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.result import open_result
-from support.command_line import assert_fails, command, octoreplay, octoreplay_process, wait_for
+from support.command_line import assert_fails, octoreplay, octoreplay_process, started, wait_for
 from support.fixture_paths import PAIR, PAIR_TEAM, TRIO
 
 
@@ -144,10 +143,10 @@ def test_an_interrupted_run_leaves_a_partial_result_and_the_old_result(tmp_path:
     out.write_text("the result of yesterday")
     # Settling takes so long that the run cannot end before the signal.
     arguments = ["run", PAIR_TEAM, "-o", out, "--settle", "100000", "--settle-max", "100000", "--state-every", "0.001"]
-    process = subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: partial.exists() and partial.stat().st_size > 20_000)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=120)
+    with started(*arguments) as process:
+        wait_for(lambda: partial.exists() and partial.stat().st_size > 20_000)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
     assert f"interrupted; the finished part is in {partial}" in errors
     assert out.read_text() == "the result of yesterday"

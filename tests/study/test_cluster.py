@@ -17,7 +17,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.study import cluster
 from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
-from support.command_line import command, octoreplay_process, wait_for
+from support.command_line import octoreplay_process, started, wait_for
 from support.fixture_paths import PAIR_TEAM
 from support.sweeps import QUICK, is_running, table
 
@@ -76,13 +76,11 @@ def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
 
 
 def test_a_lost_worker_and_a_failed_run_do_not_stop_the_sweep(dask: Cluster, tmp_path: Path) -> None:
-    arguments = command(
-        "sweep", PAIR_TEAM, "--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address
-    )
-    process = subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_for(lambda: bool(dask.children()))
-    dask.workers[0].kill()
-    out, err = process.communicate(timeout=120)
+    arguments = ("--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address)
+    with started("sweep", PAIR_TEAM, *arguments) as process:
+        wait_for(lambda: bool(dask.children()))
+        dask.workers[0].kill()
+        out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "(3 runs)" in out
     assert "failed: team=team, start=99, seed=0: no robot has a frame" in err
@@ -95,12 +93,12 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
     dask: Cluster, tmp_path: Path, number: signal.Signals
 ) -> None:
     arguments = ("-o", tmp_path / "d", "--scheduler", dask.address)
-    process = subprocess.Popen(command("sweep", PAIR_TEAM, *ENDLESS, *arguments), text=True, stderr=subprocess.PIPE)
-    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
-    running = dask.children()
-    assert len(running) == 1
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    with started("sweep", PAIR_TEAM, *ENDLESS, *arguments) as process:
+        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        running = dask.children()
+        assert len(running) == 1
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
         # A killed sweep cannot stop its workers. The next sweep removes the folder of unfinished results.
         done = octoreplay_process("sweep", PAIR_TEAM, *QUICK, *arguments)
@@ -113,11 +111,10 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
 
 
 def test_a_lost_scheduler_is_reported_in_one_sentence(dask: Cluster, tmp_path: Path) -> None:
-    arguments = command("sweep", PAIR_TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address)
-    process = subprocess.Popen(arguments, text=True, stderr=subprocess.PIPE)
-    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
-    dask.scheduler.kill()
-    _, err = process.communicate(timeout=120)
+    with started("sweep", PAIR_TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address) as process:
+        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        dask.scheduler.kill()
+        _, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert err.splitlines()[-1] == (
         f"error: {dask.address}: the connection to the scheduler was lost; finished runs are kept, and the same command"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from octoreplay.report import map_view
 from octoreplay.result import Result, open_result
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study import paper
-from support.command_line import command, octoreplay, wait_for
+from support.command_line import octoreplay, started, wait_for
 
 pytestmark = pytest.mark.long
 
@@ -145,11 +144,11 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
 
 def test_an_interrupt_leaves_nothing_half_written(tmp_path: Path) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
-    arguments = command("experiment", "paper", tmp_path / "paper", "--duration", 60)
-    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    wait_for((tmp_path / "paper" / ".team.partial").exists)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    arguments = ("experiment", "paper", tmp_path / "paper", "--duration", 60)
+    with started(*arguments) as process:
+        wait_for((tmp_path / "paper" / ".team.partial").exists)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     assert list((tmp_path / "paper").iterdir()) == []
 

@@ -25,7 +25,7 @@ from octoreplay.study.numbers import run_numbers
 from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
-from support.command_line import command, octoreplay, wait_for
+from support.command_line import octoreplay, started, wait_for
 from support.fixture_paths import PAIR, PAIR_TEAM
 from support.sweeps import QUICK, children, is_running, table
 
@@ -75,11 +75,9 @@ def test_the_folder_of_a_finished_sweep(whole: Path) -> None:
 
 def test_a_killed_sweep_continues_to_the_same_table(whole: Path, tmp_path: Path) -> None:
     arguments = (PAIR_TEAM, *GRID, "-o", tmp_path / "s", "--jobs", 1)
-    process = subprocess.Popen(command("sweep", *arguments), text=True)
-    wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(children(process)) == 1)
-    running = children(process)
-    process.kill()
-    process.wait()
+    with started("sweep", *arguments) as process:
+        wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(children(process)) == 1)
+        running = children(process)
     wait_for(lambda: not any(map(is_running, running)), 10)
     finished = rows_in(tmp_path / "s")
     assert 1 <= len(finished) < 4
@@ -95,14 +93,12 @@ def test_a_killed_sweep_continues_to_the_same_table(whole: Path, tmp_path: Path)
 def test_an_interrupted_sweep_ends_its_processes_and_reports_it(tmp_path: Path, number: signal.Signals) -> None:
     # Runs that do not stop settling.
     endless = ("--vary", "loss=0,0.25,0.5", "--settle", "100000", "--settle-max", "100000", *QUICK)
-    process = subprocess.Popen(
-        command("sweep", PAIR_TEAM, *endless, "-o", tmp_path / "s"), text=True, stderr=subprocess.PIPE
-    )
-    wait_for(lambda: any((tmp_path / "s" / "unfinished").glob("*/*.mcap")))
-    running = children(process)
-    assert running
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    with started("sweep", PAIR_TEAM, *endless, "-o", tmp_path / "s") as process:
+        wait_for(lambda: any((tmp_path / "s" / "unfinished").glob("*/*.mcap")))
+        running = children(process)
+        assert running
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
         wait_for(lambda: not any(map(is_running, running)), 10)
         return

@@ -7,10 +7,11 @@ import io
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -49,8 +50,24 @@ def octoreplay_process(*arguments: object, **environment: str) -> subprocess.Com
 
 
 def command(*arguments: object) -> list[str]:
-    """The words that start the command line as a process."""
+    """Return the words that start the command line as a process."""
     return [sys.executable, "-m", "octoreplay", *map(str, arguments)]
+
+
+@contextlib.contextmanager
+def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Start the command line as a process that reacts to SIGINT; it is killed at the end of the body."""
+    # Processes in the background of a shell ignore SIGINT, and so would their children.
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
