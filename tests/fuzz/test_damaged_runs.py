@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from support.command_line import octoreplay
 from support.fixture_paths import PAIR
 from support.log_damage import mcap_chunks
 
@@ -43,10 +42,7 @@ def test_a_run_of_damaged_logs_warns_once_for_each_log(tmp_path):
     for chunk in (chunks[20], chunks[25]):
         data[chunk.end - 3] ^= 1
     damaged.write_bytes(data)
-    done = subprocess.run(
-        [sys.executable, "-m", "octoreplay", "run", str(tmp_path / "team.yaml"), "-o", str(tmp_path / "out.mcap")],
-        text=True, capture_output=True, check=False, timeout=300,
-    )  # fmt: skip
+    done = octoreplay("run", tmp_path / "team.yaml", "-o", tmp_path / "out.mcap")
     assert done.returncode == 3, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith(f"warning: {tmp_path}")]
     assert sorted(lines) == [
