@@ -69,7 +69,7 @@ def test_clouds_that_cannot_be_imported_are_reported_in_one_sentence(walls: Path
     fails(2, r"in: the frames have no times; give a rate or a file of times", "import-clouds", walls, "-o", out)
     fails(2, r"a\.bag: the name of the output must end in \.mcap", "import-clouds", walls, "-o", tmp_path / "a.bag")
     (walls / "1.pcd").write_bytes((walls / "1.pcd").read_bytes()[:-30])
-    sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or take it out"
+    sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or remove it"
     fails(1, sentence, "import-clouds", walls, "-o", out, "--rate", 10)
     assert not out.exists()
 
