@@ -66,6 +66,6 @@ def test_refused_folders_of_clouds(walls: Path, tmp_path: Path) -> None:
         2, r"a\.bag: the name of the output must end in \.mcap", "import-clouds", walls, "-o", tmp_path / "a.bag"
     )
     (walls / "1.pcd").write_bytes((walls / "1.pcd").read_bytes()[:-30])
-    sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or take it out"
+    sentence = r"1\.pcd: is cut or damaged: .*; fetch it again or remove it"
     assert_fails(1, sentence, "import-clouds", walls, "-o", out, "--rate", 10)
     assert not out.exists()
