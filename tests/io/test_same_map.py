@@ -11,33 +11,24 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import octoreplay
 from fixtures.foxglove_messages import write_protobuf
-from fixtures.make_containers import (
+from fixtures.make_streams import PALETTE, SIDES, clouds, lidar_poses, scan_ranges
+from fixtures.scene import (
     CAMERA,
-    CONTAINERS,
     DEPTH,
     FOXGLOVE,
     FOXGLOVE_TYPES,
     INFO,
     JOINT,
-    JSON,
     LABELS,
-    PALETTE,
     ROS2,
-    SIDES,
     START_NS,
-    STREAMS,
     UNLABELLED,
-    Encoding,
     camera_poses,
-    clouds,
-    idl_definition,
     in_order,
-    lidar_poses,
     pose_entries,
     record,
-    scan_ranges,
-    write_mcap,
 )
+from fixtures.writers import JSON, Encoding, idl_definition, write_mcap
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
@@ -47,6 +38,7 @@ from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameCounts, SemanticClass
 from support import command_line, room
+from support.fixture_paths import CONTAINERS, STREAMS
 from support.log_factory import IDENTITY, SECOND, Entry
 from support.scan_maps import packet_of
 
