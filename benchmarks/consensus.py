@@ -18,7 +18,7 @@ from scenes import NUM_CLASSES
 
 from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.codec import decode_packet, encode_packet
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import Frame, Int64Array
@@ -30,6 +30,12 @@ BLOCK_EDGE = 8
 """Edge in cells of the blocks in which the share of never-hit space is counted."""
 WARM_TICKS = 3
 FRAMES_PER_ROBOT = 20
+_UPDATES = {
+    "gradient": Update.GRADIENT,
+    "natural": Update.NATURAL,
+    "bayes": Update.BAYES,
+    "local": Update.COPY,
+}
 
 
 def main() -> None:
@@ -40,7 +46,7 @@ def main() -> None:
         evidence = [robot_evidence(robot, options.resolution) for robot in range(NUM_ROBOTS)]
         cells = [octree.num_cells for octree in evidence]
         report.add(Row("cells a robot", float(np.mean(cells)), "", min(cells), max(cells)))
-        for rule in options.rule or ["gradient", "natural", "bayes", "local"]:
+        for rule in options.rule or _UPDATES:
             team = Team(evidence, rule, complete_graph)
             _add_full_tick(report, team, options.rounds)
             if rule != "local":
@@ -51,7 +57,7 @@ def main() -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--rule", action="append", choices=("gradient", "natural", "bayes", "local"))
+    parser.add_argument("--rule", action="append", choices=tuple(_UPDATES))
     parser.add_argument("--resolution", type=float, default=0.1, help="of the robots' maps (default: %(default)s)")
     parser.add_argument("--rest", type=int, default=40, help="ticks before few bricks change (default: %(default)s)")
     parser.add_argument("--ring-resolution", type=float, default=0.25, help="of the rings' maps (default: %(default)s)")
@@ -89,7 +95,7 @@ class Team:
         decoded = time.perf_counter()
         since = None if awake else self._last_tick
         steps = [self._step(robot, published, since) for robot in range(len(self.maps))]
-        self.max_change = max(team_step(steps, rule=self.rule, revision=self.tick_number))
+        self.max_change = max(team_step(steps, update=_UPDATES[self.rule], revision=self.tick_number))
         if self.rule == "bayes":
             for evidence, last in zip(self.evidence, self._last_evidence, strict=True):
                 changed = np.flatnonzero(evidence.revisions > self._last_tick)

@@ -30,7 +30,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from log_damage import CONTAINERS, damage_log, read_all
+from support.log_damage import CONTAINERS, damage_log, read_all
 
 BATCH = 100
 MEMORY_BYTES = 1 << 31
@@ -75,7 +75,7 @@ class Maps:
     results = ("map", "empty map", "refused", "failed")
 
     def __init__(self) -> None:
-        import hostile_logs
+        from support import hostile_logs
 
         self._logs = hostile_logs
         self.names = hostile_logs.LOGS

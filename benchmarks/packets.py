@@ -14,6 +14,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,12 +35,11 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import PacketFormat
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
-from octoreplay.mapping.kernels.storage import KEY_BITS
-from octoreplay.mapping.octree import SemanticOctree, leaf_list, leaf_values
+from octoreplay.mapping.octree import KEY_BITS, SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
+from octoreplay.mapping.streams import leaf_list, leaf_values
 from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array, TickMetrics
 from octoreplay.replay.exchange.messages import Source
-from octoreplay.replay.robots.robot import Robot
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
 from octoreplay.simulate.team import SimulationConfig, simulate_team
@@ -124,7 +124,7 @@ def _play(config: RunConfig, duration: float, watch: Watcher | None = None, blan
     start_ns = min(of_robot[0].stamp_ns for of_robot in frames)
     if blank_after < math.inf:
         frames = tuple(tuple(_blanked(f, start_ns + round(blank_after * 1e9)) for f in part) for part in frames)
-    session = Session(config, [_Stored(part) for part in frames], num_threads=2)
+    session = Session(config, [_Stored(part) for part in frames], ThreadPoolExecutor(2))
     ticks = []
     for tick in session.ticks():
         ticks.append(tick.metrics)
@@ -180,11 +180,6 @@ def _clean_run(rule: str, resolution: float, duration: float, packets: str, cont
 
 def _ids(config: RunConfig) -> tuple[str, ...]:
     return tuple(robot.robot_id for robot in config.robots)
-
-
-def _robots(session: Session) -> list[Robot]:
-    """The robots themselves: what they hold is in no metric."""
-    return session._robots  # noqa: SLF001 (users have no need of them, so there is no public way)
 
 
 def _worst(tick: TickMetrics) -> tuple[float, float]:
@@ -451,7 +446,7 @@ def _killed(report: Report, options: argparse.Namespace) -> None:
             return False
 
         run = _play(config, duration, keep)
-        robots = _robots(sessions[0])
+        robots = sessions[0].team.robots
         alive = [index for index in range(NUM_ROBOTS) if index != killed]
         maps = {index: _cells(robots[index].map) for index in alive}
         title = f"{rule}, a robot killed at {duration / 2:g} s"
@@ -507,7 +502,7 @@ def _flood_newcomer(report: Report, title: str, config: RunConfig, duration: flo
     graphs: list[nx.Graph] = []
 
     def watch(session: Session, tick: Tick) -> bool:
-        robots = _robots(session)
+        robots = session.team.robots
         if tick.number < back:
             return False
         if tick.number == back:

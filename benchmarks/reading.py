@@ -33,7 +33,8 @@ from scenes import cache_folder
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.io.messages.sensor_messages import convert
-from octoreplay.io.robots.discover import describe, resolve
+from octoreplay.io.robots.describe import describe
+from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.sensors.images import decode_depth, decode_labels

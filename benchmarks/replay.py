@@ -28,8 +28,10 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import RunSummary
+from octoreplay.replay.measure import TickMeasurer
 from octoreplay.replay.recorder import Recorder
-from octoreplay.replay.session import Progress, Session, replay_team
+from octoreplay.replay.run import Progress, replay_team
+from octoreplay.replay.session import Session
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 NUM_THREADS = 2
@@ -37,7 +39,7 @@ STAGES: tuple[tuple[str, type, tuple[str, ...]], ...] = (
     ("reading, decoding and inserting", Session, ("_integrate",)),
     ("publishing (encode and decode)", Session, ("_publish",)),
     ("iterating", Session, ("_iterate",)),
-    ("oracle and metrics", Session, ("_measure",)),
+    ("oracle and metrics", TickMeasurer, ("measure",)),
     ("writing the result", Recorder, ("record", "finish")),
     ("writing the result", ResultWriter, ("complete",)),
 )

@@ -1,4 +1,4 @@
-"""Who may import whom, and that a breach is seen."""
+"""Import contracts: they hold, and a breach of each is reported."""
 
 import os
 import shutil
@@ -15,29 +15,52 @@ TWIN_CONTRACT = """
 root_packages = ["octoreplay", "reference"]
 
 [[tool.importlinter.contracts]]
-name = "The reference twin shares no code with what it judges"
+name = "The reference twin shares no code with the package"
 type = "forbidden"
 source_modules = ["reference"]
 forbidden_modules = ["octoreplay.mapping", "octoreplay.replay"]
 ignore_imports = ["octoreplay -> octoreplay.**"]
 """
-"""Beside the contracts of pyproject.toml, because the twin is found among the tests only."""
+"""Contract of the reference twin. It is not in pyproject.toml because the twin is in the tests only."""
 
 BREACHES = {
-    "octoreplay.errors imports octoreplay.cli": ("errors.py", "from octoreplay import cli"),
-    "octoreplay.mapping imports octoreplay.io": ("mapping/__init__.py", "from octoreplay.io.robots import poses"),
-    "octoreplay.io imports octoreplay.mapping": ("io/robots/poses.py", "from octoreplay.mapping import kernels"),
-    "octoreplay.mapping imports mcap": ("mapping/__init__.py", "import mcap"),
+    "octoreplay.config.rules is not allowed to import octoreplay.config.run": (
+        "config/rules.py",
+        "from octoreplay.config import run",
+    ),
+    "octoreplay.io.messages is not allowed to import octoreplay.io.containers": (
+        "io/messages/ros_types.py",
+        "from octoreplay.io.containers import logs",
+    ),
+    "octoreplay.replay.exchange is not allowed to import octoreplay.replay.session": (
+        "replay/exchange/messages.py",
+        "from octoreplay.replay import session",
+    ),
+    "octoreplay.errors is not allowed to import octoreplay.cli": ("errors.py", "from octoreplay import cli"),
+    "octoreplay.mapping is not allowed to import octoreplay.io": (
+        "mapping/__init__.py",
+        "from octoreplay.io.robots import poses",
+    ),
+    "octoreplay.io is not allowed to import octoreplay.mapping": (
+        "io/robots/poses.py",
+        "from octoreplay.mapping import octree",
+    ),
+    "octoreplay.mapping is not allowed to import mcap": ("mapping/__init__.py", "import mcap"),
+    "octoreplay.evaluate.truth -> octoreplay.mapping.kernels.storage": (
+        "evaluate/truth.py",
+        "from octoreplay.mapping.kernels import storage",
+    ),
 }
+"""Text that import-linter reports: the module and the line that is added to it."""
 
 
 def check_contracts(config: Path, *folders: Path) -> subprocess.CompletedProcess[str]:
-    """Run import-linter on the packages in some folders."""
+    """Run import-linter on the packages in ``folders``."""
     code = (
         "import sys; from importlinter.cli import lint_imports;"
         " sys.exit(lint_imports(config_filename=sys.argv[1], no_cache=True))"
     )
-    # The working folder is where import-linter looks for packages first.
+    # import-linter searches packages in the working folder first.
     return subprocess.run(
         [sys.executable, "-c", code, str(config)],
         cwd=folders[0], env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
@@ -54,24 +77,23 @@ def add_line(path: Path, line: str) -> None:
     path.write_text(f"{path.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
 
 
-def test_the_contracts_hold() -> None:
+def test_contracts_hold() -> None:
     done = check_contracts(ROOT / "pyproject.toml", ROOT / "src")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("breach", BREACHES)
-def test_a_breach_is_seen(breach: str, tmp_path: Path) -> None:
+def test_breach_is_reported(breach: str, tmp_path: Path) -> None:
     package = copied(ROOT / "src" / "octoreplay", tmp_path / "octoreplay")
     file, line = BREACHES[breach]
     add_line(package / file, line)
     done = check_contracts(ROOT / "pyproject.toml", tmp_path)
     assert done.returncode == 1, done.stdout + done.stderr
-    importer, imported = breach.split(" imports ")
-    assert f"{importer} is not allowed to import {imported}" in done.stdout
+    assert breach in done.stdout
 
 
 @pytest.mark.parametrize("breach", ["", "from octoreplay.mapping import kernels", "import octoreplay.result"])
-def test_the_reference_twin_shares_no_code_with_what_it_judges(breach: str, tmp_path: Path) -> None:
+def test_reference_twin_shares_no_code_with_the_package(breach: str, tmp_path: Path) -> None:
     twin = copied(ROOT / "tests" / "reference", tmp_path / "reference")
     add_line(twin / "rules.py", breach)
     config = tmp_path / "contract.toml"

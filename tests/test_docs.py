@@ -10,7 +10,7 @@ import pytest
 
 from octoreplay import cli
 from octoreplay.config.parameters import PARAMETERS
-from octoreplay.evaluate.records import EvaluatedTick, MapScores
+from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
 from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
@@ -32,8 +32,8 @@ def test_every_metric_is_explained(record: type) -> None:
 
 
 def test_every_score_of_a_map_is_explained() -> None:
-    fields = {item.name for record in (MapScores, EvaluatedTick) for item in dataclasses.fields(record)}
-    assert fields - {"robot_id", "is_active", "tick", "seconds", "maps"} <= named("evaluation.md")
+    fields = {item.name for record in (MapScores, TruthScores, EvaluatedTick) for item in dataclasses.fields(record)}
+    assert fields - {"robot_id", "is_active", "truth", "tick", "seconds", "maps"} <= named("evaluation.md")
 
 
 def test_every_message_and_field_of_the_result_is_explained() -> None:

@@ -18,6 +18,6 @@ from octoreplay.errors import InputError, printable
          "put one of these lines:\n    depth_topic: /a\n    depth_topic: /b"),
     ],
 )  # fmt: skip
-def test_names_in_logs_cannot_control_the_terminal(text, shown):
+def test_control_characters_in_messages_are_escaped(text, shown):
     assert printable(text) == shown
     assert str(InputError(text)) == shown

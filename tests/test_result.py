@@ -1,4 +1,4 @@
-"""The Python API on stored results, on plain leaf lists in place of the octree."""
+"""Python API of stored results, with lists of leaves in place of the octree."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import leaf_list
 from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.result import Result, open_result
-from result_factory import CLASSES, SECOND, START, leaf_table, state, summary, team, tick_metrics, write_result
+from support import leaf_list
+from support.result_factory import CLASSES, SECOND, START, leaf_table, state, summary, team, tick_metrics, write_result
 
 LEAVES = leaf_table()
 
@@ -35,17 +35,17 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Result:
         yield opened
 
 
-def test_the_result_tells_what_was_run(result: Result, tmp_path: Path) -> None:
+def test_a_result_has_the_configuration_metrics_and_ticks_of_the_run(result: Result, tmp_path: Path) -> None:
     assert result.robots == ("alpha", "beta")
     assert result.class_table == CLASSES
-    assert result.config == team(tmp_path)
+    assert result.config == team(tmp_path).to_config()
     assert result.metrics == [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
     assert result.summary.stop_reason == summary(result.metrics).stop_reason
     assert result.stored_ticks("alpha") == [1, 2, 4]
     assert result.stored_ticks("beta") == [4]
 
 
-def test_history_gives_the_maps_of_every_stored_tick(result: Result) -> None:
+def test_history_yields_the_maps_of_every_stored_tick(result: Result) -> None:
     seen = []
     for maps in result.history():
         for robot_id, stored in maps.items():
@@ -57,18 +57,18 @@ def test_history_gives_the_maps_of_every_stored_tick(result: Result) -> None:
     assert seen == [("alpha", 1), ("alpha", 2), ("alpha", 4), ("beta", 4)]
 
 
-def test_a_result_without_the_centralised_map_says_so(result: Result) -> None:
+def test_a_missing_centralised_map_is_an_input_error(result: Result) -> None:
     with pytest.raises(InputError, match=r"holds no centralised map.*run the logs again"):
         result.map("central")
 
 
-def test_time_counts_from_tick_zero(result: Result) -> None:
+def test_times_count_from_tick_zero(result: Result) -> None:
     assert result.start_ns == START
     assert result.seconds(START + 3 * SECOND // 2) == 1.5
     assert result.time_ns(2.25) == START + 9 * SECOND // 4
 
 
-def test_a_map_is_a_key_frame_with_the_deltas_after_it(result: Result) -> None:
+def test_a_map_is_a_key_frame_and_its_deltas(result: Result) -> None:
     stored = result.map("alpha")
     assert (stored.robot_id, stored.tick, stored.stamp_ns) == ("alpha", 4, START + 4 * SECOND)
     assert (stored.resolution, stored.num_robots, stored.prior) == (0.2, 2, 0.0)
@@ -79,17 +79,17 @@ def test_a_map_is_a_key_frame_with_the_deltas_after_it(result: Result) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ask", "tick"),
+    ("selection", "tick"),
     [({"tick": 1}, 1), ({"tick": 2}, 2), ({"tick": 4}, 4), ({"at_ns": START + 3 * SECOND}, 2),
      ({"at_ns": START + 2 * SECOND - 1}, 1), ({"at_ns": START + 99 * SECOND}, 4)],
 )  # fmt: skip
-def test_any_stored_tick_can_be_asked_for(result: Result, ask: dict[str, int], tick: int) -> None:
-    stored = result.map("alpha", **ask)
+def test_maps_are_selected_by_tick_or_time(result: Result, selection: dict[str, int], tick: int) -> None:
+    stored = result.map("alpha", **selection)
     assert stored.tick == tick
     assert len(stored.leaves()) == {1: 1, 2: 2, 4: 4}[tick]
 
 
-def test_what_is_not_stored_is_one_sentence(result: Result) -> None:
+def test_maps_that_are_not_stored_are_input_errors(result: Result) -> None:
     with pytest.raises(InputError, match="no map of robot 'alpha' is stored at tick 3; stored nearby: 1, 2, 4"):
         result.map("alpha", tick=3)
     with pytest.raises(InputError, match="no map of robot 'beta' is stored up to the time asked for"):
@@ -100,7 +100,7 @@ def test_what_is_not_stored_is_one_sentence(result: Result) -> None:
         result.map("alpha", at_ns=START, tick=1)
 
 
-def test_points_are_answered(result: Result) -> None:
+def test_query_at_points(result: Result) -> None:
     answer = result.map("alpha").query([[0.15, 0.05, 0.1], [0.79, 0.01, 0.39], [2.1, 0.1, 0.1], [5.0, 5.0, 5.0]])
     np.testing.assert_array_equal(answer.log_odds, [*LEAVES.log_odds[[0, 1, 3]], [0, 0]])
     assert answer.log_odds.dtype == answer.probabilities.dtype == np.float32
@@ -112,22 +112,22 @@ def test_points_are_answered(result: Result) -> None:
 
 
 @pytest.mark.parametrize("points", [[1.0, 2.0, 3.0], [[1.0, 2.0]], np.zeros((2, 2, 3))])
-def test_points_of_another_shape_are_refused(result: Result, points: object) -> None:
+def test_points_with_another_shape_are_refused(result: Result, points: object) -> None:
     with pytest.raises(ValueError, match=r"points: expects an array \(P, 3\)"):
         result.map("alpha").query(points)
 
 
-def test_no_point_is_no_answer(result: Result) -> None:
+def test_query_without_points(result: Result) -> None:
     answer = result.map("alpha").query(np.zeros((0, 3)))
     assert answer.probabilities.shape == (0, 3)
     assert len(answer.labels) == 0
 
 
-def test_a_box_gives_the_leaves_that_overlap_it(result: Result) -> None:
+def test_a_box_query_returns_the_overlapping_leaves(result: Result) -> None:
     stored = result.map("alpha")
     found = stored.query_box((0.79, -1, -1), (1.05, 1, 1))
     assert found.centers.tolist() == LEAVES.centers[[1, 2]].tolist()
-    # Touching is not overlapping: leaf 0 ends where this box starts.
+    # Leaf 0 ends where this box starts, which is no overlap.
     assert len(stored.query_box((0.2, 0.0, 0.0), (0.39, 0.2, 0.2))) == 0
     assert len(stored.query_box((-9, -9, -9), (9, 9, 9))) == 4
     with pytest.raises(ValueError, match="every lower bound"):
@@ -140,7 +140,7 @@ def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.Mo
     leaf_list.install(monkeypatch)
     config = team(tmp_path).with_parameters({"prob_free": 0.6})
     prior = np.log(0.4 / 2 / 0.6)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         fill(writer)
         writer.complete(summary([tick_metrics(1)]))
     with open_result(str(tmp_path / "out.mcap")) as opened:
@@ -155,13 +155,12 @@ def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(box.log_odds, whole.log_odds[:1], rtol=1e-6)
 
 
-def test_a_map_that_cannot_be_read_is_named_with_its_file(tmp_path: Path) -> None:
-    """Here a packet of another version of the format."""
+def test_errors_in_stored_maps_name_the_file(tmp_path: Path) -> None:
     path = write_result(
         tmp_path, lambda writer: writer.write_state(state("alpha", 0, 1, b"OCTM\1" + bytes(39), key=True))
     )
     with open_result(path) as opened, pytest.raises(PacketError) as caught:
         opened.map("alpha")
     assert str(caught.value) == (
-        f"{path}: robot 'alpha': map packet of format version 1, this octoreplay reads version 3; run the logs again"
+        f"{path}: robot 'alpha': map packet of format version 1, this octoreplay reads version 3; replay the logs again"
     )

@@ -37,7 +37,7 @@ def test_pose_matrix_equals_scipy(quaternion, position):
 
 @given(quaternions, quaternions, st.floats(0, 1))
 def test_slerp_equals_scipy(first, second, fraction):
-    # Half a turn apart there are two shortest ways.
+    # Half a turn apart, both arcs are equally short.
     if abs(np.dot(first, second)) < 1e-3:
         return
     ours = Rotation.from_quat(slerp(first, second, fraction))
@@ -45,7 +45,7 @@ def test_slerp_equals_scipy(first, second, fraction):
     assert (ours * theirs.inv()).magnitude() < 1e-6
 
 
-def test_slerp_takes_the_shorter_way_and_ends_at_its_ends():
+def test_slerp_takes_the_shorter_arc():
     half = normalise((0.0, 0.0, 1.0, 1.0))
     negative = tuple(-value for value in half)
     assert slerp(IDENTITY, negative, 0.0) == pytest.approx(IDENTITY)
@@ -54,27 +54,27 @@ def test_slerp_takes_the_shorter_way_and_ends_at_its_ends():
 
 
 @given(quaternions, quaternions, positions, positions, st.floats(0, 1))
-def test_poses_are_interpolated_linearly_and_by_slerp(first, second, start, end, fraction):
+def test_interpolation_is_linear_in_position_and_slerp_in_rotation(first, second, start, end, fraction):
     position, quaternion = interpolate((start, first), (end, second), fraction)
     np.testing.assert_allclose(position, np.array(start) + fraction * (np.array(end) - start), atol=1e-9)
     assert quaternion == slerp(first, second, fraction)
 
 
 @pytest.mark.parametrize("bad", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (np.inf, 0, 0, 1), (1e200, 0, 0, 1e200)])
-def test_a_quaternion_without_direction_is_no_rotation(bad):
+def test_quaternions_of_length_0_and_not_finite_ones_are_refused(bad):
     assert normalise(bad) is None
-    with pytest.raises(ValueError, match="direction"):
+    with pytest.raises(ValueError, match="length 0 or is not finite"):
         transform_of((0, 0, 0, *bad))
 
 
 @given(quaternions, positions, st.floats(1e-2, 1e2))
-def test_seven_numbers_are_a_transform_whatever_the_quaternions_length(quaternion, position, length):
+def test_transform_of_seven_numbers_normalises_the_quaternion(quaternion, position, length):
     found = transform_of((*position, *(length * value for value in quaternion)))
     np.testing.assert_allclose(found, pose_matrix(position, quaternion), atol=1e-12)
 
 
 @given(quaternions)
-def test_the_quaternion_of_a_rotation_gives_the_rotation_back(quaternion):
+def test_rotation_to_quaternion_inverts_the_conversion_to_a_matrix(quaternion):
     rotation = Rotation.from_quat(quaternion).as_matrix()
     found = rotation_to_quaternion(rotation)
     assert found[3] >= 0
@@ -83,6 +83,6 @@ def test_the_quaternion_of_a_rotation_gives_the_rotation_back(quaternion):
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0], [0, -0.6, 0.8]])
-def test_half_turns_have_a_quaternion(axis):
+def test_rotation_to_quaternion_of_half_turns(axis):
     rotation = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
     np.testing.assert_allclose(Rotation.from_quat(rotation_to_quaternion(rotation)).as_matrix(), rotation, atol=1e-9)

@@ -1,7 +1,7 @@
-"""octoreplay: replays multi-robot logs into semantic octree maps that the team agrees on.
+"""octoreplay: replay of multi-robot logs into semantic octree maps with distributed consensus.
 
-The names below are the public ones; everything else may change between versions. They are imported when they are first
-used, so that ``import octoreplay`` and the command line's ``--help`` stay quick.
+Only the names in ``__all__`` are public; everything else may change between versions. They are imported at their first
+use, so that ``import octoreplay`` and ``octoreplay --help`` are fast.
 """
 
 import importlib
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
-    from octoreplay.replay.session import Progress, replay_team
+    from octoreplay.replay.run import Progress, replay_team
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.simulate.team import SimulationConfig, simulate_team
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
 
-_HOMES = {
+_MODULES = {
     "CheckRow": "evaluate.checks",
     "ClassTable": "records",
     "ConfigError": "errors",
@@ -38,7 +38,7 @@ _HOMES = {
     "OutputError": "errors",
     "PacketError": "errors",
     "PointQuery": "result",
-    "Progress": "replay.session",
+    "Progress": "replay.run",
     "Result": "result",
     "ResultComparison": "evaluate.comparison",
     "RobotConfig": "config.robot",
@@ -58,12 +58,12 @@ _HOMES = {
     "load_team_file": "config.team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
-    "replay_team": "replay.session",
+    "replay_team": "replay.run",
     "resolve": "io.robots.discover",
     "run_sweep": "study.sweep",
     "simulate_team": "simulate.team",
 }
-"""The module that each public name comes from."""
+"""Module of each public name."""
 
 __all__ = [
     "CheckRow", "ClassTable", "ConfigError", "Evaluation", "InputError", "LeafTable", "OctoreplayError", "OutputError",
@@ -75,11 +75,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported at its first use."""
-    home = _HOMES.get(name)
-    if home is None:
+    """Import a public name at its first use."""
+    module = _MODULES.get(name)
+    if module is None:
         raise AttributeError(f"module 'octoreplay' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f"octoreplay.{home}"), name)
+    value = getattr(importlib.import_module(f"octoreplay.{module}"), name)
     globals()[name] = value
     return value
 

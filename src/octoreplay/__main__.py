@@ -1,4 +1,4 @@
-"""``python -m octoreplay``: the command line."""
+"""Entry point of ``python -m octoreplay``."""
 
 from octoreplay.cli import main
 

@@ -1,8 +1,8 @@
-"""The command line: one group of the commands in ``commands/``, and the exit code of each end.
+"""Command line: the group of the commands in ``commands/``, and the mapping from errors to exit codes.
 
-Only this module and the commands print or exit. Exit codes: 0 good; 1 input or run error, or a failed check; 2 usage or
-configuration; 3 finished, but data was lost; 130 interrupted. Whatever a command needs is imported when it runs, so
-that ``--help`` is quick.
+Only this module and the commands print or exit. Exit codes: 0 success; 1 input or run error, or a failed check; 2 wrong
+usage or configuration; 3 finished, but data was lost; 130 interrupted. Commands import their dependencies when they
+run, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from octoreplay.errors import ConfigError, OctoreplayError
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="octoreplay")
 def cli() -> None:
-    """Replay the logs of a robot team into semantic octree maps that the team agrees on.
+    """Replay the logs of a robot team into semantic octree maps and run a distributed consensus on them.
 
-    Start with "octoreplay demo". Exit codes: 0 good; 1 input or run error, or a failed check; 2 usage or configuration;
-    3 finished, but data was lost; 130 interrupted.
+    Start with "octoreplay demo". Exit codes: 0 success; 1 input or run error, or a failed check; 2 wrong usage or
+    configuration; 3 finished, but data was lost; 130 interrupted.
     """
 
 
@@ -39,7 +39,7 @@ for _command in (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit with its code; SIGTERM ends a run as Ctrl-C does."""
+    """Run the command line and exit with its code. SIGTERM has the same effect as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.basicConfig(format="%(message)s")
     logging.getLogger("octoreplay").setLevel(logging.INFO)
@@ -47,14 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _exit_code(arguments: Sequence[str] | None) -> int:
-    """Run one command; every failure becomes one sentence on stderr and an exit code."""
+    """Run one command and return its exit code; errors are reported in one sentence on stderr."""
     try:
         code = cli.main(args=arguments, prog_name="octoreplay", standalone_mode=False)
     except click.ClickException as error:
         error.show()
         return error.exit_code
     except (KeyboardInterrupt, click.Abort) as error:
-        # click turns a KeyboardInterrupt into Abort and keeps it as the cause.
+        # click raises Abort from a KeyboardInterrupt.
         click.echo(str(error) or str(error.__cause__ or "") or "interrupted", err=True)
         return EXIT_INTERRUPTED
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""The errors that octoreplay raises on purpose.
+"""Exceptions of octoreplay.
 
 ::
 
@@ -6,7 +6,7 @@
     +-- InputError            a log, a result or a data folder cannot be used        (exit code 1)
     +-- OutputError           a file cannot be written                               (exit code 1)
     +-- ConfigError           an option, a team file or a parameter is wrong         (exit code 2)
-    +-- PacketError           bytes that are not a map packet this version can read  (exit code 1)
+    +-- PacketError           bytes are not a map packet that this version can read  (exit code 1)
 """
 
 import difflib
@@ -15,14 +15,14 @@ from collections.abc import Iterable
 
 
 class OctoreplayError(Exception):
-    """Base of all errors that octoreplay raises on purpose; its text is one sentence for the user."""
+    """Base class of octoreplay's exceptions; the text is one sentence for the user."""
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text))
 
 
 class InputError(OctoreplayError):
-    """A log, a result or a data folder is missing, damaged or lacks what a run needs."""
+    """A log, a result or a data folder is missing, damaged or incomplete."""
 
 
 class OutputError(OctoreplayError):
@@ -34,13 +34,13 @@ class ConfigError(OctoreplayError):
 
 
 class PacketError(OctoreplayError):
-    """Bytes that are no map packet, are damaged, or come from a newer format version."""
+    """Bytes are not a map packet, are damaged, or have another format version."""
 
 
 def printable(text: str) -> str:
-    """A text for a terminal: names in logs may hold anything, and what controls a terminal is escaped as in Python.
+    """Return a text that is safe to print: names in logs may contain control characters, which are escaped.
 
-    Lines that are indented, as candidates are, stay lines of their own.
+    Line breaks before an indented line are kept, because messages list candidates in such lines.
     """
     if text.isprintable():
         return text
@@ -49,6 +49,6 @@ def printable(text: str) -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """The end of a sentence: '; did you mean ...' with the nearest known name, or nothing."""
+    """Return the end of a sentence, '; did you mean ...?' with the most similar known name, or an empty string."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""

@@ -1,4 +1,4 @@
-"""What log-odds say: class posteriors, labels, and the team posterior of an agreed map."""
+"""Posterior probabilities and labels from log-odds, and the team posterior of a consensus map."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import numpy as np
 
 from octoreplay.records import FloatArray, UInt8Array
 
+TIE_TOLERANCE = 1e-3
+"""A label agrees with a reference where the reference's log-odds of the label are this close to its largest."""
+
 
 def class_probabilities(log_odds: FloatArray) -> FloatArray:
-    """Probabilities of free and the classes 1..C: (P, C + 1) in the precision of ``log_odds`` (P, C).
+    """Return the probabilities (P, C + 1) of free and of the classes 1..C, from ``log_odds`` (P, C), same dtype.
 
-    The softmax of [0, log_odds], shifted by the row's maximum so that nothing overflows.
+    They are softmax([0, log_odds]), shifted by the row's maximum so that nothing overflows.
     """
     full = np.zeros((log_odds.shape[0], log_odds.shape[1] + 1), dtype=log_odds.dtype)
     full[:, 1:] = log_odds
@@ -21,7 +24,7 @@ def class_probabilities(log_odds: FloatArray) -> FloatArray:
 
 
 def best_labels(log_odds: FloatArray) -> UInt8Array:
-    """The most probable class_id per row, 0 for free: (P,) uint8 from (P, C). A tie goes to the lower id."""
+    """Return the most probable class_id (P,) uint8, 0 for free, from ``log_odds`` (P, C). Ties go to the lower id."""
     if log_odds.shape[1] == 0:
         return np.zeros(len(log_odds), dtype=np.uint8)
     best = np.argmax(log_odds, axis=1)
@@ -30,12 +33,20 @@ def best_labels(log_odds: FloatArray) -> UInt8Array:
 
 
 def label_probabilities(log_odds: FloatArray) -> FloatArray:
-    """The probability of each row's most probable class: (P,) from (P, C)."""
-    largest = np.maximum(log_odds.max(axis=1, initial=0.0), 0.0)
-    total: FloatArray = np.exp(-largest) + np.exp(log_odds - largest[:, None]).sum(axis=1)
-    return 1.0 / total
+    """Return the probability (P,) of the most probable class, from ``log_odds`` (P, C), same dtype."""
+    return 1.0 / shifted_exp_sum(log_odds)
+
+
+def shifted_exp_sum(log_odds: FloatArray, *, class_axis: int = 1) -> FloatArray:
+    """Return the sum (P,) of exp(h_c - max h) over free and the classes: 1 / the probability of the most probable one.
+
+    ``log_odds`` is (P, C), or (C, P) with class_axis 0; the result has its dtype.
+    """
+    largest = log_odds.max(axis=class_axis, initial=0.0)
+    total: FloatArray = np.exp(-largest) + np.exp(log_odds - np.expand_dims(largest, class_axis)).sum(axis=class_axis)
+    return total
 
 
 def team_log_odds(log_odds: FloatArray, prior: float, num_robots: int) -> FloatArray:
-    """h_0 + N (h - h_0): the evidence of N robots from the mean that consensus leaves at each, same shape and dtype."""
+    """Return h_0 + N (h - h_0), same shape and dtype: the posterior of N robots from their consensus mean h."""
     return prior + num_robots * (log_odds - prior)

@@ -1,4 +1,4 @@
-"""The values that cross folders: frames, class tables, leaf tables and metrics.
+"""Values that several packages share: frames, class tables, leaf tables and metrics.
 
 Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` maps coordinates of frame b to frame a.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, field, fields
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,23 +21,31 @@ Float32Array: TypeAlias = npt.NDArray[np.float32]
 Float64Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Color: TypeAlias = tuple[int, int, int]
+ArrayT = TypeVar("ArrayT", bound=npt.NDArray[Any])
 
 CENTRAL = "central"
-"""The name under which a result holds the centralised map, the sum of all robots' evidence."""
+"""Name of the centralised map in a result: the sum of all robots' evidence."""
 
 NO_CLASS = 0
-"""The class_id of a measured point that carries no usable label: it frees its ray and hits nothing."""
+"""The class_id of a measured point without a usable label: it frees its ray and hits nothing."""
 
 CONVERGED = "converged"
-"""The ``stop_reason`` of a run whose maps came to rest."""
+"""The ``stop_reason`` of a run in which the maps converged."""
+
+
+def read_only(array: ArrayT) -> ArrayT:
+    """Return a read-only view of an array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Pinhole intrinsics in pixels; z looks forward, x right, y down (REP 103 optical).
+    """Pinhole intrinsics [pixel]; z points forward, x right, y down (REP 103 optical frame).
 
-    ``slopes`` is (2, height, width) float32 where the lens distorts: x / z and y / z of every pixel's ray, in place of
-    (u - cx) / fx and (v - cy) / fy, NaN where no ray of the lens model hits a pixel.
+    ``slopes`` (2, height, width) float32, for lenses with distortion, are x / z and y / z of each pixel's ray. They
+    replace (u - cx) / fx and (v - cy) / fy, and are NaN where the lens model has no ray for the pixel.
     """
 
     width: int
@@ -51,10 +59,11 @@ class CameraModel:
 
 @dataclass(frozen=True, eq=False)
 class BodyBox:
-    """A box in which a scan's points belong to a robot: its own body, or another robot's.
+    """Box around a robot's body, for points of a scan that belong to the scanning robot or to another robot.
 
-    ``low`` and ``high`` are (3,) in metres in the box's frame, and ``T_box_team`` (4, 4) float64 maps the team's frame
-    to it. Points in an own box carry no information; points in another's free their ray and hit nothing.
+    ``low`` and ``high`` (3,) are its corners in the box's frame [m]; ``T_box_team`` (4, 4) float64 maps the team's
+    frame to the box's frame. Points in the robot's own box carry no information; points in another robot's box free
+    their ray and hit nothing.
     """
 
     low: Float64Array
@@ -69,8 +78,8 @@ class DepthFrame:
 
     ``depth_image`` is (H, W), uint16 or float32; metres along z = value x ``depth_unit``.
     ``class_image`` is (H, W) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels (all points class 1).
-    ``confidence_image`` is (H, W) uint8: how sure each label is, in 255ths; None where all are sure.
-    ``T_team_sensor`` is (4, 4) float64; points in ``boxes`` are a robot's.
+    ``confidence_image`` is (H, W) uint8: label confidences in 1 / 255; None for full confidence.
+    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots.
     """
 
     robot_id: str
@@ -90,8 +99,8 @@ class CloudFrame:
 
     ``points`` is (P, 3) float32 or float64 in the sensor's frame; NaN rows carry no information.
     ``class_ids`` is (P,) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels.
-    ``confidences`` is (P,) uint8: how sure each label is, in 255ths; None where all are sure.
-    ``T_team_sensor`` is (4, 4) float64; points in ``boxes`` are a robot's.
+    ``confidences`` is (P,) uint8: label confidences in 1 / 255; None for full confidence.
+    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots.
     """
 
     robot_id: str
@@ -108,9 +117,9 @@ Frame: TypeAlias = DepthFrame | CloudFrame
 
 @dataclass(frozen=True)
 class SemanticClass:
-    """One occupied class: its id 1..C, name, colour (r, g, b in 0..255) and the raw labels that mean it.
+    """Occupied class: id 1..C, name, colour (r, g, b in 0..255), and the raw labels that map to it.
 
-    ``raw_colors`` are the colours that mean it in colour-coded label images: its own colour unless given.
+    ``raw_colors`` are the colours that map to it in colour-coded label images; by default its own colour.
     """
 
     class_id: int
@@ -126,7 +135,7 @@ class SemanticClass:
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The occupied classes of a team, in order of class_id, and the raw labels and colours of images to ignore."""
+    """Occupied classes of a team in the order of class_id, and the raw labels and colours to ignore."""
 
     classes: tuple[SemanticClass, ...]
     ignored_raw_labels: tuple[int, ...] = ()
@@ -134,7 +143,7 @@ class ClassTable:
 
     @property
     def num_classes(self) -> int:
-        """C, the number of occupied classes (free space not counted)."""
+        """Number C of occupied classes, without free space."""
         return len(self.classes)
 
     @property
@@ -150,10 +159,11 @@ class ClassTable:
 
 @dataclass(frozen=True, eq=False)
 class LeafTable:
-    """The leaves of one octree, in Morton order.
+    """Leaves of one octree in Morton order.
 
-    ``centers`` (L, 3) float64, metres in the team's frame; ``sizes`` (L,) float64, edge lengths in metres;
-    ``log_odds`` (L, C) float32, log p(c) / p(free) for the classes 1..C, the prior included.
+    - ``centers`` (L, 3) float64: in the team's frame [m].
+    - ``sizes`` (L,) float64: edge lengths [m].
+    - ``log_odds`` (L, C) float32: log p(c) / p(free) for the classes 1..C, including the prior.
     """
 
     centers: Float64Array
@@ -166,11 +176,13 @@ class LeafTable:
 
 @dataclass
 class FrameCounts:
-    """What became of one robot's sensor messages while reading; every message is counted once.
+    """Numbers of one robot's sensor messages by outcome of reading; every message is counted once.
 
-    ``first_missing`` says which message was the first that came too late, or had no label or pose, by the count's name;
-    ``unknown_label_pixels`` are numbers of pixels or points by raw label, ``unknown_colors`` by colour, 0xRRGGBB;
-    ``truncated_files`` has a sentence for each log that is cut or damaged, which says what was skipped.
+    - ``first_missing``: description of the first late message and of the first without label or pose, by the name of
+      the count.
+    - ``unknown_label_pixels``, ``unknown_colors``: numbers of pixels or points with an unknown label, by raw label and
+      by colour 0xRRGGBB.
+    - ``truncated_files``: one sentence for each cut or damaged log, with the part that was skipped.
     """
 
     used: int = 0
@@ -186,18 +198,18 @@ class FrameCounts:
 
     @property
     def skipped(self) -> int:
-        """Sensor messages that were read and not mapped."""
+        """Number of sensor messages that were read but not mapped."""
         return self.no_label + self.no_pose + self.late + self.undecodable
 
     @property
     def lost_data(self) -> bool:
-        """True when something in the log could not be used; a duplicate is no loss."""
+        """True where part of the log could not be used; duplicates do not count."""
         return bool(self.skipped or self.truncated_files)
 
 
 @dataclass(frozen=True)
 class RobotMetrics:
-    """One robot at one tick. Bytes of packets and maps are of what it published in this tick (0 while dormant)."""
+    """Metrics of one robot at one tick. Bytes are those of the map published in this tick (0 while dormant)."""
 
     robot_id: str
     active: bool
@@ -220,7 +232,7 @@ class RobotMetrics:
 
 @dataclass(frozen=True)
 class LinkMetrics:
-    """One directed link in one tick: what became of its packets. Acknowledgements count in bytes only."""
+    """Packets of one directed link in one tick, by outcome. Acknowledgements count in bytes only."""
 
     sender: str
     receiver: str
@@ -239,7 +251,7 @@ class LinkMetrics:
 
 @dataclass(frozen=True)
 class TickMetrics:
-    """The team after one tick; the definitions are in docs/metrics.md."""
+    """Metrics of the team after one tick; docs/metrics.md defines them."""
 
     tick: int
     stamp_ns: int
@@ -256,12 +268,12 @@ class TickMetrics:
 
     @property
     def counted_robots(self) -> tuple[RobotMetrics, ...]:
-        """The active robots, of which the worst or the mean is taken; all where none is active."""
+        """Robots over which team figures are computed: the active ones, or all where none is active."""
         return tuple(robot for robot in self.robots if robot.active) or self.robots
 
 
 class LinkTotals:
-    """Each directed link over many ticks: sums, and the mean of ``bytes_per_second``."""
+    """Totals of each directed link over many ticks: sums, and the mean of ``bytes_per_second``."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, str], list[float]] = {}
@@ -277,7 +289,7 @@ class LinkTotals:
             self._num_ticks[ends] = self._num_ticks.get(ends, 0) + 1
 
     def totals(self) -> tuple[LinkMetrics, ...]:
-        """The links in the order in which they first occurred."""
+        """Return the totals of the links in the order in which they first occurred."""
         names = [item.name for item in fields(LinkMetrics)]
 
         def total(ends: tuple[str, str], sums: list[float]) -> LinkMetrics:
@@ -289,9 +301,9 @@ class LinkTotals:
 
 @dataclass(frozen=True)
 class MapState:
-    """One robot's map as stored in a result: a packet of the map codec, whole (key frame) or as a delta.
+    """Map of one robot as stored in a result: a packet of the map codec, either a key frame or a delta.
 
-    A delta holds the bricks that changed since the state with ``base_sequence`` of the same robot.
+    A delta holds the bricks that changed since the state ``base_sequence`` of the same robot.
     """
 
     robot_id: str
@@ -305,7 +317,7 @@ class MapState:
 
 @dataclass(frozen=True, eq=False)
 class RobotPose:
-    """Where one robot's sensor is: (4, 4) float64 in the team's frame."""
+    """Pose of one robot's sensor in the team's frame: (4, 4) float64."""
 
     robot_id: str
     T_team_sensor: Float64Array
@@ -313,10 +325,7 @@ class RobotPose:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a whole run came to; the wall time is for the reader's eyes and never stored in the result.
-
-    ``links`` are the directed links over all ticks.
-    """
+    """Summary of a run. ``links`` are the directed links over all ticks; the wall time is not stored in the result."""
 
     num_ticks: int
     num_settling_ticks: int
@@ -336,5 +345,5 @@ class RunSummary:
 
     @property
     def lost_data(self) -> bool:
-        """True when any log was cut or any frame could not be used."""
+        """True where any log was cut or any frame could not be used."""
         return any(counts.lost_data for counts in self.frame_counts.values())

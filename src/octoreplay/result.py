@@ -1,11 +1,11 @@
-"""The Python API on a stored result: any robot's map at any stored tick as arrays, and what is where.
+"""Python API of a stored result: any robot's map at any stored tick as arrays, and queries at points and in boxes.
 
 ::
 
     with open_result(Path("result.mcap")) as result:
         stored = result.map("husky_1")                       # the last map; at_ns=... or tick=... for an earlier one
         leaves = stored.leaves()                             # centres, sizes, log-odds
-        answer = stored.query(np.array([[1.0, 2.0, 0.5]]))   # what is there, and how sure
+        answer = stored.query(np.array([[1.0, 2.0, 0.5]]))   # labels and probabilities
 """
 
 from __future__ import annotations
@@ -43,12 +43,20 @@ from octoreplay.records import (
 
 @dataclass(frozen=True, eq=False)
 class PointQuery:
-    """What a map says about P points.
+    """State of a map at P points.
 
-    ``log_odds`` (P, C) float32, log p(c) / p(free), the prior included; ``probabilities`` (P, C + 1) float32, free
-    first; ``labels`` (P,) uint8, the most probable class_id, 0 for free; ``known`` (P,) bool, False where the map holds
-    nothing and the rest is the prior; ``sizes`` (P,) float64, edge of the leaf around the point in metres, 0 where
-    unknown.
+    Attributes
+    ----------
+    log_odds : (P, C) float32
+        log p(c) / p(free), including the prior.
+    probabilities : (P, C + 1) float32
+        Probabilities, free first.
+    labels : (P,) uint8
+        Most probable class_id, 0 for free.
+    known : (P,) bool
+        False in unknown space, where the other fields are those of the prior.
+    sizes : (P,) float64
+        Edge of the leaf around the point in metres, 0 in unknown space.
     """
 
     log_odds: Float32Array
@@ -59,10 +67,10 @@ class PointQuery:
 
 
 class StoredMap:
-    """One robot's map after one tick, or the centralised one (``robot_id`` 'central').
+    """Map of one robot after one tick, or the centralised map (``robot_id`` 'central').
 
-    With ``team_posterior`` the methods give h_0 + N (h - h_0), the posterior of all N robots' evidence that an agreed
-    map stands for, in place of the robot's own h.
+    With ``team_posterior`` the methods return h_0 + N (h - h_0) instead of the robot's h: after consensus, the
+    posterior of the evidence of all N robots.
     """
 
     def __init__(
@@ -81,12 +89,12 @@ class StoredMap:
         return float(self.octree.resolution)
 
     def leaves(self, *, team_posterior: bool = False) -> LeafTable:
-        """All leaves, free ones included, in Morton order."""
+        """Return all leaves, including free ones, in Morton order."""
         table = self.octree.leaves(prior=self.prior)
         return LeafTable(table.centers, table.sizes, self._scaled(table.log_odds, team_posterior))
 
     def query(self, points: npt.ArrayLike, *, team_posterior: bool = False) -> PointQuery:
-        """What is at points (P, 3), metres in the team's frame. Raises ValueError for another shape."""
+        """Return the state at points (P, 3), in metres in the team's frame. Raises ValueError for another shape."""
         coords = np.asarray(points, dtype=np.float64)
         if coords.ndim != 2 or coords.shape[1] != 3:
             raise ValueError(f"points: expects an array (P, 3), got {coords.shape}")
@@ -96,9 +104,9 @@ class StoredMap:
         return PointQuery(log_odds, probabilities, best_labels(log_odds), known, np.where(known, sizes, 0.0))
 
     def query_box(self, lower: npt.ArrayLike, upper: npt.ArrayLike, *, team_posterior: bool = False) -> LeafTable:
-        """The leaves that overlap a box with corners ``lower`` and ``upper`` (3,), metres in the team's frame.
+        """Return the leaves that overlap a box with corners ``lower`` and ``upper`` (3,), metres in the team's frame.
 
-        Raises ValueError where a corner is not three numbers or the corners are in the wrong order.
+        Raises ValueError where a corner does not have three numbers, or a lower bound is above its upper bound.
         """
         low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
         if low.shape != (3,) or high.shape != (3,):
@@ -111,7 +119,7 @@ class StoredMap:
         return LeafTable(table.centers[inside], table.sizes[inside], table.log_odds[inside])
 
     def _scaled(self, log_odds: Float32Array, team_posterior: bool) -> Float32Array:
-        """The robot's log-odds, or the team's."""
+        """Log-odds of the robot, or of the team posterior."""
         if not team_posterior:
             return log_odds
         scaled: FloatArray = team_log_odds(log_odds, self.prior, self.num_robots)
@@ -119,7 +127,7 @@ class StoredMap:
 
 
 class Result:
-    """A stored result; a context manager. ``open_result`` makes one."""
+    """Stored result, opened by ``open_result``; a context manager."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -139,66 +147,67 @@ class Result:
 
     @property
     def robots(self) -> tuple[str, ...]:
-        """The team's robots in their order."""
+        """Robots of the team in their order."""
         return self._reader.robots
 
     @property
     def class_table(self) -> ClassTable:
-        """The occupied classes with their names and colours."""
+        """Occupied classes with their names and colours."""
         return self._reader.class_table
 
     @property
     def config(self) -> RunConfig:
-        """The configuration of the run."""
+        """Configuration of the run."""
         return self._reader.config
 
     @property
     def is_complete(self) -> bool:
-        """False for what an interrupted run left."""
+        """False for the result of an interrupted run."""
         return self._reader.is_complete
 
     @property
     def inputs(self) -> dict[str, tuple[int, str, str]]:
-        """Size in bytes, method and fingerprint of every input file by its path, in the order of the robots."""
+        """Size in bytes, fingerprint method and fingerprint of every input file by path, in the order of the robots."""
         return self._reader.inputs
 
     @cached_property
     def metrics(self) -> list[TickMetrics]:
-        """The metrics of all ticks, in order."""
+        """Metrics of all ticks, in order."""
         return self._reader.metrics()
 
     @cached_property
     def summary(self) -> RunSummary:
-        """What the run came to; the wall time is not stored and is NaN."""
+        """Summary of the run; the wall time is not stored and is NaN."""
         return self._reader.summary(self.metrics)
 
     @cached_property
     def start_ns(self) -> int:
-        """t_0, the time of tick 0. Raises InputError where no tick is stored."""
+        """Time t_0 of tick 0. Raises InputError for a result without a tick."""
         if not self.metrics:
             raise InputError(f"{self.path}: holds no tick; the run was interrupted before its first one")
         first = self.metrics[0]
         return first.stamp_ns - first.tick * round(self.config.network.publish_period * 1e9)
 
     def seconds(self, stamp_ns: int) -> float:
-        """Seconds from the run's start to a time."""
+        """Return the time of a stamp since the run's start in seconds."""
         return (stamp_ns - self.start_ns) / 1e9
 
     def time_ns(self, seconds: float) -> int:
-        """The time so many seconds after the run's start."""
+        """Return the stamp at a time since the run's start in seconds."""
         return self.start_ns + round(seconds * 1e9)
 
     def stored_ticks(self, robot_id: str) -> list[int]:
-        """The ticks at which a robot's map is stored. Raises InputError for an unknown robot."""
+        """Return the ticks at which a robot's map is stored. Raises InputError for an unknown robot."""
         return [tick for tick, _ in self._reader.state_times(robot_id)]
 
     def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
-        """A robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
+        """Return a robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
-        ``robot_id`` 'central' gives the centralised map: the sum of all robots' evidence up to then.
+        ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then.
 
-        Raises InputError for an unknown robot, a tick at which no map is stored, or a time before the first stored map.
-        Raises PacketError where a stored map is damaged, or of a version that is not read.
+        Raises InputError for an unknown robot, a tick without a stored map, or a time before the first stored map.
+        Raises PacketError where a stored map is damaged or has another format version.
+        Raises ValueError for both ``at_ns`` and ``tick``.
         """
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
@@ -209,13 +218,13 @@ class Result:
             for state in states[1:]:
                 apply_delta(octree, state.data)
         except PacketError as error:
-            raise PacketError(f"{self.path}: robot '{robot_id}': {error}; run the logs again") from error
+            raise PacketError(f"{self.path}: robot '{robot_id}': {error}; replay the logs again") from error
         return self._stored_map(octree, states[-1])
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
-        """All maps at every stored tick in turn, by robot_id; with 'central' where the result holds it.
+        """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
 
-        The octrees are changed in place by the next step. Raises as ``map`` does.
+        The next step changes the octrees in place. Raises PacketError as ``map`` does.
         """
         octrees: dict[str, SemanticOctree] = {}
         maps: dict[str, StoredMap] = {}
@@ -230,20 +239,20 @@ class Result:
                 elif state.robot_id in octrees:
                     apply_delta(octrees[state.robot_id], state.data)
                 else:
-                    raise PacketError("its first state is a delta")
+                    raise PacketError("the first stored state is a delta")
             except PacketError as error:
-                raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; run the logs again") from error
+                raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; replay the logs again") from error
             maps[state.robot_id] = self._stored_map(octrees[state.robot_id], state)
         if maps:
             yield maps
 
     def _stored_map(self, octree: SemanticOctree, state: MapState) -> StoredMap:
-        """A map as it is after a state; the centralised one is the posterior of all evidence already."""
+        """Map after a stored state; the centralised one already is the posterior of all evidence, so its N is 1."""
         num_robots = 1 if state.robot_id == CENTRAL else len(self.robots)
         return StoredMap(octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots)
 
     def _stamp_of(self, robot_id: str, tick: int) -> int:
-        """The time of a robot's map stored at a tick."""
+        """Stamp of a robot's map stored at a tick."""
         stamp_ns = self._reader.state_stamp(robot_id, tick)
         if stamp_ns is None:
             near = sorted(sorted(self.stored_ticks(robot_id), key=lambda stored: abs(stored - tick))[:6])
@@ -255,5 +264,5 @@ class Result:
 
 
 def open_result(path: str | Path) -> Result:
-    """A result file to ask. Raises InputError for a file that is missing, damaged or no octoreplay result."""
+    """Open a result file. Raises InputError for a file that is missing, damaged or not an octoreplay result."""
     return Result(Path(path))

@@ -1,4 +1,4 @@
-"""Rigid transforms: positions in metres, quaternions (x, y, z, w) of length 1, matrices (4, 4) float64.
+"""Rigid transforms: positions [m], unit quaternions (x, y, z, w), matrices (4, 4) float64.
 
 ``T_a_b`` maps coordinates of frame b to frame a.
 """
@@ -18,12 +18,12 @@ Position: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Pose: TypeAlias = tuple[Position, Quaternion]
 
-# Below this angle's cosine distance sin(angle) loses digits, and the straight line between the quaternions is as good.
+# For closer rotations sin(angle) loses digits, and linear interpolation of the quaternions is as accurate.
 _NEARLY_PARALLEL = 1.0 - 1e-9
 
 
 def normalise(quaternion: Sequence[float]) -> Quaternion | None:
-    """The quaternion (x, y, z, w) of length 1; None where it has no direction (zero or not finite)."""
+    """Return the unit quaternion (x, y, z, w) of the same direction; None where the length is 0 or not finite."""
     x, y, z, w = (float(value) for value in quaternion)
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not math.isfinite(length) or length < 1e-6:
@@ -32,7 +32,7 @@ def normalise(quaternion: Sequence[float]) -> Quaternion | None:
 
 
 def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """The rotation at a fraction in [0, 1] of the shorter great arc between two rotations (Shoemake 1985)."""
+    """Return the rotation at a ``fraction`` in [0, 1] of the shorter arc between two rotations (Shoemake 1985)."""
     cosine = sum(a * b for a, b in zip(first, second, strict=True))
     sign = 1.0
     if cosine < 0.0:
@@ -50,14 +50,14 @@ def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
 
 
 def interpolate(first: Pose, second: Pose, fraction: float) -> Pose:
-    """The pose at a fraction in [0, 1] between two: linearly in position, by slerp in rotation."""
+    """Return the pose at a ``fraction`` in [0, 1] between two: linear in position, slerp in rotation."""
     (p, q), (r, s) = first, second
     x, y, z = (a + fraction * (b - a) for a, b in zip(p, r, strict=True))
     return (x, y, z), slerp(q, s, fraction)
 
 
 def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> Float64Array:
-    """The (4, 4) transform of a position and a quaternion (x, y, z, w) of length 1."""
+    """Return the transform (4, 4) of a position and a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
     return np.array(
         [
@@ -70,7 +70,7 @@ def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> Float
 
 
 def inverse(transform: Float64Array) -> Float64Array:
-    """The inverse of a (4, 4) rigid transform."""
+    """Return the inverse of a rigid transform (4, 4)."""
     result = np.eye(4)
     rotation = transform[:3, :3].T
     result[:3, :3] = rotation
@@ -79,20 +79,20 @@ def inverse(transform: Float64Array) -> Float64Array:
 
 
 def transform_of(numbers: Sequence[float]) -> Float64Array:
-    """The (4, 4) transform of seven numbers x, y, z, qx, qy, qz, qw; the quaternion is normalised.
+    """Return the transform (4, 4) of seven numbers x, y, z, qx, qy, qz, qw; the quaternion is normalised.
 
-    Raises ValueError where the quaternion has no direction.
+    Raises ValueError where the quaternion has length 0 or is not finite.
     """
     quaternion = normalise(numbers[3:7])
     if quaternion is None:
-        raise ValueError("a quaternion must have a direction")
+        raise ValueError("the quaternion has length 0 or is not finite")
     return pose_matrix(numbers[:3], quaternion)
 
 
 def rotation_to_quaternion(rotation: npt.ArrayLike) -> Quaternion:
-    """The quaternion (x, y, z, w), w >= 0, of a (3, 3) rotation matrix.
+    """Return the quaternion (x, y, z, w), w >= 0, of a rotation matrix (3, 3).
 
-    Starts from the largest of the four components, so that nothing is divided by a small number (Shepperd 1978).
+    It is computed from the largest of the four components, which avoids division by a small number (Shepperd 1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
     squares = np.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],

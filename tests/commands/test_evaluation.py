@@ -1,28 +1,18 @@
-"""The command 'evaluate', run as a process on a recorded team."""
+"""Tests of the command 'evaluate', run as a process on a fixture team."""
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from octoreplay import evaluate_result
 from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json
+from support.processes import octoreplay
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-
-
-def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the command line as a process, 100 columns wide."""
-    return subprocess.run(
-        [sys.executable, "-m", "octoreplay", *map(str, arguments)], cwd=folder, text=True, capture_output=True,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-    )  # fmt: skip
 
 
 def fails(code: int, sentence: str, *arguments: object) -> None:
@@ -57,19 +47,20 @@ def test_tables_files_and_figures(trio: Path, tmp_path: Path) -> None:
     assert all(f"wrote {path}\n" in done.stdout for path in made)
 
 
-def test_the_truth_is_named_but_not_guessed(trio: Path, tmp_path: Path) -> None:
+def test_a_truth_beside_the_logs_is_named_but_not_used(trio: Path, tmp_path: Path) -> None:
     done = octoreplay("evaluate", trio, "--last")
     assert done.returncode == 0
     assert "IoU" not in done.stdout
-    assert done.stderr.startswith("IoU, coverage and calibration need the truth: --truth WORLD; beside the logs lies ")
-    assert Path(done.stderr.split("lies ")[1].strip()).resolve() == FIXTURES / "trio" / "world.npz"
+    hint = "IoU, coverage and calibration need the ground truth: --truth WORLD; found beside the logs: "
+    assert done.stderr.startswith(hint)
+    assert Path(done.stderr.removeprefix(hint).strip()).resolve() == FIXTURES / "trio" / "world.npz"
     team = tmp_path / "team"
     shutil.copytree(FIXTURES / "trio", team)
     (team / "world.npz").unlink()
     assert octoreplay("run", "team.yaml", "-o", "out.mcap", "--duration", "1", folder=team).returncode == 0
     done = octoreplay("evaluate", team / "out.mcap", "--last")
     assert (done.returncode, done.stderr) == (
-        0, "IoU, coverage and calibration need the truth: --truth WORLD\n",
+        0, "IoU, coverage and calibration need the ground truth: --truth WORLD\n",
     )  # fmt: skip
 
 
@@ -86,7 +77,7 @@ def test_a_rule_against_the_centralised_map_of_another_run(trio: Path, tmp_path:
     assert re.search(r"\ncentral +[\d,]+ +[\d.]+ bit +100\.00 % +100\.00 %\n", done.stdout)
 
 
-def test_what_cannot_be_evaluated_is_one_sentence(trio: Path, tmp_path: Path) -> None:
+def test_results_that_cannot_be_evaluated_are_reported_in_one_sentence(trio: Path, tmp_path: Path) -> None:
     (tmp_path / "empty.npz").write_bytes(b"")
     (tmp_path / "empty.mcap").write_bytes(b"")
     fails(1, r"^error: .*none\.mcap: cannot be read", tmp_path / "none.mcap")
@@ -96,5 +87,5 @@ def test_what_cannot_be_evaluated_is_one_sentence(trio: Path, tmp_path: Path) ->
     fails(1, r"^error: .*none\.mcap: cannot be read", trio, "--against", tmp_path / "none.mcap")
     fails(2, r"^error: .*must end in \.csv", trio, "--csv", tmp_path / "a.txt")
     fails(1, r"^error: .*the folder .* does not exist", trio, "--json", tmp_path / "none" / "a.json")
-    fails(1, r"^error: .*empty\.npz: is a file; give a folder", trio, "--plot", tmp_path / "empty.npz")
+    fails(1, r"^error: .*empty\.npz: is a file; name a folder", trio, "--plot", tmp_path / "empty.npz")
     fails(2, "Missing argument")

@@ -1,4 +1,4 @@
-"""Two results side by side, judged by their cells in dictionaries."""
+"""Comparisons of two results against a twin that compares dictionaries of cells."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import octree_factory
 from octoreplay.config.class_file import class_table
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate import comparison
 from octoreplay.evaluate.comparison import LabelChange, compare_results
@@ -22,7 +21,8 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
-from result_factory import CLASSES, state, summary, team, tick_metrics
+from support import octree_factory
+from support.result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25
 NAMES = ("unknown", "free", "ground", "tree")
@@ -30,18 +30,18 @@ GROUND, TREE, FREE = [2.0, 0.5], [-1.0, 3.0], [-2.0, -3.0]
 
 
 def stored(folder: Path, maps: dict[str, dict], *, classes=CLASSES, late=None, interrupted=False, **parameters) -> Path:
-    """A result with these robots' maps, {robot: {key: values}}, after tick 1, and with ``late`` after tick 3."""
+    """A result with maps {robot: {key: values}} after tick 1 and the maps ``late`` after tick 3."""
     folder.mkdir(exist_ok=True)
     config = team(folder)
     robots = tuple(
-        RobotConfig(name, (folder / "alpha.bag",), depth_topic="/depth", pose_topic="/odom")
+        ResolvedRobot(name, (folder / "alpha.bag",), depth_topic="/depth", pose_topic="/odom")
         for name in maps if name != CENTRAL
     )  # fmt: skip
     parameters = {"resolution": RESOLUTION, **parameters}
     config = dataclasses.replace(config, robots=robots, classes=classes).with_parameters(parameters)
     path = folder / "result.mcap"
     ticks = [tick_metrics(tick) for tick in (1, 2, 3)]
-    with ResultWriter(path, config, classes) as writer:
+    with ResultWriter(path, config) as writer:
         for tick in ticks:
             writer.write_metrics(tick)
         for number, (at, content) in enumerate(((1, maps), (3, late or {}))):
@@ -57,7 +57,7 @@ def stored(folder: Path, maps: dict[str, dict], *, classes=CLASSES, late=None, i
 
 
 def pair(tmp_path: Path, a: dict, b: dict, **options) -> comparison.MapDifference:
-    """The only robot's maps, compared."""
+    """Comparison of two maps of one robot."""
     paths = [stored(tmp_path / name, {"alpha": cells}) for name, cells in (("a", a), ("b", b))]
     return compare_results(*paths, **options).maps[0]
 
@@ -73,7 +73,7 @@ cubes = st.lists(st.tuples(st.tuples(*[st.sampled_from([-8, -4, 0, 2, 4])] * 3),
 
 @st.composite
 def maps(draw):
-    """A map with leaves of several sizes."""
+    """Cells of a random map with leaves of several sizes."""
     content = {}
     for corner, edge, value in draw(cubes):
         content |= octree_factory.cube(corner, edge, value)
@@ -81,7 +81,7 @@ def maps(draw):
 
 
 def label(cells: dict, key) -> str:
-    """A cell's label in words; free wins ties, then the lower class."""
+    """Label of a cell; a tie goes to free, then to the lower class."""
     if key not in cells:
         return "unknown"
     scores = (0.0, *cells[key])
@@ -89,7 +89,7 @@ def label(cells: dict, key) -> str:
 
 
 def twin(a: dict, b: dict, tolerance: float) -> dict:
-    """What a comparison must say of two maps, cell by cell."""
+    """Numbers of a comparison of two maps, counted cell by cell."""
     everywhere = set(a) | set(b)
     differences = {
         key: max(abs(x - y) for x, y in zip(a.get(key, (0, 0)), b.get(key, (0, 0)), strict=True)) for key in everywhere
@@ -117,7 +117,7 @@ def twin(a: dict, b: dict, tolerance: float) -> dict:
 
 @settings(max_examples=60, deadline=None)
 @given(a=maps(), b=maps(), tolerance=st.sampled_from([0.0, 0.25, 0.5, 1.0]), shared=st.booleans())
-def test_every_number_is_that_of_the_twin(tmp_path_factory, a, b, tolerance, shared) -> None:
+def test_every_number_equals_that_of_the_twin(tmp_path_factory, a, b, tolerance, shared) -> None:
     b = {**a, **b} if shared else b
     found = dataclasses.asdict(pair(tmp_path_factory.mktemp("pair"), a, b, tolerance=tolerance))
     expected = twin(a, b, tolerance)
@@ -135,7 +135,7 @@ def test_every_number_is_that_of_the_twin(tmp_path_factory, a, b, tolerance, sha
 
 @settings(max_examples=30, deadline=None)
 @given(a=maps(), b=maps(), tolerance=st.sampled_from([0.0, 0.25, 1.0]))
-def test_the_other_way_round_it_is_the_same_difference(tmp_path_factory, a, b, tolerance) -> None:
+def test_exchanged_results_have_the_same_difference(tmp_path_factory, a, b, tolerance) -> None:
     folder = tmp_path_factory.mktemp("pair")
     one = pair(folder, a, b, tolerance=tolerance)
     other = compare_results(folder / "b" / "result.mcap", folder / "a" / "result.mcap", tolerance=tolerance).maps[0]
@@ -150,7 +150,7 @@ def test_the_other_way_round_it_is_the_same_difference(tmp_path_factory, a, b, t
 
 @settings(max_examples=20, deadline=None)
 @given(a=maps(), b=maps())
-def test_a_larger_tolerance_never_finds_more(tmp_path_factory, a, b) -> None:
+def test_a_larger_tolerance_does_not_find_more_differences(tmp_path_factory, a, b) -> None:
     folder = tmp_path_factory.mktemp("pair")
     pair(folder, a, b)
     paths = [folder / name / "result.mcap" for name in "ab"]
@@ -166,7 +166,7 @@ def test_a_larger_tolerance_never_finds_more(tmp_path_factory, a, b) -> None:
 # --- by hand ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_difference_is_placed_and_named(tmp_path: Path) -> None:
+def test_differences_of_four_cells_by_hand(tmp_path: Path) -> None:
     a = {(0, 0, 0): GROUND, (1, 0, 0): GROUND, (-4, 0, 2): FREE}
     b = {(0, 0, 0): GROUND, (1, 0, 0): TREE, (7, 7, 7): TREE}
     found = pair(tmp_path, a, b)
@@ -182,7 +182,7 @@ def test_a_difference_is_placed_and_named(tmp_path: Path) -> None:
     assert found.largest_at in {(0.375, 0.125, 0.125), (-0.875, 0.125, 0.625), (1.875, 1.875, 1.875)}
 
 
-def test_a_result_is_the_same_as_itself(tmp_path: Path) -> None:
+def test_a_result_equals_itself(tmp_path: Path) -> None:
     path = stored(tmp_path, {"alpha": {(0, 0, 0): GROUND}, CENTRAL: {(0, 0, 0): TREE}})
     found = compare_results(path, path)
     assert found.is_same
@@ -190,14 +190,14 @@ def test_a_result_is_the_same_as_itself(tmp_path: Path) -> None:
     assert (found.same_inputs, found.settings, found.is_complete_a) == (True, (), True)
 
 
-def test_the_tolerance_is_the_largest_difference_that_counts_as_the_same(tmp_path: Path) -> None:
+def test_a_difference_equal_to_the_tolerance_is_no_difference(tmp_path: Path) -> None:
     a, b = {(0, 0, 0): (0.5, 0.25)}, {(0, 0, 0): (0.5, 0.5)}
     assert pair(tmp_path, a, b, tolerance=0.25).num_differing == 0
     assert pair(tmp_path, a, b, tolerance=0.2499).num_differing == 1
     assert pair(tmp_path, a, {}, tolerance=100.0).num_differing == 1
 
 
-def test_robots_that_only_one_result_has(tmp_path: Path) -> None:
+def test_robots_of_only_one_result(tmp_path: Path) -> None:
     cell = {(0, 0, 0): GROUND}
     a = stored(tmp_path / "a", {"alpha": cell, "beta": cell})
     b = stored(tmp_path / "b", {"alpha": cell, "gamma": cell, CENTRAL: cell})
@@ -206,13 +206,15 @@ def test_robots_that_only_one_result_has(tmp_path: Path) -> None:
     assert [one.robot_id for one in found.maps] == ["alpha"]
     assert "robots" in [one.name for one in found.settings]
     assert compare_results(a, b, robot="alpha").is_same
-    lonely = compare_results(a, b, robot="beta")
-    assert (lonely.is_same, lonely.maps, lonely.only_a) == (False, (), ("beta",))
-    with pytest.raises(InputError, match="has a map of robot 'delta'; robots: alpha, beta"):
+    beta = compare_results(a, b, robot="beta")
+    assert (beta.is_same, beta.maps, beta.only_a) == (False, (), ("beta",))
+    with pytest.raises(
+        InputError, match=r"a/result\.mcap, .*b/result\.mcap: neither has a map of robot 'delta'; robots: alpha, beta"
+    ):
         compare_results(a, b, robot="delta")
 
 
-def test_a_time_picks_the_maps_of_both(tmp_path: Path) -> None:
+def test_a_time_selects_the_maps_of_both_results(tmp_path: Path) -> None:
     first, second = {(0, 0, 0): GROUND}, {(0, 0, 0): TREE}
     a = stored(tmp_path / "a", {"alpha": first}, late={"alpha": second})
     b = stored(tmp_path / "b", {"alpha": first}, late={"alpha": first})
@@ -224,7 +226,7 @@ def test_a_time_picks_the_maps_of_both(tmp_path: Path) -> None:
         compare_results(a, b, at=0.5)
 
 
-def test_an_unknown_cell_is_each_results_own_prior(tmp_path: Path) -> None:
+def test_an_unknown_cell_has_the_prior_of_its_result(tmp_path: Path) -> None:
     cell = {(0, 0, 0): (0.5, 0.5)}
     a = stored(tmp_path / "a", {"alpha": cell})
     b = stored(tmp_path / "b", {"alpha": cell}, prob_free=0.6)
@@ -234,7 +236,7 @@ def test_an_unknown_cell_is_each_results_own_prior(tmp_path: Path) -> None:
     assert compare_results(empty, b).maps[0].largest_difference == pytest.approx(abs(0.5 + prior), abs=1e-7)
 
 
-def test_settings_and_inputs_that_differ_are_named(tmp_path: Path) -> None:
+def test_different_settings_are_listed_and_equal_inputs_recognised(tmp_path: Path) -> None:
     cell = {"alpha": {(0, 0, 0): GROUND}}
     a = stored(tmp_path / "a", cell)
     b = stored(tmp_path / "b", cell, rule="bayes", gamma=0.25)
@@ -250,7 +252,7 @@ def test_settings_and_inputs_that_differ_are_named(tmp_path: Path) -> None:
     assert compare_results(a, moved / "result.mcap").same_inputs
 
 
-def test_other_logs_are_other_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_different_logs_are_different_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cell = {"alpha": {(0, 0, 0): GROUND}}
     a = stored(tmp_path / "a", cell)
     plain = Path.write_bytes
@@ -258,25 +260,25 @@ def test_other_logs_are_other_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert compare_results(a, stored(tmp_path / "b", cell)).same_inputs is False
 
 
-# --- what cannot be compared ------------------------------------------------------------------------------------------
+# --- refused inputs ---------------------------------------------------------------------------------------------------
 
 
-def test_other_resolutions_and_classes_are_one_sentence(tmp_path: Path) -> None:
+def test_different_resolutions_and_classes_are_refused(tmp_path: Path) -> None:
     cell = {(0, 0, 0): GROUND}
     a = stored(tmp_path / "a", {"alpha": cell})
     fine = stored(tmp_path / "fine", {"alpha": cell}, resolution=0.1)
-    with pytest.raises(InputError, match=r"fine/result.mcap: has the resolution 0.1 m, and .*a/result.mcap 0.25 m;"):
+    with pytest.raises(InputError, match=r"fine/result.mcap: the resolution is 0.1 m, and 0.25 m in .*a/result.mcap;"):
         compare_results(a, fine)
     other = class_table([{"name": "ground"}, {"name": "car"}])
-    with pytest.raises(InputError, match=r"class 2 is 'car', and there 'tree'"):
+    with pytest.raises(InputError, match=r"class 2 is 'car', and 'tree' in .*a/result.mcap"):
         compare_results(a, stored(tmp_path / "other", {"alpha": cell}, classes=other))
     three = class_table([{"name": "ground"}, {"name": "tree"}, {"name": "car"}])
     more = stored(tmp_path / "more", {"alpha": {(0, 0, 0): [1.0, 2.0, 3.0]}}, classes=three)
-    with pytest.raises(InputError, match=r"class 3 is '\(none\)', and there 'car'"):
+    with pytest.raises(InputError, match=r"class 3 is '\(none\)', and 'car' in .*more/result.mcap"):
         compare_results(more, a)
 
 
-def test_what_is_no_result_is_one_sentence(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_result_is_refused(tmp_path: Path) -> None:
     a = stored(tmp_path / "a", {"alpha": {}})
     with pytest.raises(InputError, match=r"not a finished MCAP file; give the OUT.mcap of 'octoreplay run'"):
         compare_results(a, tmp_path / "a" / "alpha.bag")
@@ -284,7 +286,7 @@ def test_what_is_no_result_is_one_sentence(tmp_path: Path) -> None:
         compare_results(tmp_path / "none.mcap", a)
 
 
-def test_an_interrupted_run_can_be_compared_and_is_told(tmp_path: Path) -> None:
+def test_the_result_of_an_interrupted_run_can_be_compared(tmp_path: Path) -> None:
     cell = {"alpha": {(0, 0, 0): GROUND}}
     whole = stored(tmp_path / "a", cell)
     with pytest.raises(KeyboardInterrupt):
@@ -294,18 +296,18 @@ def test_an_interrupted_run_can_be_compared_and_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, math.nan, math.inf])
-def test_a_tolerance_is_a_number_from_0_on(tmp_path: Path, tolerance: float) -> None:
-    with pytest.raises(ConfigError, match=r"tolerance: .* is not a number from 0 on"):
+def test_a_tolerance_that_is_negative_or_not_finite_is_refused(tmp_path: Path, tolerance: float) -> None:
+    with pytest.raises(ConfigError, match=r"tolerance: .* is not a finite number of at least 0"):
         compare_results(tmp_path / "a.mcap", tmp_path / "b.mcap", tolerance=tolerance)
 
 
 @pytest.mark.parametrize("at", [math.nan, math.inf, 1e30])
-def test_a_time_is_a_number(tmp_path: Path, at: float) -> None:
+def test_a_time_that_is_not_finite_or_too_large_is_refused(tmp_path: Path, at: float) -> None:
     with pytest.raises(ConfigError, match=r"at: .* is not a number of seconds"):
         compare_results(tmp_path / "a.mcap", tmp_path / "b.mcap", at=at)
 
 
-def test_a_comparison_is_json(tmp_path: Path) -> None:
+def test_a_comparison_as_json(tmp_path: Path) -> None:
     a = stored(tmp_path / "a", {"alpha": {(0, 0, 0): GROUND}})
     b = stored(tmp_path / "b", {"alpha": {(0, 0, 0): TREE}, "beta": {}}, bounds=(-1.0, 2.5))
     content = json.loads(json_text(compare_results(a, b)))

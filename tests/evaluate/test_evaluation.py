@@ -1,4 +1,4 @@
-"""Evaluations of small results with known answers, and of a recorded team."""
+"""Evaluations of small results with known scores, and of a recorded team."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dense_scores
 from octoreplay import Evaluation, evaluate_result, load_team_file, open_result, replay_team, resolve
 from octoreplay.errors import InputError
 from octoreplay.evaluate.evaluation import truth_beside_logs
-from octoreplay.evaluate.records import MapScores
+from octoreplay.evaluate.records import MAP_SCORES, SCORES, MapScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
-from octree_factory import cells_of, cube, octree_of
-from result_factory import state, write_result, write_until
+from support import dense_scores
+from support.octree_factory import cells_of, cube, octree_of
+from support.result_factory import state, write_result, write_until
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 FREE, GROUND, TREE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3)
@@ -35,7 +35,7 @@ def packet(cells: Cells) -> bytes:
 
 
 def save_result(folder: Path, ticks: Mapping[int, Mapping[str, Cells]]) -> Path:
-    """A result that stores some maps after some ticks, as key frames."""
+    """A result with maps stored as key frames, {tick: {robot: cells}}."""
     folder.mkdir(exist_ok=True)
 
     def fill(writer: ResultWriter) -> None:
@@ -57,7 +57,7 @@ def save_truth(folder: Path, classes: Mapping[tuple[int, ...], int] = TRUTH, shi
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """After tick 2 alpha knows half of what beta knows, after tick 4 both know the same."""
+    """A result in which alpha knows half of beta's cells after tick 2, and all of them after tick 4."""
     return save_result(
         tmp_path,
         {2: {"alpha": HALF, "beta": WHOLE, CENTRAL: WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE, CENTRAL: WHOLE}},
@@ -65,15 +65,16 @@ def result(tmp_path: Path) -> Path:
 
 
 def scores(evaluation: Evaluation, robot_id: str, tick: int = -1) -> MapScores:
+    """Scores of one map at one of the stored ticks."""
     return next(entry for entry in evaluation.ticks[tick].maps if entry.robot_id == robot_id)
 
 
 def same(a: object, b: object) -> bool:
-    """Equality in which NaN is NaN."""
+    """Equality in which NaN equals NaN."""
     return repr(a) == repr(b)
 
 
-def test_scores_over_time_and_at_the_end(result: Path, tmp_path: Path) -> None:
+def test_scores_at_every_stored_tick(result: Path, tmp_path: Path) -> None:
     done: list[float] = []
     evaluation = evaluate_result(result, truth=save_truth(tmp_path), progress=done.append)
     assert evaluation.class_names == ("ground", "tree")
@@ -81,23 +82,23 @@ def test_scores_over_time_and_at_the_end(result: Path, tmp_path: Path) -> None:
     assert (len(done), done[-1]) == (2, 1.0)
     alpha, beta, central = evaluation.ticks[0].maps
     assert (alpha.robot_id, beta.robot_id, central.robot_id) == ("alpha", "beta", CENTRAL)
-    # Alpha misses what the team knows; in its own cells it is perfect.
-    assert (alpha.iou[0], alpha.mean_iou, alpha.mean_iou_known) == (0.5, 0.5, 1.0)
-    assert (alpha.coverage, beta.coverage) == (0.5, 1.0)
-    assert (alpha.world_coverage, beta.world_coverage) == (4 / 11, 8 / 11)
+    # Alpha lacks half of the cells of the team; all cells that it knows are right.
+    assert (alpha.truth.iou[0], alpha.truth.mean_iou, alpha.truth.mean_iou_known) == (0.5, 0.5, 1.0)
+    assert (alpha.truth.coverage, beta.truth.coverage) == (0.5, 1.0)
+    assert (alpha.truth.world_coverage, beta.truth.world_coverage) == (4 / 11, 8 / 11)
     assert (alpha.num_cells, beta.num_cells) == (64, 512)
     assert (alpha.agreement, alpha.agreement_occupied) == (64 / 512, 0.5)
     assert (beta.agreement, beta.agreement_occupied, central.agreement) == (1.0, 1.0, 1.0)
-    assert (alpha.occupied_accuracy, alpha.free_accuracy) == (1.0, 1.0)
-    assert math.isnan(alpha.iou[1])
+    assert (alpha.truth.occupied_accuracy, alpha.truth.free_accuracy) == (1.0, 1.0)
+    assert math.isnan(alpha.truth.iou[1])
     assert evaluation.ticks[0].label_disagreement == (512 - 64) / 512
     assert evaluation.final.label_disagreement == 0.0
     final = scores(evaluation, "alpha")
     assert same(dataclasses.replace(final, robot_id="beta"), scores(evaluation, "beta"))
-    assert final.mean_iou == final.agreement == final.coverage == 1.0
+    assert final.truth.mean_iou == final.agreement == final.truth.coverage == 1.0
 
 
-def test_entropy_and_calibration_are_those_of_the_distributions(result: Path, tmp_path: Path) -> None:
+def test_entropy_and_calibration_of_the_distributions(result: Path, tmp_path: Path) -> None:
     evaluation = evaluate_result(result, truth=save_truth(tmp_path))
     classes = {key: 1 for key in TRUTH if TRUTH[key] == 1}
     entropies = []
@@ -113,35 +114,37 @@ def test_entropy_and_calibration_are_those_of_the_distributions(result: Path, tm
             for occupied in (False, True)
         ]
         assert [
-            found.calibration_error, found.calibration_error_occupied, found.team_calibration_error,
-            found.team_calibration_error_occupied,
+            found.truth.calibration_error, found.truth.calibration_error_occupied, found.truth.team_calibration_error,
+            found.truth.team_calibration_error_occupied,
         ] == pytest.approx(expected, abs=1e-6)  # fmt: skip
 
 
-def test_the_last_tick_alone_is_the_end_of_the_history(result: Path, tmp_path: Path) -> None:
+def test_the_last_tick_only_equals_the_end_of_the_history(result: Path, tmp_path: Path) -> None:
     truth = save_truth(tmp_path)
     evaluation = evaluate_result(result, truth=truth, over_time=False)
     assert same(evaluation.ticks, evaluate_result(result, truth=truth).ticks[-1:])
 
 
-def test_a_robot_without_a_stored_map_knows_nothing(tmp_path: Path) -> None:
+def test_a_robot_without_a_stored_map_has_an_empty_map(tmp_path: Path) -> None:
     path = save_result(tmp_path, {2: {"beta": WHOLE, CENTRAL: WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE}})
     evaluation = evaluate_result(path, truth=save_truth(tmp_path))
     alpha = scores(evaluation, "alpha", 0)
-    assert (alpha.num_cells, alpha.agreement, alpha.mean_iou, alpha.coverage) == (0, 0.0, 0.0, 0.0)
-    assert math.isnan(alpha.free_accuracy)
+    assert (alpha.num_cells, alpha.agreement, alpha.truth.mean_iou, alpha.truth.coverage) == (0, 0.0, 0.0, 0.0)
+    assert math.isnan(alpha.truth.free_accuracy)
     assert evaluation.ticks[0].label_disagreement == 1.0
 
 
-def test_without_a_truth_there_is_no_score_against_it(result: Path) -> None:
+def test_scores_without_a_truth(result: Path) -> None:
     evaluation = evaluate_result(str(result))
     assert evaluation.truth is None
     alpha = scores(evaluation, "alpha", 0)
-    assert np.isnan([*alpha.iou, alpha.mean_iou, alpha.coverage, alpha.calibration_error]).all()
+    assert alpha.truth is None
+    assert len(evaluation.iou(alpha)) == 2
+    assert np.isnan([*evaluation.iou(alpha), *map(alpha.score, set(SCORES) - set(MAP_SCORES))]).all()
     assert alpha.agreement == 64 / 512
 
 
-def test_without_a_centralised_map_the_run_says_what_agrees(tmp_path: Path) -> None:
+def test_agreement_without_a_stored_centralised_map_is_that_of_the_run(tmp_path: Path) -> None:
     path = save_result(tmp_path, {2: {"alpha": HALF, "beta": WHOLE}, 4: {"alpha": WHOLE, "beta": WHOLE}})
     evaluation = evaluate_result(path, truth=save_truth(tmp_path))
     assert evaluation.final.central is None
@@ -150,8 +153,8 @@ def test_without_a_centralised_map_the_run_says_what_agrees(tmp_path: Path) -> N
             stored = next(metrics for metrics in opened.metrics if metrics.tick == tick.tick)
             assert [entry.agreement for entry in tick.maps] == [robot.agreement for robot in stored.robots]
             assert [entry.agreement_occupied for entry in tick.maps] == [r.agreement_occupied for r in stored.robots]
-    # What any robot knows stands for the team's evidence.
-    assert scores(evaluation, "alpha", 0).mean_iou == 0.5
+    # The cells that any robot knows take the place of the team's evidence.
+    assert scores(evaluation, "alpha", 0).truth.mean_iou == 0.5
 
 
 # --- against another result -------------------------------------------------------------------------------------------
@@ -164,59 +167,59 @@ def test_a_result_agrees_with_itself(result: Path, tmp_path: Path) -> None:
     assert scores(other, CENTRAL, 0).agreement == scores(other, CENTRAL, 0).agreement_occupied == 1.0
 
 
-def test_a_shifted_result_does_not_agree(result: Path, tmp_path: Path) -> None:
+def test_agreement_with_a_shifted_result(result: Path, tmp_path: Path) -> None:
     shifted = {(x, y, z + 1): values for (x, y, z), values in WHOLE.items()}
     other = save_result(tmp_path / "other", {2: {"alpha": HALF, CENTRAL: shifted}})
     evaluation = evaluate_result(result, against=other)
     beta = scores(evaluation, "beta", 0)
-    # Nine layers of 64; seven in common, of which the lowest has 8 cells of ground there.
+    # Nine layers of 64 cells; seven are common, and in one of these 8 cells are ground in the other result only.
     assert beta.agreement == (7 * 64 - 8) / (9 * 64)
     assert beta.agreement_occupied == 0.0
-    # The other one's last map stands for all later times.
+    # The other result's last map is the reference at all later times.
     assert scores(evaluation, CENTRAL).agreement == beta.agreement
 
 
-def test_the_other_result_is_asked_at_the_same_seconds(result: Path, tmp_path: Path) -> None:
+def test_the_reference_is_the_other_map_at_the_same_time(result: Path, tmp_path: Path) -> None:
     other = save_result(tmp_path / "other", {3: {"alpha": HALF, CENTRAL: HALF}, 4: {"alpha": HALF, CENTRAL: WHOLE}})
     evaluation = evaluate_result(result, against=other)
     assert math.isnan(scores(evaluation, "beta", 0).agreement)
     assert scores(evaluation, "beta").agreement == 1.0
 
 
-def test_a_reference_that_does_not_fit(result: Path, tmp_path: Path) -> None:
+def test_a_reference_with_other_classes_or_resolution_is_refused(result: Path, tmp_path: Path) -> None:
     bare = save_result(tmp_path / "bare", {2: {"alpha": HALF}})
     with pytest.raises(InputError, match=r"bare/result\.mcap: holds no centralised map"):
         evaluate_result(result, against=bare)
     config = resolve(load_team_file(FIXTURES / "pair" / "team.yaml")).with_parameters({"duration": 0.5})
     replay_team(config, tmp_path / "pair.mcap")
-    with pytest.raises(InputError, match=r"pair\.mcap: has classes other than .*result\.mcap"):
+    with pytest.raises(InputError, match=r"pair\.mcap: classes differ from .*result\.mcap"):
         evaluate_result(result, against=tmp_path / "pair.mcap")
     replay_team(config.with_parameters({"resolution": 0.4}), tmp_path / "coarse.mcap")
-    with pytest.raises(InputError, match=r"coarse\.mcap: has a resolution other than .*pair\.mcap"):
+    with pytest.raises(InputError, match=r"coarse\.mcap: resolution differs from .*pair\.mcap"):
         evaluate_result(tmp_path / "pair.mcap", against=tmp_path / "coarse.mcap")
     with pytest.raises(InputError, match=r"none\.mcap: cannot be read"):
         evaluate_result(result, against=tmp_path / "none.mcap")
 
 
-# --- what cannot be evaluated -----------------------------------------------------------------------------------------
+# --- refused inputs ---------------------------------------------------------------------------------------------------
 
 
-def test_a_truth_that_lies_elsewhere(result: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"world\.npz: none of its surface lies where the maps of .* know anything"):
+def test_a_truth_outside_the_maps_is_refused(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"world\.npz: no surface lies in the cells that the maps of .* know"):
         evaluate_result(result, truth=save_truth(tmp_path, shift=100))
 
 
-def test_a_result_without_maps(tmp_path: Path) -> None:
+def test_a_result_without_maps_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"result\.mcap: holds no map"):
         evaluate_result(write_result(tmp_path))
 
 
-def test_maps_without_metrics(tmp_path: Path) -> None:
+def test_maps_without_metrics_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"result\.mcap: damaged: tick 9 has maps but no metrics"):
         evaluate_result(save_result(tmp_path, {9: {"alpha": WHOLE, "beta": WHOLE, CENTRAL: WHOLE}}))
 
 
-def test_an_interrupted_run_without_a_tick(tmp_path: Path) -> None:
+def test_an_interrupted_run_without_a_tick_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         write_until(ZeroDivisionError, tmp_path / "empty.mcap", [])
     for path in tmp_path.glob("*.mcap"):
@@ -229,19 +232,19 @@ def test_an_interrupted_run_without_a_tick(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result of the pair, with a prior that is not uniform."""
+    """A result of the team pair, with a prior that is not uniform."""
     config = resolve(load_team_file(FIXTURES / "pair" / "team.yaml"))
     path = tmp_path_factory.mktemp("pair") / "pair.mcap"
     replay_team(config.with_parameters({"state_every": 1.0, "prob_free": 0.2, "rule": "bayes"}), path)
     return path
 
 
-def test_what_the_run_measured_is_found_again(pair: Path) -> None:
+def test_scores_equal_the_metrics_of_the_run(pair: Path) -> None:
     evaluation = evaluate_result(pair)
     assert len(evaluation.ticks) > 3
     with open_result(pair) as opened:
         by_tick = {metrics.tick: metrics for metrics in opened.metrics}
-    # In the first tick nothing is known yet, so that nothing agrees or differs.
+    # All maps are empty at the first tick.
     first = evaluation.ticks[0]
     assert np.isnan(
         [first.label_disagreement, *(value for m in first.maps for value in (m.agreement, m.agreement_occupied))]
@@ -271,22 +274,22 @@ def test_a_recorded_team_against_its_truth_cell_by_cell(pair: Path) -> None:
     for name, stored in maps.items():
         found = scores(evaluation, name)
         cells = {key: tuple(np.frombuffer(data, np.float32).tolist()) for key, data in cells_of(stored.octree).items()}
-        assert found.iou == pytest.approx(dense_scores.iou(cells, team, classes, prior), nan_ok=True)
-        assert len(found.iou) == num_classes
-        assert (found.occupied_accuracy, found.free_accuracy) == pytest.approx(
+        assert found.truth.iou == pytest.approx(dense_scores.iou(cells, team, classes, prior), nan_ok=True)
+        assert len(found.truth.iou) == num_classes
+        assert (found.truth.occupied_accuracy, found.truth.free_accuracy) == pytest.approx(
             dense_scores.accuracies(cells, classes, prior)
         )
-        assert found.coverage == pytest.approx(dense_scores.coverage(cells, team, classes, prior))
-        assert found.world_coverage == pytest.approx(dense_scores.coverage(cells, classes, classes, prior))
+        assert found.truth.coverage == pytest.approx(dense_scores.coverage(cells, team, classes, prior))
+        assert found.truth.world_coverage == pytest.approx(dense_scores.coverage(cells, classes, classes, prior))
         robots = 1 if name == CENTRAL else 2
-        assert found.team_calibration_error == pytest.approx(
+        assert found.truth.team_calibration_error == pytest.approx(
             dense_scores.calibration_error(cells, classes, prior, robots), abs=1e-4
         )
-    assert 0.2 < found.mean_iou < 1.0
-    assert found.coverage > 0.4
+    assert 0.2 < found.truth.mean_iou < 1.0
+    assert found.truth.coverage > 0.4
 
 
-def test_the_truth_beside_the_logs_is_named(pair: Path, result: Path) -> None:
+def test_the_truth_beside_the_logs_is_found(pair: Path, result: Path) -> None:
     found = truth_beside_logs(pair)
     assert found is not None
     assert found.resolve() == FIXTURES / "pair" / "world.npz"

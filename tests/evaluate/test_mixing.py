@@ -1,29 +1,35 @@
-"""Theory of mixing against known spectra, and against mixing itself."""
+"""Theory of mixing against known spectra and against simulated mixing."""
 
 import numpy as np
 import pytest
 
 from octoreplay.evaluate import mixing
 
-
-def test_known_spectra() -> None:
-    # Metropolis: 1/6 on every link of a complete graph of six, 1/3 on a ring.
-    assert mixing.eigenvalues("complete", 6) == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert mixing.eigenvalues("ring", 6) == pytest.approx(
-        sorted((2 - 2 * np.cos(2 * np.pi * k / 6)) / 3 for k in range(6))
-    )
-    # A star of four: 1/4 on each of its three links.
-    assert mixing.eigenvalues("star", 4) == pytest.approx([0, 1 / 4, 1 / 4, 1])
-    assert mixing.eigenvalues("line", 2) == pytest.approx([0, 1])
+SPECTRA = {
+    # Metropolis weights are 1/6 on every link of a complete graph of six, 1/3 on a ring, 1/4 on a star of four.
+    ("complete", 6): [1, 1, 1, 1, 1],
+    ("ring", 6): [(2 - 2 * np.cos(2 * np.pi * k / 6)) / 3 for k in range(1, 6)],
+    ("star", 4): [1 / 4, 1 / 4, 1],
+    ("line", 2): [1],
+}
+"""Non-zero eigenvalues of L by topology and number of robots."""
 
 
-def test_the_complete_graph_agrees_in_one_step() -> None:
+@pytest.mark.parametrize(("graph", "spectrum"), SPECTRA.items())
+def test_bound_and_contraction_follow_from_known_spectra(graph: tuple[str, int], spectrum: list[float]) -> None:
+    assert mixing.epsilon_bound(*graph) == pytest.approx(1 / max(spectrum))
+    for epsilon in (0.1, 0.5, 0.7, 1.1):
+        slowest = max(abs(1 - 2 * epsilon * mu) for mu in spectrum)
+        assert mixing.contraction(*graph, epsilon) == pytest.approx(slowest**2, rel=1e-9, abs=1e-20)
+
+
+def test_a_complete_graph_agrees_in_one_step() -> None:
     assert mixing.contraction("complete", 6, 0.5) == pytest.approx(0.0, abs=1e-20)
 
 
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.95, 1.02])
-def test_mixing_shrinks_and_grows_as_theory_says(topology: str, share: float) -> None:
+def test_simulated_mixing_contracts_as_in_theory(topology: str, share: float) -> None:
     edges = {
         "complete": [(i, j) for i in range(6) for j in range(i)],
         "ring": [(i, (i + 1) % 6) for i in range(6)],
@@ -38,7 +44,7 @@ def test_mixing_shrinks_and_grows_as_theory_says(topology: str, share: float) ->
         return float(sum((values[i] - values[j]) ** 2 for i, j in edges))
 
     for _ in range(400):
-        # Mixing is linear: deviations from the mean may be scaled so that they do not vanish.
+        # Mixing is linear, so the deviations from the mean are scaled in every step to keep them from vanishing.
         values = (values - values.mean()) / values.std()
         before = distance()
         change = np.zeros(6)

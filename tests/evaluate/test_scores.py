@@ -1,7 +1,8 @@
-"""Scores over spans against the cell-by-cell twin, and by hand."""
+"""Scores over intervals of cells, against a cell-by-cell twin and by hand."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -10,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import dense_scores
-from octoreplay.evaluate.runs import Region
-from octoreplay.evaluate.scores import agreement, no_truth_scores, truth_scores
+from octoreplay.evaluate.morton_intervals import Region
+from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import SemanticOctree, keys_to_codes
-from octree_factory import cells_of, cube, octree_of
+from support import dense_scores
+from support.octree_factory import cells_of, cube, octree_of
 
 FREE, GROUND, TREE, UNSURE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3), (-0.3, -0.4)
 VALUES = (FREE, GROUND, TREE, UNSURE, (0.25, 0.7), (-0.9, 0.35))
 
 
 def truth_of(classes):
-    """A truth of {key: class_id, or -1 for a class that the result does not have}."""
+    """A truth from {key: class_id}; -1 is a class that the result does not have."""
     keys = np.array(list(classes), np.int64).reshape(-1, 3)
     codes, numbers = keys_to_codes(keys), np.array([max(number, 0) for number in classes.values()], np.uint8)
     order = np.argsort(codes)
@@ -30,7 +31,7 @@ def truth_of(classes):
 
 
 def scores_of(cells, classes, *, prior=0.0, num_robots=1, team=None, observed=None):
-    """The scores of a map of some cells, where the team knows ``team`` and at the end ``observed``."""
+    """Scores of a map of some cells; the team knows the cells ``team``, and ``observed`` at the end."""
     octree, truth = octree_of(cells), truth_of(classes)
     region = Region([octree_of(cells if team is None else team).spans()])
     at_end = region if observed is None else Region([octree_of(observed).spans()])
@@ -39,7 +40,7 @@ def scores_of(cells, classes, *, prior=0.0, num_robots=1, team=None, observed=No
 
 @st.composite
 def scenes(draw):
-    """Cells of a map, of its team and of its team at the end, and a truth; all random, with large leaves among them."""
+    """Random cells of a map, of its team and of its team at the end, and a random truth; some leaves are large."""
     key = st.tuples(*[st.integers(-3, 6)] * 3)
     cells, team, observed = {}, {}, {}
     for content in (cells, team, observed):
@@ -56,14 +57,14 @@ def scenes(draw):
 
 
 def mean_of_true_classes(iou, region, classes):
-    """The mean over the classes that the truth has in the region; NaN where it has none."""
+    """Mean over the classes that occur in truth in the region; NaN without any."""
     true = sorted({classes[key] for key in region if classes.get(key, 0) > 0})
     return np.mean([iou[class_id - 1] for class_id in true]) if true else np.nan
 
 
 @settings(max_examples=80, deadline=None)
 @given(scenes(), st.sampled_from((0.0, -0.8, 0.15)), st.sampled_from((1, 3)))
-def test_spans_say_what_scikit_learn_says_of_cells(scene, prior, num_robots):
+def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior, num_robots):
     cells, team, observed, classes = scene
     found = scores_of(cells, classes, prior=prior, num_robots=num_robots, team=team, observed=observed)
     iou = dense_scores.iou(cells, team, classes, prior)
@@ -82,12 +83,13 @@ def test_spans_say_what_scikit_learn_says_of_cells(scene, prior, num_robots):
             for occupied in (False, True)
         ),
     )
-    np.testing.assert_allclose((*found.iou, *found[1:]), expected, atol=1e-6)
+    found_iou, *found_numbers = dataclasses.astuple(found)
+    np.testing.assert_allclose((*found_iou, *found_numbers), expected, atol=1e-6)
 
 
 @settings(max_examples=30, deadline=None)
 @given(scenes(), st.sampled_from((0.0, -0.8)))
-def test_agreement_is_counted_cell_by_cell(scene, prior):
+def test_agreement_equals_that_over_cells(scene, prior):
     cells, reference, _, _ = scene
     both = {**reference, **cells}
     labels = {
@@ -125,7 +127,7 @@ def test_a_perfect_map_scores_one():
     assert found.calibration_error_occupied == pytest.approx(1 - (sure[1] + tree) / 65, abs=1e-6)
 
 
-def test_counts_worked_out_by_hand():
+def test_scores_of_nine_cells_by_hand():
     # Six cells of ground: three found, one called tree, one called free, one unknown; two free cells called ground.
     cells = {(k, 0, 0): values for k, values in enumerate((GROUND, GROUND, GROUND, TREE, FREE))}
     cells |= {(0, 1, 0): GROUND, (1, 1, 0): GROUND, (2, 1, 0): FREE, (3, 1, 0): FREE}
@@ -133,9 +135,9 @@ def test_counts_worked_out_by_hand():
     team = cells | {(5, 0, 0): FREE}
     found = scores_of(cells, classes, team=team)
     assert found.iou == (3 / 8, 0.0)
-    # The tree stands nowhere in the region but in the map, so it does not count in the mean.
+    # In the region only the map has a tree, so its IoU is not part of the mean.
     assert found.mean_iou == 3 / 8
-    # Without the cell that the map does not know.
+    # This leaves out the cell that the map does not know.
     assert found.mean_iou_known == 3 / 7
     assert (found.occupied_accuracy, found.free_accuracy) == (4 / 5, 2 / 4)
     assert (found.coverage, found.world_coverage) == (4 / 6, 4 / 7)
@@ -148,14 +150,16 @@ def test_a_class_in_neither_truth_nor_map_has_no_iou():
     assert found.mean_iou == 1.0
 
 
-def test_surface_of_a_class_that_the_result_does_not_have_counts_for_nothing():
+def test_surface_of_a_class_that_the_result_does_not_have_is_not_counted():
     cells = {(0, 0, 0): GROUND, (1, 0, 0): TREE, (2, 0, 0): FREE, (3, 0, 0): FREE}
     without = {key: value for key, value in cells.items() if key not in ((1, 0, 0), (2, 0, 0))}
-    assert scores_of(cells, {(0, 0, 0): 1, (1, 0, 0): -1, (2, 0, 0): -1})[2:] == scores_of(without, {(0, 0, 0): 1})[2:]
+    found = scores_of(cells, {(0, 0, 0): 1, (1, 0, 0): -1, (2, 0, 0): -1})
+    expected = scores_of(without, {(0, 0, 0): 1})
+    assert dataclasses.astuple(found)[2:] == dataclasses.astuple(expected)[2:]
 
 
 def test_calibration_by_hand():
-    # Two cells 0.9 sure, one of them right; two 0.6 sure, both right: (2 |0.5 - 0.9| + 2 |1 - 0.6|) / 4.
+    # Two cells with probability 0.9, one of them right; two with 0.6, both right: (2 |0.5 - 0.9| + 2 |1 - 0.6|) / 4.
     sure, unsure = (np.log(18.0), 0.0), (np.log(3.0), 0.0)
     cells = {(0, 0, 0): sure, (2, 0, 0): sure, (4, 0, 0): unsure, (6, 0, 0): unsure}
     found = scores_of(cells, {(0, 0, 0): 1, (2, 0, 0): 2, (4, 0, 0): 1, (6, 0, 0): 1})
@@ -163,16 +167,16 @@ def test_calibration_by_hand():
     assert found.calibration_error == found.calibration_error_occupied == found.team_calibration_error
 
 
-def test_the_team_posterior_is_calibrated_where_the_robots_share_is_not():
-    # A million right to one: ten robots' mean of it is a tenth of the log-odds.
+def test_the_team_posterior_is_calibrated_where_the_mean_is_not():
+    # Odds of a million to one; the mean over ten robots has a tenth of these log-odds.
     cells = cube((0, 0, 0), 4, (np.log(1e6) / 10, -3.0))
     found = scores_of(cells, dict.fromkeys(cells, 1), num_robots=10)
     assert found.calibration_error > 0.15
     assert found.team_calibration_error < 1e-5
 
 
-def test_the_team_posterior_has_labels_of_its_own():
-    # With this prior 0.7 of evidence leaves the cell free, and three times as much does not.
+def test_the_team_posterior_has_its_own_labels():
+    # With this prior, evidence of 0.7 leaves the cell free, and three times as much makes it occupied.
     cells = {(0, 0, 0): (0.25, 0.7), (3, 0, 0): FREE}
     found = scores_of(cells, {(0, 0, 0): 2}, prior=-0.8, num_robots=3)
     assert found.occupied_accuracy == 0.0
@@ -181,8 +185,8 @@ def test_the_team_posterior_has_labels_of_its_own():
         assert error == pytest.approx(expected, abs=1e-6)
 
 
-def test_there_are_fifteen_bins():
-    # 0.93 and 0.90 share the bin from 13/15 to 14/15: one right and one wrong there is |1 - 1.83| / 2.
+def test_calibration_has_fifteen_bins():
+    # 0.93 and 0.90 are both in the bin from 13/15 to 14/15; with one right and one wrong cell: |1 - 1.83| / 2.
     cells = {(2 * k, 0, 0): (np.log(2 * p / (1 - p)), 0.0) for k, p in enumerate((0.9, 0.93))}
     confidences = [dense_scores.probabilities(values, 0.0, 1).max() for values in cells.values()]
     assert [int(15 * confidence) for confidence in confidences] == [13, 13]
@@ -190,7 +194,7 @@ def test_there_are_fifteen_bins():
     assert found.calibration_error == pytest.approx(abs(1 - sum(confidences)) / 2, abs=1e-6)
 
 
-def test_a_shifted_map_scores_less():
+def test_a_shifted_map_has_lower_scores():
     keys = list(itertools.product(range(8), range(8), range(8)))
     cells = {key: GROUND if key[2] < 4 else FREE for key in keys}
     classes = {key: 1 for key in keys if key[2] < 4}
@@ -204,7 +208,7 @@ def test_a_shifted_map_scores_less():
     assert agreement(spans[1], 0.0, spans[0], 0.0, 576) == (6 * 64 / 576, 3 / 4)
 
 
-def test_an_empty_map_knows_nothing():
+def test_scores_of_an_empty_map():
     empty = SemanticOctree(0.25, 2).spans()
     truth = truth_of({(0, 0, 0): 1})
     region = Region([octree_of({(0, 0, 0): GROUND}).spans()])
@@ -216,15 +220,9 @@ def test_an_empty_map_knows_nothing():
     assert Region([]).num_inside(octree_of({(0, 0, 0): GROUND}).spans()).tolist() == [0]
 
 
-def test_without_a_truth_everything_is_nan():
-    scores = no_truth_scores(3)
-    assert len(scores.iou) == 3
-    assert np.isnan([*scores.iou, *scores[1:]]).all()
-
-
 @settings(max_examples=30, deadline=None)
 @given(scenes())
-def test_a_region_holds_what_any_map_knows(scene):
+def test_a_region_is_the_union_of_the_known_cells(scene):
     maps = [octree_of(content) for content in scene[:3]]
     known = set().union(*map(cells_of, maps))
     region = Region([octree.spans() for octree in maps])

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from log_damage import CONTAINERS, damage_log, read_all
+from support.log_damage import CONTAINERS, damage_log, read_all
 
 CASES = 60
 

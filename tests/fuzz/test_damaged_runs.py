@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from log_damage import mcap_chunks
+from support.log_damage import mcap_chunks
 
 PAIR = Path(__file__).resolve().parents[1] / "fixtures" / "pair"
 

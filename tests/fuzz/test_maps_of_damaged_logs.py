@@ -7,7 +7,10 @@ import random
 import numpy as np
 import pytest
 
-from hostile_logs import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.replay.run import replay_team
+from support.hostile_logs import (
     FIXTURES,
     LOGS,
     MCAP_LOGS,
@@ -18,10 +21,7 @@ from hostile_logs import (
     value_of,
     write_hostile_log,
 )
-from log_factory import write_rows
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.replay.session import replay_team
+from support.log_factory import write_rows
 
 CASES = 12
 

@@ -1,4 +1,4 @@
-"""Recordings made by others, from the file to the map, and what is no recording."""
+"""Public recordings from the file to the map, and files that are not logs."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
-from octoreplay.io.robots.discover import describe, discover, resolve
+from octoreplay.io.robots.describe import describe
+from octoreplay.io.robots.discover import discover, resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.trajectories import read_rows, trajectory
-from recordings import RECORDINGS, needs_recordings
-from scan_maps import octree_of
+from support.recordings import RECORDINGS, needs_recordings
+from support.scan_maps import octree_of
 
 pytestmark = needs_recordings
 
 LOGS = (".mcap", ".bag", ".db3")
 
 
-def test_whatever_is_no_log_is_refused_as_such():
+def test_other_files_are_refused_as_logs():
     others = [path for path in sorted(RECORDINGS.rglob("*")) if path.is_file() and path.suffix not in LOGS]
     assert len(others) > 300
     for path in others:
@@ -37,7 +38,7 @@ def test_every_log_can_be_described_or_is_refused_in_one_sentence():
 
 
 def frames_of(path: Path, **fields):
-    """The frames of a recording's one robot, with what is not found given."""
+    """Frames of a recording with one robot; ``fields`` gives the topics that are not found."""
     robots = (RobotConfig("r", (path,), **fields),) if fields else discover([path])
     config = resolve(RunConfig(robots))
     with RobotLog(config.robots[0], config.time, config.classes) as log:
@@ -55,7 +56,7 @@ def test_a_tilting_laser_maps_the_ground_and_the_walls_around_it():
     assert np.histogram(heights, bins=10, range=(-1, 1))[0].max() > 0.3 * len(heights)
 
 
-def test_a_lidar_that_stands_still_has_its_poses_from_static_transforms():
+def test_a_lidar_that_does_not_move_has_its_poses_from_static_transforms():
     path = RECORDINGS / "mcap_other" / "pointcloudset_test.mcap"
     frames, counts = frames_of(path, pose_topic="/tf_static", map_frame="os1_sensor")
     assert counts.used == 2

@@ -1,4 +1,4 @@
-"""The same content gives the same map, whatever container and encoding hold it (fixtures/containers and streams)."""
+"""Equal maps from the same content in every container and encoding (fixtures/containers and streams)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import octoreplay
-import room
 from fixtures.foxglove_messages import write_protobuf
 from fixtures.make_containers import (
     CAMERA,
@@ -42,7 +41,7 @@ from fixtures.make_containers import (
     scan_ranges,
     write_mcap,
 )
-from log_factory import IDENTITY, SECOND, Entry
+from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -50,7 +49,9 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameCounts, SemanticClass
-from scan_maps import packet_of
+from support import room
+from support.log_factory import IDENTITY, SECOND, Entry
+from support.scan_maps import packet_of
 
 LOGS = sorted(path.name for path in CONTAINERS.iterdir())
 REFERENCE = "cdr_none.mcap"
@@ -62,17 +63,17 @@ CLASS_IDS[list(room.NAMES)] = [1, 2, 3, 4]
 
 
 def names_its_classes(name: str) -> bool:
-    """True where the log says what its labels mean: vision_msgs/LabelInfo is a message of ROS 2 alone."""
+    """True where the log names its labels: vision_msgs/LabelInfo exists in ROS 2 alone."""
     return not (name.startswith(("foxglove", "ros1")) or name.endswith(".bag"))
 
 
-def resolved(path: Path, classes: ClassTable | None) -> RunConfig:
-    """What is found in a log of which only the path is given, and the classes where it does not name them."""
+def resolved(path: Path, classes: ClassTable | None) -> ResolvedRun:
+    """The resolved run of a log's path, with the classes where the log does not name them."""
     return octoreplay.resolve(RunConfig(octoreplay.discover([path]), classes=classes))
 
 
-def frames_of(robot: RobotConfig, classes: ClassTable | None) -> list[Frame]:
-    """All frames of a robot, of which nothing may be lost."""
+def frames_of(robot: ResolvedRobot, classes: ClassTable | None) -> list[Frame]:
+    """All frames of a robot; none may be lost."""
     with RobotLog(robot, TimeConfig(), classes) as log:
         frames = list(log.frames())
         assert log.counts == FrameCounts(used=len(frames))
@@ -90,12 +91,12 @@ def frames_in(name: str) -> list[DepthFrame]:
 
 @cache
 def packet_in(name: str) -> bytes:
-    """The map of one of the containers, as it is published."""
+    """Encoded map of one of the containers."""
     return packet_of(frames_in(name), CLASSES.num_classes)
 
 
 def assert_images(frames: list[Frame], recording, poses: np.ndarray) -> None:
-    """Frames are those of a recording, from the beginning: all numbers exactly, poses up to rounding."""
+    """Check that frames equal the first ones of a recording: exactly, and poses up to rounding."""
     assert frames
     for index, frame in enumerate(frames):
         assert frame.stamp_ns == recording.stamps_ns[index]
@@ -116,9 +117,9 @@ def test_no_container_is_missing() -> None:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_robot_and_topics_are_found_without_a_word(name: str) -> None:
+def test_robot_and_topics_are_found_from_the_path_alone(name: str) -> None:
     [robot] = octoreplay.discover([CONTAINERS / name])
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         Path(name).stem,
         (CONTAINERS / name,),
         depth_topic=DEPTH,
@@ -132,7 +133,7 @@ def test_robot_and_topics_are_found_without_a_word(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_classes_come_from_the_log_where_it_can_name_them(name: str) -> None:
+def test_classes_come_from_the_label_info(name: str) -> None:
     if names_its_classes(name):
         found = resolved(CONTAINERS / name, None).classes
         assert [(c.name, c.raw_labels) for c in found.classes] == [(c.name, c.raw_labels) for c in CLASSES.classes]
@@ -142,7 +143,7 @@ def test_classes_come_from_the_log_where_it_can_name_them(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_frames_are_what_was_recorded(name: str) -> None:
+def test_frames_equal_the_recorded_ones(name: str) -> None:
     recording = record()
     frames = frames_in(name)
     assert len(frames) == len(recording.stamps_ns)
@@ -159,7 +160,7 @@ def test_frames_and_map_are_the_same_bit_by_bit(name: str) -> None:
 
 
 def test_the_map_depends_on_every_frame() -> None:
-    """Else equal maps would say nothing."""
+    """Otherwise equal maps would prove nothing."""
     frames = frames_in(REFERENCE)
     packets = {packet_of([*frames[:k], *frames[k + 1 :]], CLASSES.num_classes) for k in range(len(frames))}
     assert len(packets | {packet_in(REFERENCE)}) == len(frames) + 1
@@ -205,7 +206,7 @@ def test_runs_on_different_containers_end_with_the_same_map(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("schema", ["ros2msg", "ros2idl"])
 def test_a_type_is_read_as_its_log_defines_it(tmp_path: Path, schema: str) -> None:
-    """Another version of a package may order fields in another way than the one that is known."""
+    """Another version of a package may have its fields in another order."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     info = "std_msgs/Header header\nfloat32 threshold\nvision_msgs/VisionClass[2] class_map\n"
     store.register(get_types_from_msg("string class_name\nuint16 class_id\n", "vision_msgs/msg/VisionClass"))
@@ -274,7 +275,7 @@ def write_foxglove(path: Path, entries: list[Entry], encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_foxglove_clouds_give_the_map_of_ros(tmp_path: Path, encoding: str) -> None:
-    """The lidar's place on the robot is in the cloud's pose; rays begin there."""
+    """The cloud's pose holds the lidar's position on the robot; rays begin there."""
     path = tmp_path / "robot.mcap"
     recording, expected = clouds()
     entries = pose_entries(recording, FOXGLOVE, FOXGLOVE_TYPES)
@@ -291,7 +292,7 @@ def test_foxglove_clouds_give_the_map_of_ros(tmp_path: Path, encoding: str) -> N
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_foxglove_scans_are_those_of_ros(tmp_path: Path, encoding: str) -> None:
-    """As above, with a scanner that is mounted upside down."""
+    """As above, with a scanner mounted upside down."""
     path, start, step = tmp_path / "robot.mcap", float(np.float32(-np.pi)), float(np.float32(np.pi / 45))
     recording, upside_down = record(4), (1.0, 0.0, 0.0, 0.0)
     entries = pose_entries(recording, FOXGLOVE, FOXGLOVE_TYPES)
@@ -347,8 +348,8 @@ def test_a_robot_has_the_same_map_alone_and_in_a_shared_file() -> None:
     assert packet_of(frames, CLASSES.num_classes) == packet_of(frames_in(REFERENCE)[:4], CLASSES.num_classes)
 
 
-def test_the_fixtures_hold_what_makes_frames_hard() -> None:
-    """Pixels without depth and without labels, poses between stamps, and log times that are not the stamps."""
+def test_the_fixtures_hold_the_difficult_cases() -> None:
+    """Pixels without depth and labels, poses between stamps, and log times that differ from the stamps."""
     recording = record()
     assert (recording.depth == 0).any()
     assert (recording.labels == UNLABELLED).any()

@@ -1,4 +1,4 @@
-"""One scene, many sensors: what the same view becomes in the map does not depend on how a sensor writes it.
+"""Maps of one scene from many sensors: the encoding of a view does not change the map.
 
 The rays of every camera are cast by formulas of their own (no OpenCV), written as messages, and read back as frames.
 """
@@ -19,14 +19,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import octoreplay
-import room
 from fixtures.make_containers import write_mcap
-from log_factory import OPTICAL, SECOND, Entry, ros2
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, SemanticClass
-from scan_maps import octree_of, packet_of, states_of
+from support import room
+from support.log_factory import OPTICAL, SECOND, Entry, ros2
+from support.scan_maps import octree_of, packet_of, states_of
 
 CLASSES = ClassTable(
     tuple(SemanticClass(k + 1, name, (0, 0, 0), (raw,)) for k, (raw, name) in enumerate(room.NAMES.items()))
@@ -34,7 +34,7 @@ CLASSES = ClassTable(
 START_NS = 1_000 * SECOND
 WIDTH, HEIGHT = 160, 120
 FOCAL = (118.3, 121.9, 78.2, 62.7)
-"""fx, fy, cx, cy of the camera: all different, so that none can stand for another."""
+"""fx, fy, cx, cy of the camera, all different so that an exchange is detected."""
 
 POSES = [
     ((-1.83, -1.22, 0.71), (0.2, 0.03, -0.02)),
@@ -83,7 +83,7 @@ def grid(focal: tuple[float, ...], size: tuple[int, int] = (WIDTH, HEIGHT)) -> n
 
 
 def bent(x: np.ndarray, y: np.ndarray, D: tuple[float, ...]) -> np.ndarray:
-    """Where a lens of ROS's models plumb_bob and rational_polynomial draws a ray with these slopes (REP 104)."""
+    """Distorted slopes of rays by ROS's models plumb_bob and rational_polynomial (REP 104)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*D, 0.0, 0.0, 0.0)[:8]
     r = x * x + y * y
     radial = (1 + r * (k1 + r * (k2 + r * k3))) / (1 + r * (k4 + r * (k5 + r * k6)))
@@ -94,7 +94,7 @@ def bent(x: np.ndarray, y: np.ndarray, D: tuple[float, ...]) -> np.ndarray:
 
 @cache
 def unbent(D: tuple[float, ...]) -> np.ndarray:
-    """The slopes of all pixels of such a lens, found by going back by what one comes out wrong."""
+    """Slopes of all pixels of such a lens, by fixed-point iteration on the error."""
     drawn = grid(FOCAL)
     slopes = drawn.copy()
     for _ in range(400):
@@ -105,7 +105,7 @@ def unbent(D: tuple[float, ...]) -> np.ndarray:
 
 @cache
 def fisheye(K: tuple[float, ...], D: tuple[float, ...]) -> np.ndarray:
-    """The slopes of a lens of the model equidistant: a ray at the angle t is drawn at t + k1 t^3 + k2 t^5 + ..."""
+    """Slopes of a lens of the model equidistant: a ray at the angle t has the radius t + k1 t^3 + k2 t^5 + ..."""
     drawn = grid(K)
     radius = np.hypot(*drawn)
     angle = radius.copy()
@@ -142,7 +142,7 @@ def image(stamp_ns: int, pixels: np.ndarray, encoding: str) -> tuple[str, Any]:
 
 
 def compressed(stamp_ns: int, pixels: np.ndarray, kind: str, head: tuple[float, float]) -> tuple[str, Any]:
-    """A PNG with the head of compressed_depth_image_transport."""
+    """A PNG with the header of compressed_depth_image_transport."""
     file = io.BytesIO()
     PIL.Image.fromarray(pixels).save(file, "PNG")
     data = np.frombuffer(struct.pack("<iff", 0, *head) + file.getvalue(), np.uint8)
@@ -191,7 +191,7 @@ def pose_entry(index: int) -> Entry:
 def camera_frames(
     path: Path, lens: Lens, kind: str = "32FC1", *, topic: str = "/camera/depth/image", info: Lens | None = None
 ) -> list[DepthFrame]:
-    """The frames of a log with a lens' views; ``info`` is the lens that its CameraInfo describes, unless the same."""
+    """Frames of a log with a lens's views; ``info`` is the lens in its CameraInfo, by default the same."""
     entries = []
     for index in range(len(POSES)):
         stamp = START_NS + index * SECOND
@@ -251,20 +251,20 @@ def cells_of(frames: list[Frame]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def differing_share(a: list[Frame], b: list[Frame]) -> float:
-    """The share of the cells known to either map that the other does not know or says something else about."""
+    """Share of the cells known to either map that the other map lacks or that differ in it."""
     (first, states), (second, other_states) = cells_of(a), cells_of(b)
     shared, i, j = np.intersect1d(first, second, assume_unique=True, return_indices=True)
     return 1 - np.count_nonzero(states[i] == other_states[j]) / (len(first) + len(second) - len(shared))
 
 
 def occupancy_agreement(a: list[Frame], b: list[Frame]) -> tuple[float, float]:
-    """Of the cells known to both maps the share that is occupied or free in both; and their share of ``a``'s cells."""
+    """Share of the cells known to both maps with the same state, and the share of ``a``'s cells that both know."""
     (first, states), (second, other_states) = cells_of(a), cells_of(b)
     shared, i, j = np.intersect1d(first, second, assume_unique=True, return_indices=True)
     return np.mean((states[i] > 0) == (other_states[j] > 0)), len(shared) / len(first)
 
 
-# None of the 72,808 cells differs here; another machine's last digits may move a few.
+# None of the 72,808 cells differs here; rounding on another machine may change a few.
 ROUNDED_RAYS = 5e-5
 
 
@@ -274,7 +274,7 @@ def metres(tmp_path_factory: pytest.TempPathFactory) -> list[DepthFrame]:
     return camera_frames(tmp_path_factory.mktemp("metres") / "robot.mcap", PINHOLE)
 
 
-def test_the_scene_is_worth_comparing(metres: list[DepthFrame]) -> None:
+def test_the_scene_has_many_cells(metres: list[DepthFrame]) -> None:
     _, states = cells_of(metres)
     assert len(states) > 70_000
     assert np.count_nonzero(states > 0) > 7_000
@@ -285,7 +285,7 @@ def test_the_scene_is_worth_comparing(metres: list[DepthFrame]) -> None:
 
 
 def test_millimetres_give_the_map_of_metres_but_for_rounding(tmp_path: Path, metres: list[DepthFrame]) -> None:
-    """Half a millimetre moves 0.0096 % of the cells."""
+    """Half a millimetre changes 0.0096 % of the cells."""
     frames = camera_frames(tmp_path / "robot.mcap", PINHOLE, "16UC1")
     assert frames[0].depth_image.dtype == np.uint16
     assert 0 < differing_share(frames, metres) < 2e-4
@@ -316,7 +316,7 @@ def test_an_image_gives_the_map_of_its_points(tmp_path: Path, metres: list[Depth
 
 @pytest.mark.parametrize("name", DISTORTED)
 def test_rays_of_a_lens_are_those_of_its_formula(tmp_path: Path, name: str) -> None:
-    """As exact as float32 holds them."""
+    """Exact to float32."""
     for frame in camera_frames(tmp_path / "robot.mcap", DISTORTED[name]):
         assert frame.camera.slopes is not None
         np.testing.assert_allclose(frame.camera.slopes, DISTORTED[name].slopes(), rtol=1e-7, atol=1e-7)
@@ -330,7 +330,7 @@ def test_rays_of_a_lens_give_the_map_of_its_points(tmp_path: Path, name: str) ->
 
 @pytest.mark.parametrize("name", DISTORTED)
 def test_a_distorted_image_gives_the_map_of_its_points(tmp_path: Path, name: str) -> None:
-    """Where the lens is ignored, 28 % of the cells differ, and 48 % with the fisheye."""
+    """With the lens ignored 28 % of the cells differ, and 48 % with the fisheye."""
     frames = camera_frames(tmp_path / "robot.mcap", DISTORTED[name])
     assert differing_share(frames, cloud_frames(tmp_path / "cloud.mcap", DISTORTED[name])) < ROUNDED_RAYS
 
@@ -339,14 +339,14 @@ def test_a_distorted_image_gives_the_map_of_its_points(tmp_path: Path, name: str
 def test_a_distorted_camera_sees_what_an_undistorted_one_sees(
     tmp_path: Path, metres: list[DepthFrame], name: str
 ) -> None:
-    """Cells at edges differ, which other rays graze: 1.2 %, with the fisheye 1.6 %; 11 and 15 % without the lens."""
+    """Other rays graze cells at edges, so 1.2 % differ (fisheye 1.6 %); 11 % and 15 % with the lens ignored."""
     frames = as_clouds(camera_frames(tmp_path / "robot.mcap", DISTORTED[name]))
     agreement, shared = occupancy_agreement(metres, frames)
     assert agreement > 0.98
     assert shared > 0.99
 
 
-def test_a_rectified_image_goes_by_P_alone(tmp_path: Path) -> None:
+def test_a_rectified_image_uses_P_alone(tmp_path: Path) -> None:
     """K and the distortion are those of the image before rectification."""
     rectified = Lens(lambda: grid(RECTIFIED), K=RECTIFIED, P=RECTIFIED)
     expected = camera_frames(tmp_path / "robot.mcap", rectified)
@@ -356,7 +356,7 @@ def test_a_rectified_image_goes_by_P_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("D", [PINHOLE.D, PLUMB_BOB])
-def test_a_binned_part_of_an_image_goes_by_the_whole_camera(tmp_path: Path, D: tuple[float, ...]) -> None:
+def test_a_binned_region_uses_the_whole_camera(tmp_path: Path, D: tuple[float, ...]) -> None:
     """Every second pixel of columns 20..139 and rows 12..101, as ROS's image_geometry counts them."""
     part = Lens(lambda: unbent(D)[:, 12:102:2, 20:140:2], D=D, binning=2, roi=(20, 12, 120, 90))
     frames = camera_frames(tmp_path / "robot.mcap", part)

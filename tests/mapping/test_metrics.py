@@ -1,4 +1,4 @@
-"""The team's metrics on hand-made octrees, and brick by brick updates against a fresh comparison."""
+"""Team metrics of hand-made octrees, and incremental comparisons against new ones."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.metrics import MapComparer
-from octree_factory import cube, octree_of
 from reference.metrics import team_metrics
+from support.octree_factory import cube, octree_of
 
 EMPTY = {}
 
@@ -50,12 +50,12 @@ def test_agreement_by_hand():
     found = _compare([a, b], oracle)
     assert found.agreement.tolist() == [0.5, 1.0]
     assert found.agreement_occupied.tolist() == [0.5, 1.0]
-    # Unknown cells are a label of their own.
+    # Unknown counts as a label.
     assert found.label_disagreement == 0.5
 
 
 @pytest.mark.parametrize(("margin", "agrees"), [(0.0, True), (0.0009, True), (0.0011, False)])
-def test_a_tie_of_the_oracle_counts_as_agreement(margin, agrees):
+def test_labels_within_the_tie_tolerance_of_the_oracle_agree(margin, agrees):
     found = _compare([{(0, 0, 0): [0.0, 1.0]}], {(0, 0, 0): [1.0 + margin, 1.0]}, links=[])
     assert found.agreement.tolist() == found.agreement_occupied.tolist() == [float(agrees)]
     found = _compare([{(0, 0, 0): [-1.0, -1.0]}], {(0, 0, 0): [margin, -1.0]}, links=[])
@@ -71,7 +71,7 @@ def test_ties_of_a_map_go_to_free_and_then_to_the_lower_class():
 def test_entropy_by_hand():
     found = _compare([{(0, 0, 0): [0.0, 0.0], (50, 0, 0): [80.0, -80.0]}, EMPTY], EMPTY)
     assert found.entropy_bits.tolist() == [pytest.approx(np.log2(3) / 2), 0.0]
-    # With a prior: p = (0.5, 0.25, 0.25) where the map says nothing new.
+    # With the prior, p = (0.5, 0.25, 0.25) where the deviation is 0.
     found = _compare([{(0, 0, 0): [0.0, 0.0]}], EMPTY, links=[], prior=float(np.log(0.5)))
     assert found.entropy_bits.tolist() == [pytest.approx(1.5, rel=1e-6)]
 
@@ -90,7 +90,7 @@ def test_metrics_of_log_odds_of_any_magnitude(magnitude, prior):
     assert found.agreement.tolist() == pytest.approx(expected.agreement)
 
 
-def test_nothing_is_known():
+def test_maps_without_known_cells():
     found = _compare([EMPTY, EMPTY], EMPTY)
     assert (found.num_known_cells, found.total_distance, found.total_distance_all) == (0, 0.0, 0.0)
     assert found.label_disagreement == 0.0
@@ -98,13 +98,13 @@ def test_nothing_is_known():
     assert found.entropy_bits.tolist() == [0.0, 0.0]
 
 
-def test_no_cell_is_occupied():
+def test_oracle_without_occupied_cells():
     found = _compare([{(0, 0, 0): [1.0, 0.0]}, EMPTY], {(0, 0, 0): [-1.0, -1.0]})
     assert found.agreement.tolist() == [0.0, 0.0]
     assert found.agreement_occupied.tolist() == [1.0, 1.0]
 
 
-def test_close_maps_of_large_values_keep_their_distance():
+def test_distances_of_close_maps_with_large_values_are_exact():
     a = cube((0, 0, 0), 8, [1e4, -1e4])
     b = a | {(3, 3, 3): [1e4 + 0.0078125, -1e4]}
     found = _compare([a, b, a], a)
@@ -122,7 +122,7 @@ def _random_cells(rng):
 
 
 def _dense(maps, oracle, prior):
-    """The same maps as (N, M, K), masks (N, M) and the oracle (M, K), for the reference."""
+    """Dense arrays for the reference: maps (N, M, K), masks (N, M) and the oracle (M, K)."""
     keys = sorted(set(itertools.chain(oracle, *maps)))
     known = np.array([[key in cells for key in keys] for cells in maps], dtype=bool).reshape(len(maps), -1)
     dense = np.zeros((len(maps) + 1, len(keys), 3))
@@ -154,7 +154,7 @@ def test_random_maps_against_the_reference(seed, prior):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_updating_changed_bricks_gives_what_a_fresh_comparison_gives(seed):
+def test_incremental_comparison_equals_a_new_one(seed):
     rng = np.random.default_rng(seed)
     octrees = [octree_of(_random_cells(rng)) for _ in range(3)]
     oracle = octree_of(_random_cells(rng))
@@ -170,15 +170,15 @@ def test_updating_changed_bricks_gives_what_a_fresh_comparison_gives(seed):
         updated = comparer.compare(octrees, oracle, links, revision)
         fresh = MapComparer(3, -0.5).compare(octrees, oracle, links, 0)
         for name in vars(fresh):
-            # The bricks are summed in the order in which they came up.
+            # The order of summation follows the order in which bricks were added.
             np.testing.assert_allclose(getattr(updated, name), getattr(fresh, name), rtol=1e-12, err_msg=name)
 
 
-def test_a_map_that_was_replaced_is_compared_anew():
-    octree, nothing = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({})
+def test_all_bricks_are_compared_after_forget():
+    octree, empty = octree_of({(0, 0, 0): [1.0, 2.0]}), octree_of({})
     comparer = MapComparer(2, 0.0)
     assert comparer.compare([octree, octree], octree, [(0, 1)], 0).num_cells.tolist() == [1, 1]
     comparer.forget()
-    comparison = comparer.compare([octree, nothing], octree, [(0, 1)], 9)
+    comparison = comparer.compare([octree, empty], octree, [(0, 1)], 9)
     assert comparison.num_cells.tolist() == [1, 0]
     assert comparison.total_distance == 5.0

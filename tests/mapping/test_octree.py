@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, leaf_list, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_codes, octree_from_streams
+from octoreplay.mapping.streams import leaf_list
 from octoreplay.records import LeafTable
-from octree_factory import cells_of, cube, octree_of
 from reference.comparison import expand_leaves, num_lossless_leaves
+from support.octree_factory import cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
 RESOLUTION = 0.25
@@ -19,7 +20,7 @@ RESOLUTION = 0.25
 
 @st.composite
 def cell_maps(draw, num_classes):
-    """{key: values}: cubes with few distinct values, many of them aligned, so that there is much to merge."""
+    """{key: values} of cubes with few distinct values, many of them aligned, so that many leaves can be merged."""
     values = st.sampled_from([-5.0, -0.25, 0.0, 1.0])
     cells = {}
     for _ in range(draw(st.integers(1, 4))):
@@ -41,14 +42,14 @@ def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
     assert len(content) == len(keys) == octree.num_cells == len(cells)
     assert content == {key: list(value) for key, value in cells.items()}
     assert (leaves.sizes**3).sum() == pytest.approx(len(cells) * RESOLUTION**3)
-    # As few leaves as a lossless octree can have: no eight sibling leaves are equal.
+    # No eight sibling leaves are equal, so no lossless octree has fewer leaves.
     assert len(leaves) == num_lossless_leaves(keys, values.astype(np.float32))
     assert _in_morton_order(leaves)
 
 
 @settings(max_examples=25, deadline=None)
 @given(cells=cell_maps(num_classes=2))
-def test_spans_are_the_leaves_as_runs_of_cells(cells):
+def test_spans_equal_the_leaves(cells):
     octree = octree_of(cells)
     spans = octree.spans()
     codes = np.concatenate([np.arange(code, code + n) for code, n in zip(spans.codes, spans.num_cells, strict=True)])
@@ -67,12 +68,12 @@ def _in_morton_order(leaves):
 
 @settings(max_examples=40, deadline=None)
 @given(cells=cell_maps(num_classes=3), seed=st.integers(0, 99))
-def test_lookup_gives_what_the_leaves_say(cells, seed):
+def test_lookup_equals_the_leaves(cells, seed):
     octree = octree_of(cells, num_classes=3)
     rng = np.random.default_rng(seed)
     keys = np.concatenate([np.array(list(cells))[rng.integers(0, len(cells), 40)], rng.integers(-60, 60, (40, 3))])
     coords = (keys + rng.uniform(0.0, 1.0, keys.shape)) * RESOLUTION
-    coords[::7] = keys[::7] * RESOLUTION  # exactly in the lowest corner, which belongs to the cell
+    coords[::7] = keys[::7] * RESOLUTION  # the lowest corner of a cell belongs to the cell
     log_odds, known, sizes = octree.lookup(coords)
     leaves = octree.leaves()
     for coord, key, found, is_known, size in zip(coords, keys.tolist(), log_odds, known, sizes, strict=True):
@@ -97,7 +98,7 @@ def test_lookup_outside_the_key_space_is_unknown():
     assert (sizes > 0).tolist() == known.tolist()
 
 
-def test_lookup_of_nothing_and_in_nothing():
+def test_lookup_without_coordinates_and_in_an_empty_map():
     assert [len(part) for part in octree_of({(0, 0, 0): [1.0, 1.0]}).lookup(np.zeros((0, 3)))] == [0, 0, 0]
     log_odds, known, _ = SemanticOctree(0.2, 2).lookup(np.zeros((4, 3)))
     assert not known.any()
@@ -106,7 +107,7 @@ def test_lookup_of_nothing_and_in_nothing():
 
 @settings(max_examples=20, deadline=None)
 @given(cells=cell_maps(num_classes=2), prior=st.sampled_from([0.0, 0.4, -0.7]))
-def test_occupied_leaves_are_those_with_a_class_above_free(cells, prior):
+def test_occupied_leaves_have_a_class_above_free(cells, prior):
     octree = octree_of(cells)
     everything, occupied = octree.leaves(prior), octree.leaves(prior, occupied_only=True)
     chosen = (everything.log_odds > 0).any(axis=1)
@@ -126,8 +127,8 @@ def test_the_prior_is_added_to_leaves():
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), tolerance=st.sampled_from([0.0, 0.05, 0.2, 1.0, 10.0]))
-def test_merging_stays_within_its_bound(seed, tolerance):
-    """Every cell of a merged leaf is within half the tolerance of the leaf, and nothing that could merge is left."""
+def test_lossy_merging_stays_within_its_bound(seed, tolerance):
+    """Cells differ from their merged leaf by at most half the tolerance, and no more leaves can be merged."""
     rng = np.random.default_rng(seed)
     corner = rng.integers(-9, 9, 3)
     cells = {}
@@ -150,7 +151,7 @@ def test_merging_stays_within_its_bound(seed, tolerance):
         assert len(group) < 8 or np.ptp(np.array(group), axis=0).max() > tolerance
 
 
-def test_leaves_that_merge_to_equal_classes_are_scalars():
+def test_leaves_that_merge_to_equal_classes_are_not_vector_leaves():
     cells = cube((0, 0, 0), 2, [1.0, 0.0]) | {(1, 1, 1): [0.0, 1.0]}
     merged = octree_of(cells).streams(tolerance=1.0)
     assert (merged.values.tolist(), merged.masks.size) == ([0.5], 0)
@@ -158,7 +159,7 @@ def test_leaves_that_merge_to_equal_classes_are_scalars():
 
 @settings(max_examples=40, deadline=None)
 @given(cells=cell_maps(num_classes=2), prune=st.booleans())
-def test_leaves_of_a_stream_do_not_overlap_and_fill_the_known_space(cells, prune):
+def test_leaves_of_a_stream_do_not_overlap_and_cover_the_known_space(cells, prune):
     octree = octree_of(cells)
     codes, depths, _ = leaf_list(octree.streams(prune=prune))
     spans = np.int64(1) << (3 * (storage.KEY_BITS - depths.astype(np.int64)))
@@ -176,7 +177,7 @@ def test_without_pruning_every_known_cell_is_a_leaf():
     assert octree.streams().num_leaves == 2
 
 
-def test_equal_siblings_that_are_not_all_known_stay_apart():
+def test_equal_siblings_are_not_merged_unless_all_are_known():
     cells = cube((0, 0, 0), 8, [-5.0, -5.0])
     del cells[7, 7, 7]
     octree = octree_of(cells)
@@ -208,7 +209,7 @@ def test_a_copy_is_independent():
 
 
 def test_many_bricks_are_found_again():
-    """The hash table and the arrays grow many times."""
+    """The hash table and the arrays are enlarged many times."""
     rng = np.random.default_rng(0)
     octree = SemanticOctree(0.2, 1)
     codes = np.unique(rng.integers(0, 1 << 48, 30_000))
@@ -235,10 +236,10 @@ def test_morton_codes():
         assert storage.key_to_code(2 + x, 4 + y, -6 + z) - storage.key_to_code(2, 4, -6) == x + 2 * y + 4 * z
 
 
-def test_memory_is_what_the_bricks_take():
+def test_memory_bytes():
     octree = octree_of(cube((0, 0, 0), 8, [-5.0, -5.0]))
     assert octree.memory_bytes < 2000
-    # One octet has a known cell: a row for all classes, and in the second map two more, one for each.
+    # One octet has a known cell: one shared row, and in the second map two class rows.
     free, hit = octree_of({(0, 0, 0): [1.0, 1.0]}), octree_of({(0, 0, 0): [1.0, 0.0]})
     one_value = octree_of(cube((0, 0, 0), 4, [1.0, 1.0]))
     rows = [(other.memory_bytes - one_value.memory_bytes) // storage.ROW_BYTES for other in (free, hit)]
@@ -246,13 +247,13 @@ def test_memory_is_what_the_bricks_take():
 
 
 @pytest.mark.parametrize("needs_block", [True, False])
-def test_a_block_grows_with_the_cells_that_become_known(needs_block):
-    """Also where nobody asks for a block: the brick has one."""
+def test_block_grows_with_new_known_cells(needs_block):
+    """Also without ``needs_block``, because the brick already has a block."""
     octree = octree_of({(3, 0, 0): [1.0, 2.0], (3, 3, 3): [0.5, 0.5]})
     before = cells_of(octree)
     masks = np.zeros((1, 1), np.uint64)
-    gains = octree.raise_bricks(np.array([0]), masks, np.array([storage.ALL_CELLS]), np.array([needs_block]))
-    assert gains.tolist() == [True]
+    has_new_cells = octree.expand_bricks(np.array([0]), masks, np.array([storage.ALL_CELLS]), np.array([needs_block]))
+    assert has_new_cells.tolist() == [True]
     after = cells_of(octree)
     assert len(after) == storage.BRICK_CELLS
     assert {key: after[key] for key in before} == before

@@ -1,4 +1,4 @@
-"""Points on triangles and votes in cells, against obvious twins."""
+"""Points on triangles and class votes in cells, against naive implementations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def barycentric(point, corners):
 
 
 @pytest.mark.parametrize("batch", [surface.BATCH, 7])
-def test_points_lie_on_their_triangle_and_leave_no_gap(monkeypatch, batch):
+def test_points_are_on_their_triangle_and_cover_it(monkeypatch, batch):
     monkeypatch.setattr(surface, "BATCH", batch)
     rng = np.random.default_rng(0)
     corners = rng.uniform(-1, 1, (6, 3, 3))
@@ -36,19 +36,19 @@ def test_points_lie_on_their_triangle_and_leave_no_gap(monkeypatch, batch):
         np.testing.assert_allclose(weights @ triangle, points, atol=1e-9)
         assert (weights > 0).all()
         np.testing.assert_allclose(points.mean(axis=0), triangle.mean(axis=0), atol=1e-9)
-        # Anywhere on the triangle a point is within the spacing.
+        # Every place on the triangle has a point within the spacing.
         places = rng.dirichlet(np.ones(3), 200) @ triangle
         gaps = np.linalg.norm(places[:, None] - points[None], axis=2).min(axis=1)
         assert gaps.max() < spacing
 
 
-def test_a_triangle_is_cut_by_its_longest_edge():
+def test_number_of_cuts_follows_from_the_longest_edge():
     corners = np.array([[[0, 0, 0], [1.0, 0, 0], [0, 0.1, 0]], [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]])
     assert num_cuts(corners, 0.3).tolist() == [4, 1]
 
 
 @given(st.lists(st.tuples(st.integers(-5, 5), st.integers(0, 4)), max_size=60), st.integers(1, 20))
-def test_most_votes_win_and_ties_go_to_the_lower_id(votes, batch):
+def test_majority_wins_and_ties_go_to_the_lower_id(votes, batch):
     counted = CellVotes()
     for start in range(0, len(votes), batch):
         part = votes[start : start + batch]
@@ -63,11 +63,11 @@ def test_most_votes_win_and_ties_go_to_the_lower_id(votes, batch):
     cells, winners = counted.winners()
     assert dict(zip(cells.tolist(), winners.tolist(), strict=True)) == expected
     assert cells.tolist() == sorted(expected)
-    # Asking does not change what was counted.
+    # winners() does not change the counts.
     assert counted.winners()[1].tolist() == winners.tolist()
 
 
-def test_votes_are_merged_when_many_wait(monkeypatch):
+def test_waiting_votes_are_merged_beyond_the_batch_size(monkeypatch):
     monkeypatch.setattr(surface, "BATCH", 2)
     votes = CellVotes()
     for class_ids in ([1, 2], [2, 2], [1, 1], [1, 3]):

@@ -1,5 +1,4 @@
-"""Another implementation's map against the twin's, cell by cell and both ways; and how many leaves a lossless octree
-has for given cells."""
+"""Comparison of a map with the reference cell by cell, and the number of leaves of a lossless octree."""
 
 from __future__ import annotations
 
@@ -17,10 +16,13 @@ Key = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class MapDifference:
-    """``max_abs``: the largest |log-odds difference| over the twin's cells, unknown cells counted as the prior.
+    """Difference between a map's leaves and the reference.
 
-    ``missing``: cells that the twin's robot knows and the leaves do not hold; ``spurious``: the reverse, cells that no
-    scan ever touched included; ``overlapping``: cells that more than one leaf holds. ``worst_key`` is where max_abs is.
+    - ``max_abs``: largest |log-odds difference| over the reference's cells; unknown cells count as the prior.
+    - ``missing``: number of cells that are known in the reference but in no leaf.
+    - ``spurious``: number of cells in a leaf that are unknown in the reference, including cells that no scan touches.
+    - ``overlapping``: number of additional leaves that hold the same cell.
+    - ``worst_key``: key of the cell with max_abs.
     """
 
     max_abs: float
@@ -31,7 +33,7 @@ class MapDifference:
 
 
 def compare_map(keys: Int64Array, tick: TwinTick, robot: int, leaves: LeafTable, resolution: float) -> MapDifference:
-    """How one robot's leaves (log-odds with the prior) differ from the twin's map over ``recording.keys``."""
+    """Return the difference between a robot's leaves (with the prior) and the reference over ``keys`` (M, 3)."""
     leaf_keys, leaf_log_odds = expand_leaves(leaves, resolution)
     distinct, first = np.unique(_codes(leaf_keys), return_index=True)
     places = np.minimum(np.searchsorted(distinct, _codes(keys)), max(len(distinct) - 1, 0))
@@ -56,7 +58,7 @@ def compare_map(keys: Int64Array, tick: TwinTick, robot: int, leaves: LeafTable,
 
 
 def _codes(keys: Int64Array) -> Int64Array:
-    """One integer per key."""
+    """Return one integer for each key."""
     if len(keys) and np.abs(keys).max() >= 1 << 20:
         raise AssertionError("a cell lies more than 2^20 cells from the origin")
     codes: Int64Array = ((keys[:, 0] + (1 << 20)) << 42) | ((keys[:, 1] + (1 << 20)) << 21) | (keys[:, 2] + (1 << 20))
@@ -64,7 +66,7 @@ def _codes(keys: Int64Array) -> Int64Array:
 
 
 def expand_leaves(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Float64Array]:
-    """The finest cells (X, 3) that the leaves cover, and the log-odds (X, C) of each."""
+    """Return the finest cells (X, 3) in the leaves, and their log-odds (X, C)."""
     cells = np.rint(leaves.sizes / resolution).astype(np.int64)
     if not np.allclose(cells * resolution, leaves.sizes, rtol=1e-6, atol=0.0):
         raise AssertionError("a leaf's size is no whole number of cells")
@@ -79,9 +81,9 @@ def expand_leaves(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Flo
 
 
 def num_lossless_leaves(keys: Int64Array, values: Float64Array, max_levels: int = 20) -> int:
-    """Leaves of the octree in which eight sibling leaves with bit-equal values (M, C) are one leaf, level by level.
+    """Return the number of leaves after merging eight sibling leaves with bit-equal values (M, C), level by level.
 
-    Siblings of level l are the cells whose keys agree after floor division by 2^l; unknown cells are in no leaf.
+    Siblings at level l are the cells with equal keys after floor division by 2^l; unknown cells are in no leaf.
     """
     level: dict[Key, bytes] = {
         (key[0], key[1], key[2]): row.tobytes()
@@ -99,7 +101,7 @@ def num_lossless_leaves(keys: Int64Array, values: Float64Array, max_levels: int 
 
 
 def _merged(parents: dict[Key, list[bytes]]) -> Iterator[tuple[Key, bytes]]:
-    """The parents whose eight children are all leaves with equal values."""
+    """Yield the parents of which all eight children are leaves with equal values."""
     for key, children in parents.items():
         if len(children) == 8 and len(set(children)) == 1:
             yield key, children[0]

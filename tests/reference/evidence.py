@@ -1,4 +1,4 @@
-"""One robot's own evidence: the sums of its scans' log-odds increments, and the three readings of log q."""
+"""Evidence of one robot: sums of its scans' log-odds increments, and the three definitions of log q."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from octoreplay.records import Float64Array, Int64Array
 
 @dataclass(frozen=True, eq=False)
 class IndexedScan:
-    """One scan as indices into the team's list of cells; ``hit_classes`` are 1..C, ``hit_strengths`` in 255ths."""
+    """One scan as indices into the team's list of cells; ``hit_classes`` are 1..C, ``hit_strengths`` in 1 / 255."""
 
     robot: int
     stamp_ns: int
@@ -24,7 +24,7 @@ class IndexedScan:
 
 
 class Evidence:
-    """The clamped and the unclamped sum of one robot's increments, (M, K) with column 0 zero, and what was counted."""
+    """Clamped and unclamped sums of one robot's increments, (M, K) with column 0 zero, and numbers of scans."""
 
     def __init__(self, num_cells: int, num_classes: int) -> None:
         self.clamped: Float64Array = np.zeros((num_cells, num_classes + 1))
@@ -35,7 +35,7 @@ class Evidence:
     def integrate(self, scan: IndexedScan, sensor: SensorConfig) -> None:
         """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells.
 
-        ``hit`` counts as much as its class is sure.
+        ``hit`` is multiplied by strength / 255.
         """
         for cells, increments in self._increments(scan, sensor):
             self.total[cells] += increments
@@ -44,7 +44,7 @@ class Evidence:
         self.num_scans += 1
 
     def _increments(self, scan: IndexedScan, sensor: SensorConfig) -> Iterator[tuple[Int64Array, Float64Array]]:
-        """(cells, increments (., K)) of the freed and of the hit cells; a cell is in one of them, once."""
+        """Yield (cells, increments (., K)) of the freed and of the hit cells; each cell occurs once in one of them."""
         num_columns = self.clamped.shape[1]
         freed = np.full((len(scan.freed), num_columns), sensor.miss)
         hit = np.full((len(scan.hit), num_columns), sensor.miss if sensor.hit_other is None else sensor.hit_other)
@@ -54,7 +54,7 @@ class Evidence:
             yield cells, increments
 
     def log_likelihood(self, reading: str) -> Float64Array:
-        """log q (M, K), as a deviation from the prior: 'sum', 'time-average' or 'cell-average'."""
+        """Return log q (M, K) as a deviation from the prior; ``reading`` is 'sum', 'time-average' or 'cell-average'."""
         if reading == "sum":
             return self.clamped.copy()
         if reading == "time-average":

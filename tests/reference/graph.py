@@ -1,4 +1,4 @@
-"""The communication graph of a tick: links, weights, the step-size bound and the rate of convergence."""
+"""Communication graph of a tick: links, weights, step-size bound and rate of convergence."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class TeamGraph:
-    """The directed links (sender, receiver) among the robots that are active, the weights A (N, N) that receivers, the
-    rows, give to senders, with zeros on the diagonal, and the consensus step size."""
+    """Directed links (sender, receiver) of the active robots, weights A (N, N), and consensus step size.
+
+    Rows of A are receivers, columns senders; the diagonal is 0.
+    """
 
     directed: tuple[Link, ...]
     weights: Float64Array
@@ -31,19 +33,19 @@ class TeamGraph:
 
     @property
     def links(self) -> tuple[Link, ...]:
-        """The pairs {i, j}, i < j, with a link in either direction."""
+        """Pairs {i, j}, i < j, with a link in either direction."""
         return tuple(sorted({(min(link), max(link)) for link in self.directed}))
 
     def neighbours(self, robot: int) -> list[int]:
-        """Whom the robot hears, in the team's order."""
+        """Return the senders of the robot's incoming links, in the team's order."""
         return sorted(sender for sender, receiver in self.directed if receiver == robot)
 
     def receivers(self, robot: int) -> list[int]:
-        """Who hears the robot, in the team's order."""
+        """Return the receivers of the robot's outgoing links, in the team's order."""
         return sorted(receiver for sender, receiver in self.directed if sender == robot)
 
     def degree(self, robot: int) -> int:
-        """The number of robots that the robot hears."""
+        """Return the number of the robot's incoming links."""
         return len(self.neighbours(robot))
 
 
@@ -55,12 +57,12 @@ def team_graph(
     elapsed_s: float = 0.0,
     history: Sequence[Sequence[Sequence[float] | None]] = (),
 ) -> TeamGraph:
-    """The graph that the topology induces on the active robots at a time of the schedule, weighted anew.
+    """Return the graph of the topology on the active robots at a time of the schedule, with weights and step size.
 
-    ``history`` holds, tick by tick up to this one, each robot's position or None where it is not there.
+    ``history`` has, for each tick up to this one, each robot's position, or None where it has none.
 
-    Raises ConfigError when the step size is not below the bound of this graph (only the rules with a step size have
-    one), or when given weights have a row sum above 1.
+    Raises ConfigError where the step size is not below the bound of this graph (for rules with a step size), and where
+    given weights have a row sum above 1.
     """
     directed = directed_links(network, robot_ids, active, elapsed_s, history)
     weights = link_weights(network, directed, robot_ids)
@@ -77,7 +79,7 @@ def directed_links(
     elapsed_s: float = 0.0,
     history: Sequence[Sequence[Sequence[float] | None]] = (),
 ) -> tuple[Link, ...]:
-    """Every (sender, receiver), sorted: the topology's, less one-way pairs, then as the schedule says."""
+    """Return all (sender, receiver), sorted: links of the topology, without blocked directions, after the schedule."""
     entries = [entry for entry in network.schedule if entry.start <= elapsed_s and not entry.end <= elapsed_s]
     topology = topology_links(network, robot_ids, history)
     links = []
@@ -96,7 +98,7 @@ def directed_links(
 
 
 def _cuts(entry: ScheduleEntry, a: str, b: str) -> bool:
-    """Whether an entry keeps what a says from b."""
+    """Return whether an entry of the schedule cuts the link from a to b."""
     in_groups = [group for group in entry.groups if a in group or b in group]
     return (
         a in entry.robots_off
@@ -111,7 +113,7 @@ def _cuts(entry: ScheduleEntry, a: str, b: str) -> bool:
 def topology_links(
     network: NetworkConfig, robot_ids: Sequence[str], history: Sequence[Sequence[Sequence[float] | None]] = ()
 ) -> tuple[Link, ...]:
-    """Every link {i, j}, i < j, of the topology with all robots in it; the star's centre is the first robot."""
+    """Return all links {i, j}, i < j, of the topology over all robots; the star's centre is the first robot."""
     n = len(robot_ids)
     if network.topology == "complete":
         pairs = list(itertools.combinations(range(n), 2))
@@ -143,7 +145,7 @@ def topology_links(
 
 
 def _nearest(robot: int, positions: Sequence[Sequence[float] | None], most: int) -> list[int]:
-    """The robots nearest to one, the lower index first among equals."""
+    """Return the nearest robots; ties go to the lower index."""
     here = positions[robot]
     if here is None:
         return []
@@ -154,7 +156,7 @@ def _nearest(robot: int, positions: Sequence[Sequence[float] | None], most: int)
 
 
 def _in_range(pair: Link, history: Sequence[Sequence[Sequence[float] | None]], network: NetworkConfig) -> bool:
-    """Going back from now: whether the two came near before they were last too far apart, or not both there."""
+    """Return whether two robots are linked by range, with hysteresis over the history."""
     for positions in reversed(history):
         here, there = positions[pair[0]], positions[pair[1]]
         if here is None or there is None or math.dist(here, there) > network.radio_range + network.range_hysteresis:
@@ -165,8 +167,11 @@ def _in_range(pair: Link, history: Sequence[Sequence[Sequence[float] | None]], n
 
 
 def link_weights(network: NetworkConfig, directed: Sequence[Link], robot_ids: Sequence[str]) -> Float64Array:
-    """A (N, N), with degree_i the number of robots that i hears: Metropolis 1 / (1 + max(degree_i, degree_j)),
-    1 / degree_i, 1 / (1 + the largest degree), or the edge list's (both directions)."""
+    """Return A (N, N), where degree_i is the number of i's incoming links.
+
+    Weights are Metropolis 1 / (1 + max(degree_i, degree_j)), 1 / degree_i, 1 / (1 + largest degree), or those of the
+    edge list (both directions).
+    """
     n = len(robot_ids)
     degree = [sum(receiver == i for _, receiver in directed) for i in range(n)]
     given = {frozenset((a, b)): weight for a, b, weight in network.edges}
@@ -187,12 +192,12 @@ def link_weights(network: NetworkConfig, directed: Sequence[Link], robot_ids: Se
 
 
 def laplacian(weights: Float64Array) -> Float64Array:
-    """L = diag(row sums of A off the diagonal) - A."""
+    """Return L = diag(row sums of A off the diagonal) - A."""
     return np.diag(weights.sum(axis=1)) - weights
 
 
 def step_size(consensus: ConsensusConfig, network: NetworkConfig, weights: Float64Array) -> float:
-    """epsilon as configured; by default 0.5 with Metropolis and max-degree weights, else min(0.5, 0.9 x the bound)."""
+    """Return epsilon: configured, 0.5 with Metropolis and max-degree weights, else min(0.5, 0.9 x bound)."""
     if consensus.epsilon is not None:
         return consensus.epsilon
     if network.weights in ("metropolis", "max-degree"):
@@ -201,10 +206,10 @@ def step_size(consensus: ConsensusConfig, network: NetworkConfig, weights: Float
 
 
 def step_size_bound(weights: Float64Array) -> float:
-    """The epsilon below which consensus converges; infinite without links.
+    """Return the epsilon below which consensus converges; infinite without links.
 
-    Symmetric A: 1 / lambda_max(L). Else the least Re(mu) / |mu|^2 over the non-zero eigenvalues of L, which is where
-    |1 - 2 epsilon mu| reaches 1.
+    It is 1 / lambda_max(L) for symmetric A, else the smallest Re(mu) / |mu|^2 over the non-zero eigenvalues mu of L, at
+    which |1 - 2 epsilon mu| reaches 1.
     """
     if np.array_equal(weights, weights.T):
         values = np.linalg.eigvalsh(laplacian(weights)).astype(complex)
@@ -214,8 +219,10 @@ def step_size_bound(weights: Float64Array) -> float:
 
 
 def simulated_bound(weights: Float64Array, num_steps: int = 1 << 17) -> float:
-    """The epsilon below which consensus converges, by running it: bisection between 0.4 and 10 on what happens to the
-    differences L h in so many steps."""
+    """Return the epsilon below which consensus converges, by simulation.
+
+    Bisection between 0.4 and 10 on the growth of the differences L h in ``num_steps`` steps.
+    """
     matrix = laplacian(weights)
     low, high = 0.4, 10.0
     for _ in range(20):
@@ -224,7 +231,7 @@ def simulated_bound(weights: Float64Array, num_steps: int = 1 << 17) -> float:
         log_scale = 0.0
         for _ in range(num_steps.bit_length() - 1):
             power = power @ power
-            scale = max(1e-300, float(np.abs(power).max()))  # kept apart, so that nothing overflows
+            scale = max(1e-300, float(np.abs(power).max()))  # the scale is separate, so that nothing overflows
             power, log_scale = power / scale, 2.0 * log_scale + math.log(scale)
         shrinks = log_scale + math.log(max(1e-300, float(np.abs(matrix @ power).max()))) < 0.0
         low, high = (epsilon, high) if shrinks else (low, epsilon)
@@ -232,22 +239,22 @@ def simulated_bound(weights: Float64Array, num_steps: int = 1 << 17) -> float:
 
 
 def check_step_size(epsilon: float, weights: Float64Array) -> None:
-    """Raise ConfigError when epsilon is not below the bound."""
+    """Raise ConfigError where epsilon is not below the bound."""
     bound = step_size_bound(weights)
     if not epsilon < bound * (1.0 - _ROUNDING):
         raise ConfigError(f"epsilon: {epsilon:g} is not below the bound {bound:g} of this graph")
 
 
 def second_eigenvalue(graph: TeamGraph) -> float:
-    """lambda_2: the second largest |eigenvalue| of I - 2 epsilon L, that is the largest |1 - 2 epsilon mu| over the
-    non-zero eigenvalues mu of L; 0 without any.
+    """Return lambda_2, the second largest |eigenvalue| of I - 2 epsilon L.
 
-    On a graph in several parts (a robot without links is one) this is the rate of the part that agrees slowest.
+    It is the largest |1 - 2 epsilon mu| over the non-zero eigenvalues mu of L, 0 without any. In a graph of several
+    components, it is the rate of the slowest one.
     """
     values = np.linalg.eigvals(laplacian(graph.weights))
     return max((float(abs(1.0 - 2.0 * graph.epsilon * mu)) for mu in values if abs(mu) > _ROUNDING), default=0.0)
 
 
 def default_settle_max(num_ramp_ticks: int, lambda_2: float) -> int:
-    """Most settling ticks: ramp + 12 / -log10 lambda_2, rounded up; lambda_2 is held in [1e-12, 1 - 1e-9]."""
+    """Return the maximum number of settling ticks: ramp + ceil(12 / -log10 lambda_2), lambda_2 in [1e-12, 1 - 1e-9]."""
     return num_ramp_ticks + math.ceil(12.0 / -math.log10(min(max(lambda_2, 1e-12), 1.0 - 1e-9)))

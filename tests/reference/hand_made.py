@@ -1,4 +1,4 @@
-"""Frames and configurations small enough to follow by hand: one pixel, one ray along +x, cells of 1 m."""
+"""Small frames and configurations for calculations by hand: one pixel, one ray along +x, cells of 1 m."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from octoreplay.records import CameraModel, ClassTable, CloudFrame, DepthFrame, 
 START_NS = 5_000_000_000
 
 FACING_X = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rotation of a level camera that looks along +x."""
+"""Rotation of a level camera with its optical axis along +x."""
 
 
 def facing_x(x: float = 0.5, y: float = 0.5, z: float = 0.5) -> np.ndarray:
-    """T_team_sensor (4, 4) of a camera at a point, looking along +x."""
+    """Return T_team_sensor (4, 4) of a camera at a point with its optical axis along +x."""
     pose = np.eye(4)
     pose[:3, :3] = FACING_X
     pose[:3, 3] = (x, y, z)
@@ -28,7 +28,7 @@ def facing_x(x: float = 0.5, y: float = 0.5, z: float = 0.5) -> np.ndarray:
 def depth_frame(
     image: Any, classes: Any = None, *, robot_id: str = "a", seconds: float = 0.0, pose: Any = None, unit: float = 1.0
 ) -> DepthFrame:
-    """A depth image whose pixel in column u and row v looks along (1, -u, -v) in the team's frame (f = 1 pixel)."""
+    """Return a depth image with f = 1 pixel: the ray of pixel (u, v) is along (1, -u, -v) in the team's frame."""
     image = np.atleast_2d(image)
     return DepthFrame(
         robot_id=robot_id,
@@ -42,12 +42,12 @@ def depth_frame(
 
 
 def ray(robot_id: str, seconds: float, class_id: int, distance: float = 2.0) -> DepthFrame:
-    """One ray from (0.5, 0.5, 0.5) along +x: with 2 m it frees cells 0 and 1 of the row and hits cell 2."""
+    """Return a frame of one ray from (0.5, 0.5, 0.5) along +x. With 2 m it frees cells 0 and 1 and hits cell 2."""
     return depth_frame(np.array([[distance]], dtype=np.float32), [[class_id]], robot_id=robot_id, seconds=seconds)
 
 
 def cloud(points: Any, class_ids: Any, *, dtype: Any = np.float64) -> CloudFrame:
-    """A cloud in a sensor frame that is the team's frame moved to (0.5, 0.5, 0.5)."""
+    """Return a cloud of a sensor at (0.5, 0.5, 0.5) without rotation."""
     pose = np.eye(4)
     pose[:3, 3] = 0.5
     ids = None if class_ids is None else np.array(class_ids, dtype=np.uint8)
@@ -55,7 +55,7 @@ def cloud(points: Any, class_ids: Any, *, dtype: Any = np.float64) -> CloudFrame
 
 
 def team_config(robot_ids: str = "ab", num_classes: int = 2, **parameters: Any) -> RunConfig:
-    """A team whose robots are single letters, with cells of 1 m and ticks of 1 s."""
+    """Return the configuration of a team with one-letter robots, cells of 1 m and ticks of 1 s."""
     table = ClassTable(tuple(SemanticClass(c, f"class_{c}", (c, c, c), (c,)) for c in range(1, num_classes + 1)))
     robots = tuple(RobotConfig(robot_id, (Path(f"{robot_id}.mcap"),)) for robot_id in robot_ids)
     return RunConfig(robots=robots, classes=table).with_parameters({"resolution": 1.0, **parameters})

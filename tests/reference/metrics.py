@@ -1,4 +1,4 @@
-"""The team's metrics after a tick, on the uniform grid. See docs/metrics.md.
+"""Team metrics after a tick on the uniform grid; docs/metrics.md defines them.
 
 ``maps`` is (N, M, K): absolute log-odds of N robots, column 0 zero, the prior where a robot knows nothing. ``known`` is
 (N, M): the cells that are in each robot's map. ``oracle`` is (M, K).
@@ -16,15 +16,15 @@ from octoreplay.records import BoolArray, Float64Array, Int64Array
 from reference.rules import softmax
 
 TIE = 1e-3
-"""A robot's label agrees when the oracle's value for it is within this of the oracle's maximum."""
+"""A robot's label agrees where the oracle's value of it is this close to the oracle's maximum."""
 
 UNKNOWN = -1
-"""The label of a cell that is not in a robot's map."""
+"""Label of cells that are not in a robot's map."""
 
 
 @dataclass(frozen=True)
 class TwinMetrics:
-    """The team after one tick; per-robot values are in the team's order."""
+    """Metrics after one tick; values of robots are in the team's order."""
 
     total_distance: float
     total_distance_all: float
@@ -45,7 +45,7 @@ def team_metrics(
     links: Sequence[tuple[int, int]],
     max_change: float,
 ) -> TwinMetrics:
-    """All metrics of one tick."""
+    """Return all metrics of one tick."""
     robots = range(len(maps))
     pairs = list(itertools.combinations(robots, 2))
     labels = robot_labels(maps, known)
@@ -68,17 +68,17 @@ def team_metrics(
 
 
 def squared_distance(a: Float64Array, b: Float64Array) -> float:
-    """Sum over cells of ||a - b||^2; cells that neither map knows hold the prior in both and add nothing."""
+    """Return the sum over cells of ||a - b||^2; cells unknown to both maps have the prior in both and add 0."""
     return float(((a - b) ** 2).sum())
 
 
 def robot_labels(maps: Float64Array, known: BoolArray) -> Int64Array:
-    """(N, M) argmax of each map, the lowest class at a tie, UNKNOWN where the robot does not know the cell."""
+    """Return the argmax (N, M) of each map; ties go to the lowest class, unknown cells are UNKNOWN."""
     return np.where(known, maps.argmax(axis=2), UNKNOWN)
 
 
 def oracle_agreement(labels: Int64Array, oracle: Float64Array, cells: BoolArray) -> tuple[float, float]:
-    """Share of ``cells`` where one robot's labels agree with the oracle: of all, and of those it labels occupied.
+    """Return the share of ``cells`` where a robot's labels agree with the oracle: of all, and of the oracle's occupied.
 
     A share of no cells is 1.
     """
@@ -89,20 +89,20 @@ def oracle_agreement(labels: Int64Array, oracle: Float64Array, cells: BoolArray)
 
 
 def label_disagreement(labels: Int64Array, cells: BoolArray) -> float:
-    """Share of ``cells`` whose label, unknown included, differs between any two robots; 0 of no cells."""
+    """Return the share of ``cells`` in which any two robots' labels, including unknown, differ; 0 of no cells."""
     return _share(labels.min(axis=0) != labels.max(axis=0), cells, empty=0.0)
 
 
 def mean_entropy(log_odds: Float64Array) -> float:
-    """Mean entropy [bits] of the cells' distributions; 0 of no cells."""
+    """Return the mean entropy of the cells [bit]; 0 of no cells."""
     if not len(log_odds):
         return 0.0
     prob = softmax(log_odds)
-    # p log p is 0 at p = 0, which exp reaches by underflow.
+    # p log p is 0 at p = 0, which occurs where exp underflows.
     terms = prob * np.log2(np.where(prob > 0, prob, 1.0))
     return float(-terms.sum(axis=1).mean())
 
 
 def _share(true: BoolArray, among: BoolArray, *, empty: float) -> float:
-    """The share of ``among`` where ``true`` holds."""
+    """Return the share of ``among`` in which ``true`` is True."""
     return float((true & among).sum() / among.sum()) if among.any() else empty

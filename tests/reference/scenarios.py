@@ -1,7 +1,7 @@
-"""Seeded small teams for judging the fast code: robots that drive through an analytic scene with overlapping views.
+"""Seeded small teams for tests: robots that drive through an analytic scene with overlapping views.
 
 The scene is a ground plane (grass with a dirt road) and axis-aligned boxes (buildings, trees, cars), ray-cast in closed
-form with numpy. Images carry depth noise, wrong labels, pixels without label and pixels without depth. Nothing in the
+form with numpy. Images have depth noise, wrong labels, pixels without label and pixels without depth. Nothing in the
 scene, the poses or the stamps is aligned with cells, except where a stamp falls on a tick on purpose.
 """
 
@@ -32,7 +32,7 @@ from octoreplay.records import (
 )
 
 START_NS = 1_700_000_000_000_000_000
-"""The team's first stamp."""
+"""First stamp of the team."""
 
 CLASS_NAMES = ("grass", "dirt_road", "building", "tree", "car")
 GRASS, DIRT_ROAD, BUILDING, TREE, CAR = range(1, 6)
@@ -43,7 +43,7 @@ ROAD_HALF_WIDTH = 1.137
 
 @dataclass(frozen=True)
 class TeamShape:
-    """What a scenario is made from. Lengths in metres, times in seconds.
+    """Parameters of a scenario. Lengths in metres, times in seconds.
 
     The last robot starts at ``late_start`` of the duration and the last but one ends at ``early_end`` of it (teams of
     three and more). ``sensors``: 'depth16' (uint16 mm), 'depth32' (float32 m), 'cloud', or 'mixed', which gives robot
@@ -68,7 +68,7 @@ class TeamShape:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A team's frames in order of (stamp, robot), and the configuration that goes with them."""
+    """Frames of a team in order of (stamp, robot), and their configuration."""
 
     frames: tuple[Frame, ...]
     class_table: ClassTable
@@ -76,11 +76,11 @@ class Scenario:
 
     @property
     def robot_ids(self) -> tuple[str, ...]:
-        """The team, in its order."""
+        """Robot ids in the team's order."""
         return tuple(robot.robot_id for robot in self.base_config.robots)
 
     def config(self, edges: tuple[tuple[str, str, float | None], ...] = (), **parameters: Any) -> RunConfig:
-        """The configuration with flat parameters replaced; ``edges`` goes with topology='edges'."""
+        """Return the configuration with parameters replaced; ``edges`` is for topology='edges'."""
         network_names = {field.name for field in dataclasses.fields(NetworkConfig)}
         network = {name: parameters.pop(name) for name in list(parameters) if name in network_names}
         config = self.base_config.with_parameters(parameters)
@@ -96,8 +96,10 @@ class Scene:
     classes: Int64Array
 
     def cast(self, origin: Float64Array, directions: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """The ray parameter t (P,) of the first surface that each ray origin + t direction (P, 3) meets (infinite where
-        there is none) and its class (P,). A box that holds the origin is not seen."""
+        """Return the ray parameter t (P,) and class (P,) of the first surface on each ray origin + t direction (P, 3).
+
+        t is infinite where there is no surface. A box that holds the origin is ignored.
+        """
         with np.errstate(divide="ignore"):
             inverse = 1.0 / directions[:, None, :]
         to_lower = (self.lower - origin)[None] * inverse
@@ -118,7 +120,7 @@ class Scene:
 
 
 def make_scenario(seed: int = 0, shape: TeamShape | None = None) -> Scenario:
-    """A seeded team; the same seed and shape give the same frames."""
+    """Return a seeded team; the same seed and shape give the same frames."""
     shape = shape or TeamShape()
     rng = np.random.default_rng(seed)
     paths = [_Path.random(i, shape.num_robots, rng) for i in range(shape.num_robots)]
@@ -141,12 +143,12 @@ def make_scenario(seed: int = 0, shape: TeamShape | None = None) -> Scenario:
 
 
 def _robot_id(index: int) -> str:
-    """Names whose alphabetical order is the team's order (up to ten robots)."""
+    """Return robot ids in alphabetical order (up to ten robots)."""
     return f"robot_{index}"
 
 
 def _class_table() -> ClassTable:
-    """The five classes of the scene; raw label = class_id."""
+    """Return the five classes of the scene; raw label = class_id."""
     return ClassTable(
         tuple(SemanticClass(i + 1, name, PALETTE[i], (i + 1,)) for i, name in enumerate(CLASS_NAMES)),
         ignored_raw_labels=(NO_CLASS,),
@@ -155,7 +157,7 @@ def _class_table() -> ClassTable:
 
 @dataclass(frozen=True)
 class _Path:
-    """A closed drive around a centre, while the camera swings; all robots drive near the middle of the scene."""
+    """Closed drive around a centre near the middle of the scene, with a swinging camera."""
 
     centre: tuple[float, float]
     radii: tuple[float, float]
@@ -167,7 +169,7 @@ class _Path:
 
     @staticmethod
     def random(index: int, num_robots: int, rng: np.random.Generator) -> _Path:
-        """Robot ``index``'s drive; neighbours on the circle of centres see most of the same cells."""
+        """Return the drive of robot ``index``; the views of neighbours on the circle of centres overlap most."""
         angle = 2 * np.pi * index / num_robots + rng.uniform(-0.2, 0.2)
         return _Path(
             centre=(2.6 * np.cos(angle), 2.6 * np.sin(angle)),
@@ -180,14 +182,14 @@ class _Path:
         )
 
     def position(self, seconds: float) -> Float64Array:
-        """Where the camera is, (3,)."""
+        """Return the position (3,) of the camera [m]."""
         turn = 2 * np.pi * seconds / self.period + self.phase
         x = self.centre[0] + self.radii[0] * np.cos(turn)
         y = self.centre[1] + self.radii[1] * np.sin(turn)
         return np.array([x, y, self.height + 0.02 * np.sin(3.1 * turn)])
 
     def pose(self, seconds: float) -> Float64Array:
-        """T_team_sensor (4, 4): z looks forward, x right, y down."""
+        """Return T_team_sensor (4, 4): z points forward, x right, y down."""
         turn = 2 * np.pi * seconds / self.period + self.phase
         yaw = turn + np.pi / 2 + self.swing * np.sin(2.3 * turn)
         pitch = self.pitch + 0.05 * np.sin(1.7 * turn)
@@ -200,7 +202,7 @@ class _Path:
 
 
 def _random_scene(paths: list[_Path], rng: np.random.Generator) -> Scene:
-    """Boxes of the three standing classes in a square of 16 m, none within 0.6 m of a drive."""
+    """Return boxes of buildings, trees and cars in a square of 16 m, none within 0.6 m of a drive."""
     driven = np.array([path.position(s)[:2] for path in paths for s in np.linspace(0.0, path.period, 60)])
     sizes = {BUILDING: (2.2, 1.7, 2.1), TREE: (0.35, 0.35, 2.4), CAR: (1.3, 0.7, 0.8)}
     lower: list[Float64Array] = []
@@ -219,7 +221,7 @@ def _random_scene(paths: list[_Path], rng: np.random.Generator) -> Scene:
 
 
 def _stamps(index: int, shape: TeamShape, rng: np.random.Generator) -> Int64Array:
-    """One robot's stamps. The first robot starts the team's clock, and some of its stamps fall exactly on a tick."""
+    """Return one robot's stamps. The first robot has the team's first stamp; some of its stamps are exactly ticks."""
     duration = (shape.num_ticks - 1) * shape.publish_period - 0.25 * shape.publish_period
     begin, end = 0.0, duration
     if shape.num_robots >= 3 and index == shape.num_robots - 1:
@@ -237,7 +239,7 @@ def _stamps(index: int, shape: TeamShape, rng: np.random.Generator) -> Int64Arra
 def _robot_frames(
     index: int, path: _Path, scene: Scene, shape: TeamShape, rng: np.random.Generator
 ) -> list[DepthFrame] | list[CloudFrame]:
-    """All frames of one robot."""
+    """Return all frames of one robot."""
     width, height = shape.image
     camera = CameraModel(width, height, 0.72 * width, 0.72 * width, 0.5 * (width - 1), 0.5 * (height - 1))
     kinds = ("depth16", "depth32", "cloud")
@@ -258,9 +260,9 @@ def _robot_frames(
 def _see(
     scene: Scene, camera: CameraModel, pose: Float64Array, shape: TeamShape, rng: np.random.Generator
 ) -> tuple[Float64Array, UInt8Array]:
-    """A noisy z-depth image (H, W) [m], NaN where nothing was measured, and a noisy class image (H, W)."""
+    """Return a noisy depth image (H, W) [m], NaN where nothing was measured, and a noisy class image (H, W)."""
     pixels = _pixel_directions(camera)
-    # The directions have z = 1 in the camera's frame, so the ray parameter is the z-depth.
+    # The directions have z = 1 in the camera's frame, so the ray parameter is the depth along z.
     depth, classes = scene.cast(pose[:3, 3], pixels @ pose[:3, :3].T)
     with np.errstate(invalid="ignore"):
         depth = depth + rng.normal(size=depth.shape) * (0.0012 + 0.0019 * (np.minimum(depth, 20.0) - 0.4) ** 2)
@@ -274,14 +276,14 @@ def _see(
 
 
 def _pixel_directions(camera: CameraModel) -> Float64Array:
-    """Ray directions (H * W, 3) with z = 1, in the camera's frame."""
+    """Return ray directions (H * W, 3) with z = 1 in the camera's frame."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
 
 
 def _as_uint16(depth: Float64Array, rng: np.random.Generator) -> Any:
-    """Millimetres; what was not measured is 0 or, one time in four, 65535."""
+    """Return depths [mm]; pixels without measurement are 0 or, in one of four cases, 65535."""
     lost = np.where(rng.random(depth.shape) < 0.25, 65535.0, 0.0)
     return np.where(np.isnan(depth), lost, np.rint(np.nan_to_num(depth) * 1000.0)).astype(np.uint16)
 
@@ -289,6 +291,6 @@ def _as_uint16(depth: Float64Array, rng: np.random.Generator) -> Any:
 def _as_cloud(
     robot_id: str, stamp_ns: int, depth: Float64Array, classes: UInt8Array, camera: CameraModel, pose: Float64Array
 ) -> CloudFrame:
-    """The image as points (float32), rows that were not measured being NaN."""
+    """Return the image as points float32; rows without measurement are NaN."""
     points = _pixel_directions(camera) * depth.reshape(-1, 1)
     return CloudFrame(robot_id, stamp_ns, points.astype(np.float32), classes.ravel(), pose)

@@ -1,6 +1,6 @@
-"""The inverse sensor model of one scan: which cells it frees, which it hits, and with which class.
+"""Inverse sensor model of one scan: cells that it frees, cells that it hits, and their classes.
 
-OctoMap's rule holds: one update per cell and scan, and a cell that is hit is not freed as well.
+Each cell is updated once in a scan, and a cell that is hit is not also freed (OctoMap's rule).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from reference.rays import Key, cells_before_end, coord_to_key, key_to_coord
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What one scan measured, one row per ray.
+    """Measurements of one scan, one row for each ray.
 
     ``ends`` is (P, 3) float64, team frame [m]: the measured point, or the cut end of a ray beyond max_range.
     ``class_ids`` is (P,): 1..C for a point that hits its cell, NO_CLASS for one that only frees its ray (an ignored
-    label, a cut ray, 'no return', another robot's body, a label without confidence).
-    ``confidences`` (P,) say how sure each label is, in 255ths.
+    label, a cut ray, 'no return', another robot's body, zero confidence).
+    ``confidences`` is (P,): label confidences in 1 / 255.
     """
 
     origin: Float64Array
@@ -45,9 +45,9 @@ class Measurements:
 
 @dataclass(frozen=True, eq=False)
 class ScanUpdate:
-    """The cells that one scan touches, each once: ``freed`` (F, 3), ``hit`` (H, 3), and the class of each hit (H,).
+    """Cells that one scan touches, each once: ``freed`` (F, 3), ``hit`` (H, 3), and the class of each hit (H,).
 
-    ``hit_strengths`` (H,) are how sure these classes are, in 255ths.
+    ``hit_strengths`` (H,) are the confidences of these classes in 1 / 255.
     """
 
     freed: Int64Array
@@ -57,7 +57,7 @@ class ScanUpdate:
 
 
 def scan_update(frame: Frame, sensor: SensorConfig, region: MapConfig) -> ScanUpdate:
-    """The cells that a scan frees and hits; cells whose centre is outside the mapped region are left out."""
+    """Return the cells that a scan frees and hits, without cells with a centre outside the mapped region."""
     measured = measurements(frame, sensor)
     hit = hit_cells(measured, region.resolution)
     passed = passed_cells(measured, sensor.rays, region.resolution)
@@ -72,17 +72,17 @@ def scan_update(frame: Frame, sensor: SensorConfig, region: MapConfig) -> ScanUp
 
 
 def in_region(key: Key, region: MapConfig) -> bool:
-    """True when the cell's centre lies in the mapped region [min, max)."""
+    """Return True where the cell's centre is in the mapped region [min, max)."""
     box = region.box
     centre = key_to_coord(key, region.resolution)
     return all(box[axis] <= centre[axis] < box[axis + 3] for axis in range(3))
 
 
 def hit_cells(measured: Measurements, resolution: float) -> dict[Key, tuple[int, int]]:
-    """The class of every end cell with a labelled point, and its strength in 255ths.
+    """Return the class of every end cell with a labelled point, and its strength in 1 / 255.
 
-    The class with the largest sum of confidences wins, ties to the lower id; its strength is their mean, rounded half
-    up.
+    The class with the largest sum of confidences wins, ties go to the lower id. Its strength is the mean confidence of
+    its points, rounded half up.
     """
     votes: dict[Key, dict[int, list[int]]] = {}
     for end, class_id, confidence in zip(measured.ends, measured.class_ids, measured.confidences, strict=True):
@@ -94,15 +94,15 @@ def hit_cells(measured: Measurements, resolution: float) -> dict[Key, tuple[int,
 
 
 def _rounded_mean(numbers: list[int]) -> int:
-    """The mean of whole numbers, rounded half up."""
+    """Return the mean of integers, rounded half up."""
     return math.floor(sum(numbers) / len(numbers) + 0.5)
 
 
 def passed_cells(measured: Measurements, rays: str, resolution: float) -> set[Key]:
-    """Every cell that any ray passes before its end cell.
+    """Return all cells that any ray passes before its end cell.
 
-    ``rays`` 'cells': one ray per distinct end cell (of hits, ignored points and cut rays alike) to the cell's centre.
-    'all': one ray per measured point, to the point itself or to the exact cut end.
+    With ``rays`` 'cells', one ray goes to the centre of each distinct end cell (of hits, ignored points and cut rays).
+    With 'all', one ray goes to each measured point or exact cut end.
     """
     origin = measured.origin.tolist()
     passed: set[Key] = set()
@@ -117,7 +117,7 @@ def passed_cells(measured: Measurements, rays: str, resolution: float) -> set[Ke
 
 
 def measurements(frame: Frame, sensor: SensorConfig) -> Measurements:
-    """The rays of one scan that carry information, in the team's frame."""
+    """Return the rays of one scan that carry information, in the team's frame."""
     if isinstance(frame, DepthFrame):
         points, class_ids, confidences, no_return = _depth_points(frame, sensor)
     else:
@@ -138,7 +138,7 @@ def measurements(frame: Frame, sensor: SensorConfig) -> Measurements:
 
 
 def in_any_box(points: Float64Array, boxes: Iterable[BodyBox]) -> BoolArray:
-    """Which of the points (P, 3), in the team's frame, lie in a box, its faces included."""
+    """Return where points (P, 3) in the team's frame are in a box or on its faces."""
     within = np.zeros(len(points), dtype=bool)
     for box in boxes:
         places = points @ box.T_box_team[:3, :3].T + box.T_box_team[:3, 3]
@@ -147,11 +147,9 @@ def in_any_box(points: Float64Array, boxes: Iterable[BodyBox]) -> BoolArray:
 
 
 def _depth_points(frame: DepthFrame, sensor: SensorConfig) -> tuple[Float64Array, Int64Array, Int64Array, BoolArray]:
-    """Points (P, 3) in the sensor's frame, classes, confidences and the 'no return' mask of a depth image's usable
-    pixels.
+    """Return points (P, 3) in the sensor's frame, classes, confidences and 'no return' mask of the usable pixels.
 
-    A pixel without return stands for the point of its ray at depth 1 m; only its direction is used. One whose ray is
-    not known is not usable.
+    A pixel without return gets the point at depth 1 m; only its direction is used. Pixels without a ray are not usable.
     """
     image, camera = frame.depth_image, frame.camera
     across, down = np.meshgrid(
@@ -172,7 +170,7 @@ def _depth_points(frame: DepthFrame, sensor: SensorConfig) -> tuple[Float64Array
 
 
 def _without_information(image: npt.NDArray[Any], invalid_depth: tuple[float, ...]) -> BoolArray:
-    """True for depths that are 0, negative, not finite, the largest value of an integer type, or named invalid."""
+    """Return True for depths that are <= 0, not finite, the largest value of an integer type, or in invalid_depth."""
     if np.issubdtype(image.dtype, np.integer):
         by_type = (image <= 0) | (image == np.iinfo(image.dtype).max)
     else:
@@ -182,7 +180,7 @@ def _without_information(image: npt.NDArray[Any], invalid_depth: tuple[float, ..
 
 
 def _equals_any(image: npt.NDArray[Any], values: tuple[float, ...]) -> BoolArray:
-    """True where the raw depth is one of ``values``, as the image's own type stores them; NaN equals NaN."""
+    """Return True where the raw depth is one of ``values`` in the image's dtype; NaN equals NaN."""
     found = np.zeros(image.shape, dtype=bool)
     for value in values:
         if np.issubdtype(image.dtype, np.integer):
@@ -195,7 +193,7 @@ def _equals_any(image: npt.NDArray[Any], values: tuple[float, ...]) -> BoolArray
 
 
 def _cloud_points(frame: CloudFrame) -> tuple[Float64Array, Int64Array, Int64Array, BoolArray]:
-    """The finite points of a cloud, their classes and confidences, and a 'no return' mask that is False."""
+    """Return the finite points of a cloud, their classes and confidences, and a 'no return' mask of False."""
     finite = np.isfinite(frame.points).all(axis=1)
     points = frame.points[finite].astype(np.float64)
     if frame.class_ids is None:

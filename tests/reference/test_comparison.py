@@ -31,7 +31,7 @@ def test_equal_maps_do_not_differ():
     assert (result.missing, result.spurious, result.overlapping) == (0, 0, 0)
 
 
-def test_a_wrong_value_is_found_where_it_is():
+def test_wrong_value_is_reported_with_its_key():
     keys, tick = _local_run()
     centers, sizes, log_odds = GOOD
     wrong = [log_odds[0], [-0.3, 0.2], log_odds[2]]
@@ -42,14 +42,14 @@ def test_a_wrong_value_is_found_where_it_is():
 
 def test_missing_spurious_and_overlapping_cells_are_counted():
     keys, tick = _local_run()
-    # One leaf of 2 m over cells 0..1 (and seven that nobody touched beside them), a second one over cell 0, none at 2.
+    # One leaf of 2 m over cells 0..1 (and seven untouched cells), a second one over cell 0, none at 2.
     leaves = _leaves([[1.0, 1.0, 1.0], [0.5, 0.5, 0.5]], [2, 1], [[-0.3, -0.3], [-0.3, -0.3]])
     result = compare_map(keys, tick, 0, leaves, 1.0)
     assert (result.missing, result.spurious, result.overlapping) == (1, 6, 1)
     assert result.max_abs == pytest.approx(1.0)
 
 
-def test_no_leaves_are_all_missing():
+def test_all_cells_are_missing_without_leaves():
     keys, tick = _local_run()
     empty = _leaves(np.zeros((0, 3)), [], np.zeros((0, 2)))
     result = compare_map(keys, tick, 0, empty, 1.0)
@@ -75,6 +75,6 @@ def test_lossless_leaves_by_hand():
     assert num_lossless_leaves(cube, values, max_levels=1) == 8
     values[0, 1] = 2.0
     assert num_lossless_leaves(cube, values) == 7 + 8
-    # Seven of eight known siblings stay seven leaves; so do eight equal cells that are no siblings.
+    # Seven of eight siblings are seven leaves; eight equal cells that are no siblings are eight leaves.
     assert num_lossless_leaves(cube[1:], np.ones((63, 2))) == 7 + 7
     assert num_lossless_leaves(np.array(list(itertools.product((1, 2), repeat=3))), np.ones((8, 2))) == 8

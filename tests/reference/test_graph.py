@@ -46,11 +46,11 @@ def test_more_topologies_by_hand():
     assert len(_team("random", prob_link=1.0).links) == 10
     assert _team("random", network_seed=7).links == _team("random", network_seed=7).links
     here = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)]
-    # b is as near to a as e is; the lower index counts.
+    # b and e are at the same distance from a; the lower index is chosen.
     assert _team("nearest", num_nearest=1, history=[here]).links == ((0, 1), (0, 4), (1, 3))
 
 
-def test_a_link_in_range_stands_until_it_is_beyond_the_hysteresis():
+def test_link_by_range_persists_up_to_the_hysteresis():
     def linked(*distances):
         history = [[(0.0, 0.0, 0.0), None if d is None else (0.0, d, 0.0)] for d in distances]
         robots = ("a", "b")
@@ -65,7 +65,7 @@ def test_a_link_in_range_stands_until_it_is_beyond_the_hysteresis():
     assert linked(9.9, 12.1, 9.0)
 
 
-def test_one_way_pairs_and_what_the_schedule_says():
+def test_one_way_pairs_and_the_schedule():
     entries = (
         ScheduleEntry(10.0, 20.0, groups=(("a", "b"), ("c",))),
         ScheduleEntry(20.0, 30.0, links_up=(("a", "c"),), robots_silent=("b",)),
@@ -96,7 +96,7 @@ def test_metropolis_weights_by_hand():
     np.testing.assert_allclose(graph.laplacian(line.weights).sum(axis=1), 0.0, atol=1e-16)
 
 
-def test_weights_are_made_anew_among_the_active_robots():
+def test_weights_are_those_of_the_active_robots():
     pair = _team("complete", active=[True, False, False, True, False])
     assert pair.weights[0, 3] == pair.weights[3, 0] == 0.5
     assert pair.weights.sum() == 1.0
@@ -113,7 +113,7 @@ def test_max_degree_weights_by_hand():
     np.testing.assert_allclose(star.weights, [[0.0, third, third], [third, 0.0, 0.0], [third, 0.0, 0.0]])
 
 
-def test_weights_of_a_one_way_link_are_the_receivers():
+def test_one_way_link_has_a_weight_at_the_receiver_only():
     team = _team("line", robots=("a", "b", "c"), one_way=(("a", "b"),), weights="degree")
     assert team.weights.tolist() == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.0, 1.0, 0.0]]
 
@@ -146,12 +146,12 @@ def test_complex_eigenvalues_of_asymmetric_weights():
     assert graph.step_size_bound(directed) == pytest.approx(0.5)
 
 
-def test_the_simulated_bound_by_hand():
+def test_simulated_bound_by_hand():
     directed = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     assert graph.simulated_bound(directed) == pytest.approx(0.5, rel=1e-3)
     line = _team("line", robots=("a", "b", "c"))
     assert graph.simulated_bound(line.weights) == pytest.approx(1.0, rel=1e-3)
-    # One robot hears another at 1/2: mu = 1/2.
+    # One link of weight 1/2: mu = 1/2.
     assert graph.simulated_bound(np.array([[0.0, 0.5], [0.0, 0.0]])) == pytest.approx(2.0, rel=1e-3)
 
 

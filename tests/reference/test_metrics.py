@@ -24,7 +24,7 @@ def test_agreement_counts_ties_and_unknown_cells():
     cells = np.array([True, True, True, False])
     # Class 1 in cell 2 is within 1e-3 of the oracle's best, so it agrees.
     assert metrics.oracle_agreement(np.array([1, 0, 1, 0]), ORACLE, cells) == (1.0, 1.0)
-    # Not knowing the occupied cell 0 is a disagreement: 2 of 3 cells, 1 of the 2 occupied ones.
+    # The unknown occupied cell 0 is a disagreement: 2 of 3 cells agree, 1 of the 2 occupied ones.
     unknown = metrics.UNKNOWN
     assert metrics.oracle_agreement(np.array([unknown, 0, 2, 0]), ORACLE, cells) == (pytest.approx(2 / 3), 0.5)
     # Free in cell 2 is 1.0005 below.
@@ -38,7 +38,7 @@ def test_shares_of_no_cells():
     assert metrics.mean_entropy(np.zeros((0, 3))) == 0.0
 
 
-def test_labels_take_the_lowest_class_at_a_tie_and_mark_the_unknown():
+def test_labels_are_the_lowest_class_at_a_tie_or_unknown():
     maps = np.array([[[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]]])
     assert metrics.robot_labels(maps, np.array([[True, True, False]])).tolist() == [[0, 1, metrics.UNKNOWN]]
 

@@ -1,4 +1,4 @@
-"""The twin of ratio consensus by hand."""
+"""Reference of ratio consensus, by hand."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ def test_rounding_is_to_nearest_and_ties_go_to_even():
     assert quantised(np.array([0.5, 1.5, -2.5, 3.2]) * UNIT).tolist() == [0, 2, -2, 3]
 
 
-def test_two_robots_agree_at_once():
+def test_two_robots_agree_after_one_exchange():
     a, b = _pair(3.0, -1.0)
     for robot in (a, b):
         robot.share_out(1)
-    a.take_in(1, b.total, b.total_weight)
-    b.take_in(0, a.total, a.total_weight)
+    a.receive(1, b.total, b.total_weight)
+    b.receive(0, a.total, a.total_weight)
     assert a.log_odds == b.log_odds == 1.0
     assert a.weight == b.weight == WHOLE_WEIGHT
 
 
-def test_the_next_packet_brings_what_a_lost_one_withheld():
+def test_next_packet_replaces_a_lost_one():
     a, b = _pair(4.0, 0.0)
     a.share_out(1)
     a.share_out(1)
-    b.take_in(0, a.total, a.total_weight)
-    b.take_in(0, a.total, a.total_weight)
+    b.receive(0, a.total, a.total_weight)
+    b.receive(0, a.total, a.total_weight)
     assert b.mass * UNIT == 3.0
     assert b.weight == 1.75 * WHOLE_WEIGHT
     assert a.log_odds == 4.0

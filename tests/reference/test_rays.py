@@ -54,7 +54,7 @@ def test_key_is_the_floor_of_the_quotient():
 
 
 @given(origin=point, target=point, resolution=st.sampled_from([0.17, 0.25, 1.0]))
-def test_walk_is_a_path_of_face_neighbours_from_the_origin_to_the_end_cell(origin, target, resolution):
+def test_traversal_is_a_path_of_face_neighbours_to_the_end_cell(origin, target, resolution):
     path = [*_walk(origin, target, resolution), coord_to_key(target, resolution)]
     assert path[0] == coord_to_key(origin, resolution)
     steps = np.abs(np.diff(np.array(path), axis=0))
@@ -78,11 +78,11 @@ def test_every_passed_cell_touches_the_segment(origin, target, resolution):
 
 
 @given(origin=point, target=point)
-def test_cells_that_dense_samples_fall_in_are_all_passed(origin, target):
+def test_cells_of_dense_samples_are_passed(origin, target):
     passed = {*_walk(origin, target, 0.25), coord_to_key(target, 0.25)}
     t = np.linspace(0.0, 1.0, 400)[:, None]
     samples = np.array(origin) * (1 - t) + np.array(target) * t
     scaled = samples / 0.25
-    # A sample on a wall belongs to either side.
+    # Samples on a wall may be in either cell.
     inside = (np.abs(scaled - np.rint(scaled)) > 1e-6).all(axis=1)
     assert {coord_to_key(sample, 0.25) for sample in samples[inside]} <= passed

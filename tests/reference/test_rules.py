@@ -12,7 +12,7 @@ log_odds = arrays(np.float64, (3, 5), elements=st.floats(-6.0, 6.0)).map(rules.f
 
 
 def _paper_gradient(mixed, log_q, gamma):
-    """Lines 7 to 13 of Alg. 1, letter by letter, one cell at a time."""
+    """Lines 7 to 13 of Alg. 1, literally, one cell at a time."""
     result = []
     for h, q in zip(mixed, log_q, strict=True):
         delta = h - q
@@ -50,7 +50,7 @@ def test_gradient_step_is_the_papers_alpha_beta_form(mixed, log_q):
 
 
 @given(mixed=log_odds, log_q=log_odds)
-def test_gradient_step_climbs_along_the_objectives_derivative(mixed, log_q):
+def test_gradient_step_follows_the_derivative_of_the_objective(mixed, log_q):
     step = (rules.gradient_step(mixed, log_q, 1.0) - mixed)[0]
     for c in range(1, mixed.shape[1]):
         plus, minus = mixed[0].copy(), mixed[0].copy()
@@ -78,13 +78,13 @@ def test_natural_and_bayes_steps_by_hand():
 
 
 @pytest.mark.parametrize("step", [rules.gradient_step, rules.natural_step])
-def test_free_stays_zero_and_the_evidence_is_a_fixed_point(step):
+def test_free_is_zero_and_the_evidence_is_a_fixed_point(step):
     log_q = np.array([[0.0, -2.0, 3.0]])
     np.testing.assert_allclose(step(log_q, log_q, 0.5), log_q, atol=1e-15)
     assert step(np.zeros((1, 3)), log_q, 0.5)[0, 0] == 0.0
 
 
-def test_an_unobserved_cell_stays_the_prior_under_every_rule():
+def test_unobserved_cells_keep_the_prior_under_every_rule():
     nothing = np.zeros((2, 4))
     mixed = rules.mix(nothing, [(0.5, nothing)], 0.5)
     for result in (

@@ -12,7 +12,7 @@ from reference.twin import Twin, record
 ONE_BOX = Scene(np.array([[2.0, -1.0, 0.0]]), np.array([[3.0, 1.0, 2.0]]), np.array([3]))
 
 
-def test_the_scene_is_cast_in_closed_form():
+def test_scene_is_cast_in_closed_form():
     origin = np.array([0.0, 0.0, 1.0])
     directions = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.5], [0.0, 2.0, -0.5], [0.0, 0.0, 1.0]])
     t, classes = ONE_BOX.cast(origin, directions)
@@ -20,7 +20,7 @@ def test_the_scene_is_cast_in_closed_form():
     assert classes[:3].tolist() == [3, 3, GRASS]
 
 
-def test_the_same_seed_gives_the_same_frames_and_another_one_others():
+def test_frames_depend_on_the_seed():
     shape = TeamShape(num_robots=2, num_ticks=4, image=(6, 4), sensors="mixed")
     first, second, other = (make_scenario(seed, shape) for seed in (3, 3, 4))
     assert [frame.stamp_ns for frame in first.frames] == [frame.stamp_ns for frame in second.frames]
@@ -32,7 +32,7 @@ def test_the_same_seed_gives_the_same_frames_and_another_one_others():
     assert not np.array_equal(first.frames[0].T_team_sensor, other.frames[0].T_team_sensor)
 
 
-def test_images_carry_noise_labels_and_gaps():
+def test_images_have_noise_labels_and_gaps():
     scenario = make_scenario(0, TeamShape(num_robots=3, num_ticks=10, sensors="mixed"))
     kinds = {frame.robot_id: frame for frame in scenario.frames}
     assert isinstance(kinds["robot_2"], CloudFrame)
@@ -53,7 +53,7 @@ def test_configurations_take_flat_parameters_and_edges():
 
 
 @pytest.mark.parametrize("num_robots", [4, 6])
-def test_default_teams_are_large_enough_to_judge(num_robots):
+def test_default_teams_are_large_enough(num_robots):
     """At least 100 ticks and 20,000 cells, overlapping views, saturated cells, evidence throughout, late and early."""
     scenario = make_scenario(1, TeamShape(num_robots=num_robots))
     config = scenario.config(rule="local", settle=0)

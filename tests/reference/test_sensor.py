@@ -38,7 +38,7 @@ def test_depth_unit_scales_the_raw_value():
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -np.inf, -1.0])
-def test_depths_that_are_not_a_positive_number_carry_no_information(value):
+def test_depths_that_are_not_positive_and_finite_carry_no_information(value):
     assert _touched(depth_frame(np.array([[value]], dtype=np.float32), [[1]])) == (set(), {})
 
 
@@ -48,7 +48,7 @@ def test_zero_and_the_largest_integer_carry_no_information(value):
     assert _touched(frame) == (set(), {})
 
 
-def test_invalid_depths_are_raw_values_of_the_images_own_type():
+def test_invalid_depths_are_raw_values_in_the_dtype_of_the_image():
     frame = depth_frame(np.array([[2.1]], dtype=np.float32), [[1]])
     assert _touched(frame, SensorConfig(invalid_depth=(2.1,))) == (set(), {})
     assert _touched(frame, SensorConfig(invalid_depth=(2.2,)))[1] == {(2, 0, 0): 1}
@@ -64,7 +64,7 @@ def test_no_return_frees_up_to_the_cell_before_the_cut_end(image, meaning):
     assert _touched(depth_frame(image, [[1]]), sensor) == ({(0, 0, 0), (1, 0, 0), (2, 0, 0)}, {})
 
 
-def test_range_limits_are_on_the_distance_of_the_measured_point():
+def test_range_limits_apply_to_the_distance_of_the_measured_point():
     # Depth 2 at column 1: the point is 2 sqrt(2) = 2.83 m away.
     frame = depth_frame(np.array([[0.0, 2.0]], dtype=np.float32), [[0, 1]])
     assert _touched(frame, SensorConfig(min_range=2.9)) == (set(), {})
@@ -73,7 +73,7 @@ def test_range_limits_are_on_the_distance_of_the_measured_point():
     assert _touched(frame, SensorConfig(max_range=2.9))[1] == {(2, -2, 0): 1}
 
 
-def test_points_at_the_limits_are_within_them():
+def test_range_limits_are_inclusive():
     frame = ray("a", 0.0, 1)
     assert _touched(frame, SensorConfig(min_range=2.0))[1] == {(2, 0, 0): 1}
     assert _touched(frame, SensorConfig(max_range=2.0))[1] == {(2, 0, 0): 1}
@@ -116,7 +116,7 @@ def test_a_scan_without_a_usable_point_touches_nothing():
 @pytest.mark.parametrize(
     ("class_ids", "winner"), [([2, 2, 1], 2), ([2, 1, 1], 1), ([3, 2, 2], 2), ([3, 2, 1], 1), ([0, 0, 3], 3)]
 )
-def test_the_class_with_most_points_wins_a_cell_and_ties_go_to_the_lower_id(class_ids, winner):
+def test_majority_of_points_wins_and_ties_go_to_the_lower_id(class_ids, winner):
     points = [[2.0, 0.1 * i, 0] for i in range(len(class_ids))]
     assert _touched(cloud(points, class_ids))[1] == {(2, 0, 0): winner}
 
@@ -135,7 +135,7 @@ def test_cut_rays_go_to_the_centre_of_the_cell_of_their_cut_end_in_cells_mode_on
     assert _touched(frame, sensor["all"]) == ({(0, 0, 0), (1, 0, 0), (2, 0, 0)}, {})
 
 
-def test_bounds_keep_the_cells_whose_centre_is_inside():
+def test_bounds_keep_cells_with_centres_inside():
     region = MapConfig(resolution=1.0, bounds=(0.6, -9.0, -9.0, 2.4, 9.0, 9.0))
     assert _touched(ray("a", 0.0, 1), region=region) == ({(1, 0, 0)}, {})
     band = MapConfig(resolution=1.0, bounds=(0.6, 9.0))
@@ -155,16 +155,16 @@ def _weighted(points, class_ids, confidences, **options):
      ([2, 2, 1], [100, 101, 201], (1, 201)), ([3, 3, 3], [1, 1, 2], (3, 1)), ([3, 3, 3], [1, 2, 2], (3, 2)),
      ([3, 3, 1], [255, 0, 100], (3, 255)), ([0, 2, 2], [255, 1, 0], (2, 1))],
 )  # fmt: skip
-def test_the_class_with_most_confidence_wins_with_its_mean(class_ids, confidences, winner):
+def test_largest_sum_of_confidences_wins_with_its_mean_as_strength(class_ids, confidences, winner):
     points = [[2.0, 0.1 * i, 0] for i in range(len(class_ids))]
     assert _weighted(points, class_ids, confidences) == [winner]
 
 
-def test_hits_without_confidences_are_sure():
+def test_hits_without_confidences_have_full_strength():
     assert scan_update(ray("a", 0.0, 2), SensorConfig(), ONE_METRE).hit_strengths.tolist() == [255]
 
 
-def test_no_confidence_is_no_label():
+def test_zero_confidence_frees_the_ray_only():
     assert _weighted([[2.0, 0, 0]], [1], [0]) == []
     frame = dataclasses.replace(ray("a", 0.0, 2), confidence_image=np.zeros((1, 1), np.uint8))
     assert _touched(frame) == ({(0, 0, 0), (1, 0, 0)}, {})
@@ -174,7 +174,7 @@ def _box(low, high, is_own):
     return BodyBox(np.array(low, float), np.array(high, float), np.eye(4), is_own)
 
 
-def test_points_on_an_own_body_say_nothing_and_on_anothers_free_their_ray():
+def test_points_on_own_body_are_dropped_and_on_others_free_their_ray():
     free = {(0, 0, 0), (1, 0, 0)}
     # The point is at (2.5, 0.5, 0.5), in the corner of both boxes.
     own, other = _box([2.5, 0.5, 0.5], [3, 1, 1], is_own=True), _box([2, 0, 0], [2.5, 0.5, 0.5], is_own=False)
@@ -184,13 +184,13 @@ def test_points_on_an_own_body_say_nothing_and_on_anothers_free_their_ray():
     assert _touched(dataclasses.replace(ray("a", 0.0, 1), boxes=(beside,))) == (free, {(2, 0, 0): 1})
 
 
-def test_cut_ends_are_in_no_box():
+def test_boxes_do_not_affect_cut_rays():
     boxes = (_box([-9, -9, -9], [9, 9, 9], is_own=True),)
     frame = dataclasses.replace(ray("a", 0.0, 1, distance=7.0), boxes=boxes)
     assert _touched(frame, SensorConfig(max_range=2.2)) == ({(0, 0, 0), (1, 0, 0)}, {})
 
 
-def test_slopes_stand_for_the_pinhole():
+def test_slopes_replace_the_pinhole():
     frame = ray("a", 0.0, 1)
     camera = dataclasses.replace(frame.camera, slopes=np.array([[[0.5]], [[-1.0]]], np.float32))
     # Depth 2: 1 m to the right, 2 m up.

@@ -63,7 +63,7 @@ def test_hit_other_applies_to_the_other_classes_of_a_hit_cell():
     assert _at(ticks[-1], 0, key=(1, 0, 0)) == [-0.2, -0.2]
 
 
-def test_a_hit_counts_as_much_as_its_class_is_sure():
+def test_hits_are_weighted_by_their_strength():
     sure = np.array([[51]], np.uint8)
     frames = [dataclasses.replace(ray("a", 0.0, 2), confidence_image=sure), ray("a", 0.1, 2)]
     ticks, twin = _run(frames, "a", rule="local", settle=0, hit=1.5, hit_other=-0.7)
@@ -128,7 +128,7 @@ def test_gradient_by_hand():
     np.testing.assert_allclose(_at(ticks[2], 0), [0.125 + 0.5 * sigma * (1.0 - sigma) * 0.875])
 
 
-def test_sync_mixes_what_was_published_before_anybody_iterated():
+def test_sync_mixes_maps_published_before_any_iteration():
     # natural, gamma 1/2, weights 1/2: tick 2 sees h_a = 0.5 and h_b = 0 as published: both mix to 0.25.
     frames = [ray("a", 0.0, 1), ray("b", 1.0, 1)]
     ticks, _ = _run([*frames, ray("a", 1.0, 0)], rule="natural", settle=0)
@@ -168,15 +168,15 @@ def test_on_arrival_without_an_arrival_iterates_once_with_the_full_gamma():
     assert alone[1].num_iterations == (1, 0)
 
 
-def test_the_order_of_arrival_is_that_of_the_senders():
-    # c hears a (1/2) before b (0), weights 1/3, own evidence 0, gamma 1/4: 1/2 * 1/3 * 3/4 = 1/8, then 2/3 and 3/4 of
-    # it, 1/16. In the other order 1/8 would stay.
+def test_maps_arrive_in_the_order_of_their_senders():
+    # c receives a (1/2) before b (0), weights 1/3, own evidence 0, gamma 1/4: 1/2 * 1/3 * 3/4 = 1/8, then 2/3 * 3/4 of
+    # it, 1/16. In the other order the result would be 1/8.
     frames = [ray("a", 0.0, 1), ray("b", 1.0, 0), ray("c", 1.0, 0)]
     ticks, _ = _run(frames, "abc", rule="natural", mode="on-arrival", settle=0)
     np.testing.assert_allclose(_at(ticks[2], 2)[0], 1 / 16)
 
 
-def test_known_cells_are_ones_own_and_those_of_maps_that_arrived():
+def test_known_cells_are_those_of_own_scans_and_arrived_maps():
     # b's first tick is 2; it knows its own cell 0..1 then, and a's cell 2 since a published it in that tick.
     ticks, _ = _run([ray("a", 0.0, 1), ray("b", 1.2, 1, distance=1.0), ray("a", 3.5, 1)], settle=0)
     assert [tick.known.sum(axis=1).tolist() for tick in ticks[:3]] == [[0, 0], [3, 0], [3, 3]]
@@ -204,7 +204,7 @@ def test_a_robot_that_leaves_is_in_the_team_up_to_the_tick_after_its_last_scan(a
         assert ticks[-1].links == ()
 
 
-def test_a_robot_that_never_scans_stays_out():
+def test_robot_without_scans_is_never_active():
     ticks, _ = _run([ray("a", 0.0, 1)], "abc", rule="bayes")
     assert not any(tick.active[1] or tick.active[2] for tick in ticks)
     assert not ticks[-1].known[1:].any()
@@ -213,7 +213,7 @@ def test_a_robot_that_never_scans_stays_out():
 # --- settling --------------------------------------------------------------------------------------------------------
 
 
-def test_settling_goes_on_over_the_last_graph_with_a_falling_gamma():
+def test_settling_uses_the_last_graph_with_a_falling_gamma():
     # One robot, natural, gamma 1/2, ramp over 2: h = 1/2, then gamma 1/4: 1/2 + 1/8, then gamma 0: no change, stop.
     ticks, twin = _run([ray("a", 0.0, 1)], "a", rule="natural", settle=2)
     assert [tick.settling for tick in ticks] == [False, False, True, True]
@@ -224,7 +224,7 @@ def test_settling_goes_on_over_the_last_graph_with_a_falling_gamma():
     assert twin.stop_reason == STOPPED_CONVERGED
 
 
-def test_settling_stops_at_its_maximum_and_can_be_off():
+def test_settling_stops_at_its_maximum_and_can_be_disabled():
     frames = [ray("a", 0.0, 1)]
     ticks, twin = _run(frames, "a", rule="natural", settle_max=1)
     assert (len(ticks), twin.stop_reason) == (3, STOPPED_MAX)
@@ -239,7 +239,7 @@ def test_local_is_settled_after_one_tick():
 
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
 @pytest.mark.parametrize("rule", ["gradient", "natural", "bayes"])
-def test_settling_ends_the_disagreement(small, rule, topology):
+def test_settling_removes_the_disagreement(small, rule, topology):
     scenario, recording = small
     config = scenario.config(rule=rule, topology=topology)
     ticks = list(Twin(config, recording).ticks())
@@ -254,7 +254,7 @@ def test_settling_ends_the_disagreement(small, rule, topology):
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
 @pytest.mark.parametrize("mode", ["sync", "on-arrival"])
 @pytest.mark.parametrize("evidence", ["sum", "time-average", "cell-average"])
-def test_bayes_keeps_the_mean_of_the_maps_at_the_mean_of_the_evidence(small, evidence, mode, topology):
+def test_bayes_conserves_the_mean_of_the_maps(small, evidence, mode, topology):
     scenario, recording = small
     config = scenario.config(rule="bayes", mode=mode, topology=topology, evidence=evidence)
     tick = None
@@ -283,7 +283,7 @@ def test_one_robot_alone_ends_at_its_own_evidence(small, rule, mode):
         assert distance[-1] < 1e-4
 
 
-def test_gradient_holds_the_oracles_mean_as_a_fixed_point_when_all_evidence_is_equal():
+def test_mean_of_the_oracle_is_a_fixed_point_of_gradient_with_equal_evidence():
     frames = [ray(robot, 0.0, 1) for robot in "abc"]
     ticks, _ = _run(frames, "abc", num_classes=1, gamma=1.0, settle=2000, settle_tolerance=1e-14)
     np.testing.assert_allclose(3 * ticks[-1].maps[:, 2, 1], ticks[-1].oracle[2, 1], atol=1e-6)
@@ -300,7 +300,7 @@ def test_rules_act_on_the_deviation_from_the_prior(small):
         np.testing.assert_allclose(with_prior.log_odds(1), expected)
 
 
-def test_unknown_cells_are_the_prior(small):
+def test_unknown_cells_have_the_prior(small):
     scenario, recording = small
     for rule in ALL_RULES:
         for tick in Twin(scenario.config(rule=rule, topology="line"), recording, with_metrics=False).ticks():
@@ -314,7 +314,7 @@ def test_the_papers_preset_runs(small):
     assert 0.0 < np.abs(ticks[-1].maps).max() < 1.0
 
 
-# --- faults that the comparison must catch ---------------------------------------------------------------------------
+# --- faults that the comparison must detect ---------------------------------------------------------------------------
 
 
 def _wrong_sign(monkeypatch):
@@ -353,7 +353,7 @@ def _old_evidence(monkeypatch):
      ("natural", _current_maps_in_place_of_published_ones), ("bayes", _current_maps_in_place_of_published_ones),
      ("bayes", _old_evidence)],
 )  # fmt: skip
-def test_a_fault_moves_the_maps_far_beyond_the_tolerance_of_a_comparison(small, monkeypatch, rule, fault, mode):
+def test_faults_change_maps_far_beyond_the_tolerance_of_a_comparison(small, monkeypatch, rule, fault, mode):
     scenario, recording = small
     config = scenario.config(rule=rule, mode=mode, settle=0)
     good = list(Twin(config, recording, with_metrics=False).ticks())[-1]
@@ -367,7 +367,7 @@ def test_a_fault_moves_the_maps_far_beyond_the_tolerance_of_a_comparison(small, 
 # --- bad input -------------------------------------------------------------------------------------------------------
 
 
-def test_refusals():
+def test_invalid_input_is_refused():
     frames = [ray("a", 0.0, 1)]
     with pytest.raises(InputError, match="no frames"):
         record(team_config(), [])

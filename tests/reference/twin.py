@@ -1,13 +1,13 @@
-"""The reference twin: a whole team replayed in plain float64 numpy on the uniform grid.
+"""Reference twin: replay of a whole team in plain float64 numpy on the uniform grid.
 
-    recording = record(config, frames)          # sensor model and ray walks: once per team and sensor model
+    recording = record(config, frames)          # ray casting, once for each team and sensor model
     for tick in Twin(config, recording).ticks():
-        tick.log_odds(robot)                    # (M, C), the prior included, for recording.keys (M, 3)
+        tick.log_odds(robot)                    # (M, C), including the prior, for recording.keys (M, 3)
         tick.known[robot]                       # (M,)
         tick.metrics                            # TwinMetrics
 
-The cells are those that any scan of any robot touches. Every other cell of the grid is the prior in every map at every
-tick, under every rule, so leaving it out changes nothing.
+The grid holds the cells that any scan of any robot touches. All other cells have the prior in every map at every tick
+under every rule, so omitting them does not change the results.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ STOPPED_MAX = "settle_max"
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A team's scans, ready to integrate, in order of (stamp, robot).
+    """Scans of a team after ray casting, in order of (stamp, robot).
 
-    ``keys`` is (M, 3) int64: every cell that any scan touches, sorted by (x, y, z).
+    ``keys`` is (M, 3) int64: all cells that any scan touches, sorted by (x, y, z).
     """
 
     keys: Int64Array
@@ -45,10 +45,12 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class TwinTick:
-    """The team after one tick. Arrays are copies.
+    """State of the team after one tick. Arrays are copies; maps, evidence and oracle are deviations with column 0 zero.
 
-    ``maps`` (N, M, K) and ``evidence`` (N, M, K) are deviations from the prior, column 0 zero: h_i - h_0 and log q_i
-    (s_i for evidence 'sum'). ``known`` (N, M): the cells in each robot's map. ``oracle`` (M, K): the sum of log q_i.
+    - ``maps`` (N, M, K): h_i - h_0.
+    - ``evidence`` (N, M, K): log q_i (s_i for evidence 'sum').
+    - ``known`` (N, M): cells in each robot's map.
+    - ``oracle`` (M, K): sum of log q_i.
     """
 
     tick: int
@@ -66,15 +68,15 @@ class TwinTick:
     metrics: TwinMetrics | None
 
     def log_odds(self, robot: int) -> Float64Array:
-        """One robot's log-odds (M, C) of the classes 1..C, the prior included."""
+        """Return one robot's log-odds (M, C) of the classes 1..C, including the prior."""
         absolute: Float64Array = self.maps[robot][:, 1:] + self.prior
         return absolute
 
 
 def record(config: RunConfig, frames: Sequence[Frame]) -> Recording:
-    """Every scan's freed and hit cells, by the configuration's sensor model and mapped region.
+    """Return the freed and hit cells of all scans, by the configuration's sensor model and mapped region.
 
-    Raises InputError without frames or for a frame of a robot that is not in the team, ConfigError without classes.
+    Raises InputError without frames and for a frame of a robot that is not in the team, ConfigError without classes.
     """
     if config.classes is None:
         raise ConfigError("classes: the reference needs a class table")
@@ -103,14 +105,14 @@ def record(config: RunConfig, frames: Sequence[Frame]) -> Recording:
 
 
 def _distinct_keys(updates: Sequence[ScanUpdate]) -> Int64Array:
-    """The distinct cells (M, 3) of all updates, sorted."""
+    """Return the distinct cells (M, 3) of all updates, sorted."""
     every = np.concatenate([part for update in updates for part in (update.freed, update.hit)])
     _, first = np.unique(_codes(every), return_index=True)
     return every[first]
 
 
 def _codes(keys: Int64Array) -> Int64Array:
-    """One integer per key that sorts as (x, y, z) does."""
+    """Return one integer for each key, in the order of (x, y, z)."""
     limit = 1 << 20
     if len(keys) and np.abs(keys).max() >= limit:
         raise InputError("a cell lies more than 2^20 cells from the origin")
@@ -118,10 +120,10 @@ def _codes(keys: Int64Array) -> Int64Array:
 
 
 class Twin:
-    """One run of a recording under a configuration's consensus and network sections."""
+    """Run of a recording with the consensus and network sections of a configuration."""
 
     def __init__(self, config: RunConfig, recording: Recording, *, with_metrics: bool = True) -> None:
-        """Raises ConfigError when epsilon is above the bound of the graph of the whole team."""
+        """Raise ConfigError where epsilon is above the bound of the graph of the whole team."""
         if config.map.prune_tolerance != 0.0:
             raise ConfigError("prune_tolerance: the reference is lossless")
         self.config = config
@@ -148,16 +150,16 @@ class Twin:
 
     @property
     def start_ns(self) -> int:
-        """t_0: the team's first stamp."""
+        """First stamp t_0 of the team."""
         return self.recording.scans[0].stamp_ns
 
     @property
     def num_log_ticks(self) -> int:
-        """Ticks before settling: the last of them is the first one after the last scan."""
+        """Number of ticks before settling, up to the first tick after the last scan."""
         return (self.recording.scans[-1].stamp_ns - self.start_ns) // self.period_ns + 2
 
     def ticks(self) -> Iterator[TwinTick]:
-        """The team after every tick, settling included; ``stop_reason`` is set when the iterator ends."""
+        """Yield the team after every tick, including settling; ``stop_reason`` is set at the end."""
         for tick in range(self.num_log_ticks):
             stamp_ns = self.start_ns + tick * self.period_ns
             self._integrate_before(stamp_ns)
@@ -167,7 +169,7 @@ class Twin:
         yield from self._settle(active, team)
 
     def _settle(self, active: tuple[bool, ...], team: TeamGraph) -> Iterator[TwinTick]:
-        """Ticks over the last graph with a falling gamma, until nothing changes."""
+        """Yield ticks on the last graph with decreasing gamma until nothing changes."""
         consensus = self.config.consensus
         if consensus.settle == 0:
             self.stop_reason = STOPPED_OFF
@@ -190,7 +192,7 @@ class Twin:
     def _tick(
         self, tick: int, active: tuple[bool, ...], team: TeamGraph, *, gamma_factor: float, settling: bool
     ) -> TwinTick:
-        """Publish, deliver, iterate and measure; what was recorded before the tick is already integrated."""
+        """Publish, deliver, iterate and measure; scans before the tick are already integrated."""
         before = self.maps.copy()
         published, published_known = before, self.known.copy()
         for robot in range(self.num_robots):
@@ -220,7 +222,7 @@ class Twin:
         )
 
     def _integrate_before(self, stamp_ns: int) -> None:
-        """Integrate every scan with a stamp before ``stamp_ns`` that is not in yet, in order of (stamp, robot)."""
+        """Integrate the remaining scans with stamps before ``stamp_ns``, in order of (stamp, robot)."""
         changed = set()
         scans = self.recording.scans
         while self.num_integrated < len(scans) and scans[self.num_integrated].stamp_ns < stamp_ns:
@@ -234,8 +236,10 @@ class Twin:
             self.log_q[robot] = self.sums[robot].log_likelihood(self.config.consensus.evidence)
 
     def _active_at(self, stamp_ns: int) -> tuple[bool, ...]:
-        """Which robots take part: from the first tick after their first scan; with after_end 'leave' up to and with
-        the first tick after their last."""
+        """Return which robots are active: from the first tick after their first scan.
+
+        With after_end 'leave', they are active up to and including the first tick after their last scan.
+        """
         active = []
         for robot in range(self.num_robots):
             stamps = [scan.stamp_ns for scan in self.recording.scans if scan.robot == robot]
@@ -245,7 +249,7 @@ class Twin:
         return tuple(active)
 
     def _graph_of(self, active: tuple[bool, ...]) -> TeamGraph:
-        """The weighted graph among the active robots."""
+        """Return the weighted graph of the active robots."""
         return graph.team_graph(self.config.network, self.config.consensus, self.robot_ids, active)
 
     def _iterate_robot(
@@ -256,7 +260,7 @@ class Twin:
         published_known: BoolArray,
         gamma_factor: float,
     ) -> None:
-        """All of one robot's iterations in a tick, its neighbours' maps being those that they published in it."""
+        """Run all iterations of one robot in a tick, with the maps that its neighbours published in the tick."""
         consensus = self.config.consensus
         senders = [] if consensus.rule == "local" else team.neighbours(robot)
         if consensus.mode == "sync" or not senders:
@@ -266,7 +270,7 @@ class Twin:
         else:
             per_arrival = gamma_factor / len(senders) if consensus.gamma_per_arrival == "divided" else gamma_factor
             for j in senders:
-                # 'bayes' keeps the sum over robots only if both ends of a link add and subtract the same difference.
+                # 'bayes' conserves the sum over robots only if both ends of a link use the same difference.
                 own = self._base(published[robot] if consensus.rule == "bayes" else self.maps[robot])
                 self._iterate(robot, [(team.weights[robot, j], published[j] - own)], team.epsilon, per_arrival)
         self.known[robot] |= self.touched[robot]
@@ -274,13 +278,13 @@ class Twin:
             self.known[robot] |= published_known[j]
 
     def _base(self, own: Float64Array) -> Float64Array:
-        """What a neighbour's map is compared with: the robot's own; 'merge' adds the neighbour's map itself."""
+        """Return the map that is subtracted from a neighbour's: the robot's own, or 0 for 'merge'."""
         return np.zeros_like(own) if self.config.consensus.rule == "merge" else own
 
     def _iterate(
         self, robot: int, differences: list[tuple[float, Float64Array]], epsilon: float, gamma_factor: float
     ) -> None:
-        """One iteration of the rule at one robot."""
+        """Run one iteration of the rule at one robot."""
         consensus = self.config.consensus
         k = self.num_iterations[robot]
         gamma = gamma_factor * rules.gamma_at(consensus.gamma, k, consensus.gamma_power, consensus.gamma_decay)
@@ -303,7 +307,7 @@ class Twin:
         self.num_iterations[robot] += 1
 
     def _with_prior(self, deviation: Float64Array) -> Float64Array:
-        """Absolute log-odds: the prior added to the classes 1..C."""
+        """Return absolute log-odds: the prior is added to the classes 1..C."""
         absolute = deviation.copy()
         absolute[..., 1:] += self.prior
         return absolute

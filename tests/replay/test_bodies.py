@@ -1,18 +1,20 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
-from log_factory import robot_entries, write_mcap
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.records import ClassTable, SemanticClass
-from octoreplay.replay.session import Session, replay_team
+from octoreplay.replay.run import replay_team
+from octoreplay.replay.session import Session
+from support.log_factory import robot_entries, write_mcap
 
 CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
 
@@ -20,7 +22,7 @@ CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
 def robot_of(tmp_path, name, **fields):
     """A robot that drives along x and sees a wall 1 m ahead of its camera, all the time."""
     path = write_mcap(tmp_path / f"{name}.mcap", robot_entries(num_frames=10, labels=False))
-    return RobotConfig(
+    return ResolvedRobot(
         name, (path,), depth_topic="/camera/depth/image_raw", camera_info_topic="/camera/depth/camera_info",
         pose_topic="/odom", label_topic="", **fields,
     )  # fmt: skip
@@ -44,7 +46,7 @@ def num_occupied(config, *, hides):
         logs = [stack.enter_context(RobotLog(robot, config.time, CLASSES)) for robot in config.robots]
         sources = [stack.enter_context(ReadAhead(log)) for log in logs]
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
-        *_, last = Session(config, sources, bodies=bodies).ticks()
+        *_, last = Session(config, sources, ThreadPoolExecutor(2), bodies=bodies).ticks()
         return [int(np.count_nonzero(octree.leaves(0.0).log_odds[:, 0] > 0)) for octree in last.maps]
 
 

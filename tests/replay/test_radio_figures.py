@@ -10,7 +10,7 @@ import pytest
 
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 
 TRIO = Path(__file__).parents[1] / "fixtures" / "trio" / "team.yaml"

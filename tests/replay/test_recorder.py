@@ -7,7 +7,7 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
@@ -31,4 +31,4 @@ def test_the_centralised_map_is_the_sum_of_what_the_robots_saw(tmp_path: Path) -
 
 def test_no_robot_may_have_the_name_of_the_centralised_map(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="robot id 'central': is the name of the centralised map"):
-        parse_team("robots: [{id: central, log: a.mcap}]", source="team.yaml", folder=tmp_path)
+        parse_team("robots: [{id: central, log: a.mcap}]", name="team.yaml", folder=tmp_path)

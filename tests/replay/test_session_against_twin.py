@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +15,19 @@ from octoreplay.config.presets import PRESETS
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
+from octoreplay.records import CONVERGED
 from octoreplay.replay import session as session_module
+from octoreplay.replay.measure import TickMeasurer
 from octoreplay.replay.robots import consensus as consensus_module
 from octoreplay.replay.robots import robot as robot_module
-from octoreplay.replay.session import CONVERGED, NO_SETTLING, SETTLE_MAX, Session
-from octree_factory import class_rows
+from octoreplay.replay.session import Session
+from octoreplay.replay.settling import NO_SETTLING, SETTLE_MAX
 from reference import rules
 from reference.comparison import compare_map
 from reference.hand_made import cloud, ray, team_config
 from reference.scenarios import TeamShape, make_scenario
 from reference.twin import STOPPED_CONVERGED, STOPPED_MAX, STOPPED_OFF, Twin, record
+from support.octree_factory import class_rows
 
 TOLERANCE = 5e-5
 """Largest |log-odds difference| of any class in any cell."""
@@ -112,7 +116,7 @@ def _compare_frames(config, frames, recording=None, *, every=1, with_metrics=Fal
     the first settling tick and in the last, everything else in all of them."""
     recording = recording or record(config, frames)
     twin = Twin(config, recording, with_metrics=with_metrics)
-    session = Session(config, _sources(config, frames), num_threads=1)
+    session = Session(config, _sources(config, frames), ThreadPoolExecutor(1))
     outcome = Outcome()
     was_settling = False
     for expected, tick in itertools.zip_longest(twin.ticks(), session.ticks()):
@@ -382,7 +386,7 @@ def test_threads_do_not_change_a_byte(rule, mode):
     config = scenario.config(rule=rule, mode=mode, topology="ring", settle=2)
     runs = []
     for num_threads in (1, 2, 4):
-        session = Session(config, _sources(config, scenario.frames), num_threads=num_threads)
+        session = Session(config, _sources(config, scenario.frames), ThreadPoolExecutor(num_threads))
         run = []
         for tick in session.ticks():
             run.append((tick.metrics, _packets(tick)))
@@ -414,7 +418,7 @@ def test_leaving_out_bricks_at_rest_does_not_change_a_byte(rule, topology, monke
     runs = []
     for function in (recorded, whole):
         monkeypatch.setattr(consensus_module, "team_step", function)
-        session = Session(config, _sources(config, scenario.frames))
+        session = Session(config, _sources(config, scenario.frames), ThreadPoolExecutor(2))
         runs.append([_packets(tick) for tick in session.ticks()])
     assert runs[0] == runs[1]
     assert sum(since is not None for since in since_of_steps) > len(since_of_steps) / 3
@@ -427,8 +431,8 @@ def _change_steps(monkeypatch, change):
     """Every robot's iterations are done as ``change`` describes them."""
     right = consensus_module.team_step
 
-    def wrong(steps, *, rule, **kwargs):
-        return right([change(step) for step in steps], rule=rule, **kwargs)
+    def wrong(steps, **kwargs):
+        return right([change(step) for step in steps], **kwargs)
 
     monkeypatch.setattr(consensus_module, "team_step", wrong)
 
@@ -449,7 +453,7 @@ def _change_arrivals(monkeypatch, change):
     right = Session._iterate
 
     def wrong(self, graph, factor, number):
-        for robot in self._robots:
+        for robot in self.team.robots:
             robot._arrived = [a._replace(held=change(self, robot, a)) for a in robot._arrived]
         return right(self, graph, factor, number)
 
@@ -460,7 +464,7 @@ def _current_maps_in_place_of_published_ones(monkeypatch):
     _change_arrivals(
         monkeypatch,
         lambda session, robot, arrival: dataclasses.replace(
-            arrival.held, octree=session._robots[arrival.source.origin].map
+            arrival.held, octree=session.team.robots[arrival.source.origin].map
         ),
     )
 
@@ -481,10 +485,10 @@ def _free_is_not_reset(monkeypatch):
     """Free's own step g_0 = -sum of the others' stays in h[0], and the classes' log-odds against free miss it."""
     right = consensus_module.team_step
 
-    def wrong(steps, *, rule, **kwargs):
+    def wrong(steps, **kwargs):
         mixed = [dataclasses.replace(step, own=step.own.copy(), gamma=0.0) for step in steps]
-        right(mixed, rule=rule, **kwargs)
-        changes = right(steps, rule=rule, **kwargs)
+        right(mixed, **kwargs)
+        changes = right(steps, **kwargs)
         for own, without in ((step.own, other.own) for step, other in zip(steps, mixed, strict=True)):
             codes = own.codes[own.bricks.masks[: own.num_bricks].any(axis=1)]
             rows, others = class_rows(own, own.find(codes)), class_rows(without, without.find(codes))
@@ -533,8 +537,8 @@ def _half_a_step(monkeypatch):
 def _neighbours_cells_are_not_taken(monkeypatch):
     right = consensus_kernels.join_columns
 
-    def wrong(table, columns, is_awake, known, has_block, layout):
-        right(table, columns, is_awake, known, has_block, layout)
+    def wrong(table, columns, needs_update, known, has_block, layout):
+        right(table, columns, needs_update, known, has_block, layout)
         known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
 
     monkeypatch.setattr(consensus_kernels, "join_columns", wrong)
@@ -590,13 +594,13 @@ def test_a_fault_turns_the_comparison_red(monkeypatch, rule, mode, fault, messag
     ],
 )  # fmt: skip
 def test_a_wrong_metric_turns_the_comparison_red(monkeypatch, name, wrong):
-    right = Session._measure
+    right = TickMeasurer.measure
 
-    def measure(self, *args):
-        metrics = right(self, *args)
+    def measure(self, *args, **kwargs):
+        metrics = right(self, *args, **kwargs)
         return dataclasses.replace(metrics, **{name: wrong(getattr(metrics, name))})
 
-    monkeypatch.setattr(Session, "_measure", measure)
+    monkeypatch.setattr(TickMeasurer, "measure", measure)
     with pytest.raises(AssertionError):
         _compare(SMALL, topology="line", rule="gradient", settle=0, every=50, with_metrics=True)
 

@@ -12,8 +12,8 @@ import pytest
 from octoreplay.config.network import LinkConfig
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.replay.network.graph import TeamNetwork, settle_ticks_max, step_size
-from octoreplay.replay.settling import QUIET_PROB, num_quiet_ticks, num_settle_ticks
+from octoreplay.replay.network.graph import TeamNetwork, step_size
+from octoreplay.replay.settling import QUIET_PROB, num_quiet_ticks, num_settle_ticks, settle_ticks_max
 
 IDS = ("a", "b", "c", "d")
 

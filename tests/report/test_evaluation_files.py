@@ -1,4 +1,4 @@
-"""Evaluations as CSV and JSON hold what the records hold."""
+"""Evaluations as CSV and JSON have the values of the records."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from evaluation_factory import evaluation
 from octoreplay.errors import OutputError
-from octoreplay.evaluate.records import MapScores
+from octoreplay.evaluate.records import SCORES, MapScores, TruthScores
 from octoreplay.records import CENTRAL
-from octoreplay.report.evaluation_files import SCORES, evaluation_csv, evaluation_json, write_evaluation
+from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json, write_evaluation
+from support.evaluation_factory import evaluation
 
 
 def rows(text: str) -> list[dict[str, str]]:
@@ -26,7 +26,7 @@ def number(cell: str) -> float:
     return float(cell) if cell else math.nan
 
 
-def test_csv_has_a_row_for_each_map_and_three_for_the_team() -> None:
+def test_csv_has_one_row_per_map_and_three_for_the_team() -> None:
     judged = evaluation()
     table = rows(evaluation_csv(judged))
     assert len(table) == len(judged.ticks) * (len(judged.ticks[0].maps) + 3)
@@ -40,8 +40,8 @@ def test_csv_has_a_row_for_each_map_and_three_for_the_team() -> None:
             assert row["kind"] == ("central" if scores.robot_id == CENTRAL else "robot")
             assert row["is_active"] == str(int(scores.is_active))
             for name in SCORES:
-                assert repr(number(row[name])) == repr(float(getattr(scores, name)))
-            for name, value in zip(judged.class_names, scores.iou, strict=True):
+                assert repr(number(row[name])) == repr(float(scores.score(name)))
+            for name, value in zip(judged.class_names, judged.iou(scores), strict=True):
                 assert repr(number(row[f"iou.{name}"])) == repr(value)
         for kind in ("mean", "least", "largest"):
             row = next(places)
@@ -51,15 +51,16 @@ def test_csv_has_a_row_for_each_map_and_three_for_the_team() -> None:
                 assert all(repr(number(row[name])) == repr(float(over_robots(name))) for name in SCORES)
 
 
-def test_csv_and_json_leave_no_field_out() -> None:
-    names = {item.name for item in dataclasses.fields(MapScores)} - {"iou"}
+def test_csv_and_json_have_every_field() -> None:
+    fields = (item.name for record in (MapScores, TruthScores) for item in dataclasses.fields(record))
+    names = set(fields) - {"truth", "iou"}
     assert names | {"iou.ground", "iou.tree"} <= set(rows(evaluation_csv(evaluation()))[0])
     tick = json.loads(evaluation_json(evaluation()))["ticks"][0]
     assert set(tick["maps"][0]) == names | {"iou"}
     assert set(tick["mean"]) == set(tick["least"]) == set(tick["largest"]) == {*SCORES, "iou"}
 
 
-def test_json_says_what_csv_says() -> None:
+def test_json_and_csv_have_equal_values() -> None:
     judged = evaluation()
     content = json.loads(evaluation_json(judged))
     assert {name: content[name] for name in ("result", "truth", "against")} == {
@@ -78,20 +79,20 @@ def test_json_says_what_csv_says() -> None:
             )
 
 
-def test_the_team_is_counted_over_its_active_robots() -> None:
+def test_team_statistics_are_over_the_active_robots() -> None:
     judged = evaluation()
     tick = judged.ticks[0]
     by_kind = {row["kind"]: row for row in rows(evaluation_csv(judged))[: len(tick.maps) + 3]}
-    values = [scores.coverage for scores in tick.maps if scores.is_active and scores.robot_id != CENTRAL]
+    values = [scores.score("coverage") for scores in tick.maps if scores.is_active and scores.robot_id != CENTRAL]
     assert len(values) == 2
     assert float(by_kind["least"]["coverage"]) == min(values)
     assert float(by_kind["largest"]["coverage"]) == max(values)
     assert float(by_kind["mean"]["coverage"]) == pytest.approx(sum(values) / 2)
-    # A class that one of the robots has no IoU of has none in the team.
+    # A class without an IoU in the map of one robot has none in the team.
     assert by_kind["mean"]["iou.tree"] == by_kind["least"]["iou.tree"] == ""
 
 
-def test_files_are_written(tmp_path: Path) -> None:
+def test_files_are_written_to_the_given_paths(tmp_path: Path) -> None:
     write_evaluation(evaluation())
     assert list(tmp_path.iterdir()) == []
     write_evaluation(evaluation(), csv_path=tmp_path / "a.csv", json_path=tmp_path / "a.json")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evaluation_factory import evaluation
 from octoreplay.errors import OutputError
 from octoreplay.report import evaluation_plots
 from octoreplay.report.evaluation_plots import write_evaluation_figures
+from support.evaluation_factory import evaluation
 
 NAMES = ["agreement.png", "iou.png", "class_iou.png", "coverage.png", "calibration.png"]
 
 
-def test_figures_are_pictures_and_equal_every_time(tmp_path: Path) -> None:
+def test_figures_are_not_blank_and_reproducible(tmp_path: Path) -> None:
     paths = write_evaluation_figures(evaluation(), tmp_path / "a")
     assert [path.name for path in paths] == NAMES
     again = write_evaluation_figures(evaluation(), tmp_path / "b")
@@ -27,7 +27,7 @@ def test_figures_are_pictures_and_equal_every_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("has_central", [True, False])
 @pytest.mark.parametrize("num_ticks", [1, 2])
-def test_one_tick_and_no_centralised_map_are_drawn(tmp_path: Path, num_ticks: int, has_central: bool) -> None:
+def test_figures_of_one_tick_or_without_a_centralised_map(tmp_path: Path, num_ticks: int, has_central: bool) -> None:
     judged = evaluation(num_ticks, has_central=has_central)
     assert len(write_evaluation_figures(judged, tmp_path)) == len(NAMES)
 
@@ -37,16 +37,16 @@ def test_without_truth_only_agreement_is_drawn(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["agreement.png"]
 
 
-def test_curves_show_the_numbers() -> None:
+def test_curves_have_the_values_of_the_records() -> None:
     judged = evaluation(6)
     figure = evaluation_plots._curves("title", "label", judged.ticks, "coverage")
     mean, central = figure.axes[0].lines
     np.testing.assert_allclose(mean.get_ydata(), [tick.mean("coverage") for tick in judged.ticks])
-    np.testing.assert_allclose(central.get_ydata(), [t.central.coverage for t in judged.ticks if t.central is not None])
+    np.testing.assert_allclose(central.get_ydata(), [t.central.score("coverage") for t in judged.ticks])
     np.testing.assert_allclose(mean.get_xdata(), [tick.seconds for tick in judged.ticks])
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         write_evaluation_figures(evaluation(), tmp_path / "file")

@@ -7,10 +7,10 @@ import io
 
 import pytest
 
-from evaluation_factory import evaluation
 from octoreplay.evaluate.records import Evaluation
 from octoreplay.report import tables
 from octoreplay.report.evaluation_tables import MAX_TIMES, evaluation_tables
+from support.evaluation_factory import evaluation
 
 
 def rendered(judged: Evaluation) -> str:
@@ -22,18 +22,18 @@ def rendered(judged: Evaluation) -> str:
 
 
 def row(text: str, title: str, name: str) -> list[str]:
-    """The cells of the first row with a name below a title."""
+    """Cells of the first row called ``name`` below a title."""
     lines = text[text.index(title) :].splitlines()
     return next(line for line in lines if line.startswith(name)).split()[1:]
 
 
-def test_every_map_the_mean_and_the_centralised_map_have_a_row() -> None:
+def test_every_map_and_the_mean_have_a_row() -> None:
     judged = evaluation()
     text = rendered(judged)
     final = judged.final
     for scores in final.maps:
         assert row(text, "Against world.npz", scores.robot_id) == [
-            f"{getattr(scores, name):.3f}"
+            f"{scores.score(name):.3f}"
             for name in ("mean_iou", "mean_iou_known", "occupied_accuracy", "free_accuracy", "coverage",
                          "world_coverage", "calibration_error", "calibration_error_occupied",
                          "team_calibration_error", "team_calibration_error_occupied")
@@ -43,28 +43,28 @@ def test_every_map_the_mean_and_the_centralised_map_have_a_row() -> None:
         assert " ".join(agreement) == f"{tables.share(scores.agreement)} {tables.share(scores.agreement_occupied)}"
     assert row(text, "Against world.npz", "mean")[0] == f"{final.mean('mean_iou'):.3f}"
     assert "agreement with the centralised map\n" in text
-    assert "cells whose label differs between robots: 8.33 %" in text
+    assert "cells with different labels: 8.33 %" in text
 
 
-def test_classes_have_a_column_for_each_robot_of_a_small_team() -> None:
+def test_the_classes_of_a_small_team_have_one_column_per_robot() -> None:
     judged = evaluation()
     ground = row(rendered(judged), "IoU of the classes", "ground")
-    robots = [scores.iou[0] for scores in judged.final.robots]
+    robots = [judged.iou(scores)[0] for scores in judged.final.robots]
     central = judged.final.central
     assert central is not None
-    assert ground == [f"{value:.3f}" for value in (*robots, sum(robots) / 3, central.iou[0])]
+    assert ground == [f"{value:.3f}" for value in (*robots, sum(robots) / 3, judged.iou(central)[0])]
     assert row(rendered(judged), "IoU of the classes", "tree")[1] == "-"
 
 
-def test_a_large_team_has_its_mean_least_and_largest() -> None:
+def test_the_classes_of_a_large_team_have_columns_mean_least_and_largest() -> None:
     judged = evaluation(num_robots=12)
     ground = row(rendered(judged), "IoU of the classes", "ground")
-    robots = [scores.iou[0] for scores in judged.final.robots]
+    robots = [judged.iou(scores)[0] for scores in judged.final.robots]
     assert ground[:3] == [f"{value:.3f}" for value in (sum(robots) / 12, min(robots), max(robots))]
     assert row(rendered(judged), "IoU of the classes", "tree")[:3] == ["-", "-", "-"]
 
 
-def test_time_has_a_row_for_some_ticks_up_to_the_last() -> None:
+def test_the_table_over_time_ends_at_the_last_tick() -> None:
     judged = evaluation(num_ticks=40)
     lines = rendered(judged).split("Over time")[1].splitlines()
     times = [float(line.split()[0]) for line in lines if " s " in line]
@@ -77,25 +77,25 @@ def test_time_has_a_row_for_some_ticks_up_to_the_last() -> None:
     assert central is not None
     assert last.split()[-5:] == [
         *(f"{judged.final.mean(name):.3f}" for name in ("mean_iou", "coverage", "calibration_error")),
-        f"{judged.final.mean('team_calibration_error'):.3f}", f"{central.mean_iou:.3f}",
+        f"{judged.final.mean('team_calibration_error'):.3f}", f"{central.score('mean_iou'):.3f}",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("num_ticks", [1, 2, 11, 12, 13, 14, 25])
-def test_no_tick_is_shown_twice(num_ticks: int) -> None:
+def test_the_table_over_time_has_no_duplicate_rows(num_ticks: int) -> None:
     lines = rendered(evaluation(num_ticks=num_ticks)).partition("Over time")[2].splitlines()
     times = [line.split()[0] for line in lines if " s " in line]
     assert len(set(times)) == len(times) == (min(num_ticks, MAX_TIMES) if num_ticks > 1 else 0)
 
 
-def test_without_truth_and_centralised_map_the_rest_is_shown() -> None:
+def test_tables_without_truth_and_centralised_map() -> None:
     text = rendered(evaluation(has_truth=False, has_central=False))
     assert "IoU" not in text
     assert "central" not in text.replace("the centralised map", "")
     assert "Over time" in text
 
 
-def test_who_is_off_and_what_is_compared_with_is_said() -> None:
+def test_inactive_robots_and_the_reference_are_shown() -> None:
     first = evaluation(num_ticks=1)
     text = rendered(dataclasses.replace(first, against="other.mcap"))
     assert "alpha (off)" in text

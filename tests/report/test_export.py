@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-import leaf_list
 from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
 from octoreplay.report.export import FREE_COLOR, export_ply
-from result_factory import leaf_table, state, write_result
+from support import leaf_list
+from support.result_factory import leaf_table, state, write_result
 
 LEAVES = leaf_table()
 DARK, YELLOW = [68, 1, 84], [253, 231, 37]
 
 
 def fill(writer: ResultWriter) -> None:
-    """Alpha knows all four leaves; beta the first, with other log-odds, and a place of its own."""
+    """Alpha knows all four leaves; beta knows the first, with other log-odds, and one more."""
     other = LeafTable(
         np.array([[0.1, 0.1, 0.1], [3.1, 3.1, 3.1]]),
         np.array([0.2, 0.2]),
@@ -39,7 +39,7 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def exported(result: Path, **options: object) -> tuple[list[list[float]], list[list[int]], PlyData]:
-    """Positions and colours of the points, and the whole file."""
+    """Positions and colours of the points, and the file."""
     path = result.with_name("map.ply")
     count = export_ply(result, path, **options)
     data = PlyData.read(path)
@@ -49,21 +49,21 @@ def exported(result: Path, **options: object) -> tuple[list[list[float]], list[l
     return positions, np.column_stack([vertices[name] for name in ("red", "green", "blue")]).tolist(), data
 
 
-def test_labels_have_the_classes_colours(result: Path) -> None:
+def test_labels_have_the_colours_of_the_classes(result: Path) -> None:
     positions, colors, data = exported(result)
     np.testing.assert_allclose(positions, LEAVES.centers[:3], atol=1e-5)
     assert colors == [[10, 20, 30], [1, 2, 250], [10, 20, 30]]
     assert data["vertex"]["label"].tolist() == [1, 2, 1]
 
 
-def test_free_leaves_come_only_when_asked_for(result: Path) -> None:
+def test_free_leaves_are_optional(result: Path) -> None:
     positions, colors, data = exported(result, free=True)
     assert len(positions) == 4
     assert colors[3] == list(FREE_COLOR)
     assert data["vertex"]["label"].tolist() == [1, 2, 1, 0]
 
 
-def test_the_comments_say_what_was_chosen(result: Path) -> None:
+def test_the_comments_name_the_options(result: Path) -> None:
     comments = exported(result, robot="beta", team_posterior=True)[2].comments
     assert "octoreplay map of beta at tick 1, 1 s after the start" in comments
     assert "resolution 0.2 m, N = 2 robots, log-odds: team posterior h_0 + N (h - h_0)" in comments
@@ -71,7 +71,7 @@ def test_the_comments_say_what_was_chosen(result: Path) -> None:
     assert "log-odds: the robot's own h" in exported(result)[2].comments[1]
 
 
-def test_the_team_posterior_is_surer(result: Path) -> None:
+def test_the_team_posterior_has_higher_probabilities(result: Path) -> None:
     own = exported(result)[2]["vertex"]["probability"]
     whole = exported(result, team_posterior=True)[2]["vertex"]["probability"]
     odds = np.exp(2 * LEAVES.log_odds[0])
@@ -79,16 +79,16 @@ def test_the_team_posterior_is_surer(result: Path) -> None:
     assert (whole > own).all()
 
 
-def test_an_earlier_map_can_be_written(result: Path) -> None:
+def test_a_map_at_an_earlier_time_can_be_exported(result: Path) -> None:
     assert len(exported(result, at=2.5)[0]) == 1
     with pytest.raises(InputError, match="no map of robot 'alpha' is stored up to"):
         export_ply(result, result.with_name("map.ply"), at=0.5)
 
 
-def test_probability_runs_from_a_guess_to_certainty(result: Path) -> None:
+def test_probability_colours_run_from_uniform_to_certain(result: Path) -> None:
     _, colors, data = exported(result, color="probability")
     order = np.argsort(data["vertex"]["probability"])
-    # The ramp's green rises all the way.
+    # Green increases over the whole ramp.
     green = [colors[index][1] for index in order]
     assert green == sorted(green)
     assert "dark 0.333, yellow 1" in data.comments[-1]
@@ -113,7 +113,7 @@ def test_a_team_of_equal_maps_has_no_disagreement(tmp_path: Path, monkeypatch: p
     assert exported(write_result(tmp_path, equal), color="disagreement")[1] == [DARK] * 3
 
 
-def test_robots_colours_mix_where_both_know_a_place(result: Path) -> None:
+def test_robot_colours_are_mixed_where_both_robots_know_a_leaf(result: Path) -> None:
     positions, colors, data = exported(result, color="robot")
     first, second = np.array(PALETTE[0]), np.array(PALETTE[1])
     found = {tuple(position): color for position, color in zip(positions, colors, strict=True)}
@@ -127,7 +127,7 @@ def test_robots_colours_mix_where_both_know_a_place(result: Path) -> None:
     assert len(exported(result, color="robot", robot="beta")[0]) == 2
 
 
-def test_voxels_are_cubes(result: Path) -> None:
+def test_voxels_are_exported_as_cubes(result: Path) -> None:
     path = result.with_name("cubes.ply")
     assert export_ply(result, path, what="voxels") == 3
     data = PlyData.read(path)
@@ -135,6 +135,6 @@ def test_voxels_are_cubes(result: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{"what": "mesh"}, {"color": "height"}])
-def test_other_choices_are_refused(result: Path, options: dict[str, str]) -> None:
+def test_unknown_options_are_refused(result: Path, options: dict[str, str]) -> None:
     with pytest.raises(ConfigError, match="is not one of"):
         export_ply(result, result.with_name("map.ply"), **options)

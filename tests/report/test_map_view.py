@@ -1,4 +1,4 @@
-"""Pictures of maps against what a slow, obvious drawing of the same faces shows."""
+"""Pictures of maps against a slow, simple drawing of the same faces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from octoreplay.report import map_view
 from octoreplay.report.map_view import BACKGROUND, Faces, View, cube_faces, draw, mesh_faces, overlay, view_of
 from octoreplay.result import StoredMap
-from octree_factory import octree_of
+from support.octree_factory import octree_of
 
 DOWN = View(math.pi / 2, math.pi / 2, (0.0, 0.0, 0.0), 0.1, 80, 60)
 """Straight down, x to the right, y up, ten pixels to a metre."""
@@ -20,7 +20,7 @@ OBLIQUE = View(0.7, 0.6, (0.3, -0.3, 0.0), 0.16, 25, 21)
 
 @pytest.fixture
 def evenly_lit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Faces show their colours as they are."""
+    """Draw faces in their own colours, without light and shade."""
     monkeypatch.setattr(map_view, "_light", lambda faces, view: np.ones(len(faces.corners)))
 
 
@@ -35,24 +35,24 @@ def together(*parts: Faces) -> Faces:
 
 
 def at(picture: np.ndarray, view: View, point: tuple[float, float, float]) -> list[int]:
-    """The picture's colour at a point."""
+    """Colour of the picture at a point."""
     column, row, _ = view.project(point)
     return picture[int(row), int(column)].tolist()
 
 
-# --- where things are ------------------------------------------------------------------------------------------------
+# --- geometry ---------------------------------------------------------------------------------------------------------
 
 
-def test_points_are_projected_to_where_they_are() -> None:
+def test_projection_of_points_by_hand() -> None:
     np.testing.assert_allclose(DOWN.project([1.0, 2.0, 3.0]), [50.0, 10.0, -3.0], atol=1e-12)
     level = View(0.0, 0.0, (0.0, 0.0, 1.0), 0.5, 80, 60)
-    # Looking along x: y is to the left, and what is farther along x is deeper.
+    # The view is along x: y points to the left, and the depth grows with x.
     np.testing.assert_allclose(level.project([4.0, 2.0, 2.0]), [36.0, 28.0, 4.0], atol=1e-12)
     slanted = View(math.pi / 2, math.pi / 4, (0.0, 0.0, 0.0), 1.0, 0, 0)
     np.testing.assert_allclose(slanted.project([0.0, 1.0, 1.0]), [0.0, -math.sqrt(2.0), 0.0], atol=1e-12)
 
 
-def test_a_view_just_holds_its_points() -> None:
+def test_a_view_is_the_closest_one_of_its_points() -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(-20, 30, (50, 3))
     for width, height in ((100, 400), (400, 100)):
@@ -65,7 +65,7 @@ def test_a_view_just_holds_its_points() -> None:
         np.testing.assert_allclose([columns.min() + columns.max(), rows.min() + rows.max()], [width, height], atol=1e-6)
 
 
-def test_only_faces_between_cubes_are_left_out() -> None:
+def test_faces_of_cubes_without_those_between_two_cubes() -> None:
     rng = np.random.default_rng(4)
     keys = {tuple(key) for key in rng.integers(-3, 3, (60, 3)).tolist()}
     faces = cubes(*(tuple((k + 0.5) for k in key) for key in keys))
@@ -82,11 +82,11 @@ def test_only_faces_between_cubes_are_left_out() -> None:
     assert len(middles) == len(expected)
 
 
-# --- what is seen ----------------------------------------------------------------------------------------------------
+# --- drawing ----------------------------------------------------------------------------------------------------------
 
 
 def naive(faces: Faces, view: View) -> np.ndarray:
-    """The picture, pixel by pixel and face by face; faces as they are lit, one sample in a pixel's middle."""
+    """Picture drawn pixel by pixel and face by face, with one sample in the middle of a pixel and no light."""
     picture = np.zeros((view.height, view.width, 3))
     right, up, ahead = view.axes
     for row, column in itertools.product(range(view.height), range(view.width)):
@@ -114,7 +114,7 @@ def naive(faces: Faces, view: View) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_cubes_are_drawn_as_the_obvious_way_draws_them(seed: int, evenly_lit: None) -> None:
+def test_cubes_are_drawn_as_by_the_naive_way(seed: int, evenly_lit: None) -> None:
     rng = np.random.default_rng(seed)
     keys = np.unique(rng.integers(-2, 3, (12, 3)), axis=0)
     faces = cube_faces(
@@ -124,24 +124,24 @@ def test_cubes_are_drawn_as_the_obvious_way_draws_them(seed: int, evenly_lit: No
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_triangles_are_drawn_as_the_obvious_way_draws_them(seed: int, evenly_lit: None) -> None:
+def test_triangles_are_drawn_as_by_the_naive_way(seed: int, evenly_lit: None) -> None:
     rng = np.random.default_rng(seed)
     faces = mesh_faces(rng.uniform(-2, 2, (15, 3, 3)), rng.integers(0, 256, (15, 3)).astype(np.uint8))
     assert_same(draw(faces, OBLIQUE, supersampling=1), naive(faces, OBLIQUE))
 
 
 def assert_same(picture: np.ndarray, expected: np.ndarray) -> None:
-    """Equal but for rounding; a ray through an edge may see either side of it."""
+    """Check equality up to rounding, except for a few rays through edges, which may hit either face."""
     assert len(np.unique(expected.reshape(-1, 3), axis=0)) > 5
     wrong = np.abs(picture.astype(float) - expected).max(axis=2) > 1
     assert wrong.mean() < 0.003
 
 
-def test_half_a_cube_is_half_its_color_and_half_the_background() -> None:
+def test_a_half_transparent_cube_mixes_its_color_with_the_background() -> None:
     solid = draw(cubes((0.5, 0.5, 0.5)), DOWN)
     half = draw(cubes((0.5, 0.5, 0.5), opacity=0.5), DOWN)
     top = (0.5, 0.5, 1.0)
-    # The sky's 0.62, and the sun's 0.56 at the angle between its direction (0.6, 0, 0.75) and straight up.
+    # 0.62 from the sky, and 0.56 from the sun at the angle between its direction (0.6, 0, 0.75) and the vertical.
     light = 0.62 + 0.56 * 0.75 / math.hypot(0.6, 0.75)
     np.testing.assert_allclose(at(solid, DOWN, top), np.array([200, 100, 40]) * light, atol=0.51)
     np.testing.assert_allclose(
@@ -150,7 +150,7 @@ def test_half_a_cube_is_half_its_color_and_half_the_background() -> None:
     assert at(half, DOWN, (-0.5, 0.5, 1.0)) == list(BACKGROUND)
 
 
-def test_the_nearer_cube_hides_the_farther_one(evenly_lit: None) -> None:
+def test_a_nearer_cube_covers_a_farther_one(evenly_lit: None) -> None:
     near, far = (10, 200, 30), (250, 0, 90)
     for opacity in (1.0, 0.25):
         faces = together(cubes((0.5, 0.5, 0.5), color=far), cubes((0.5, 0.5, 4.5), color=near, opacity=opacity))
@@ -158,7 +158,7 @@ def test_the_nearer_cube_hides_the_farther_one(evenly_lit: None) -> None:
         np.testing.assert_allclose(at(draw(faces, DOWN), DOWN, (0.5, 0.5, 0.0)), expected, atol=0.51)
 
 
-def test_what_is_in_the_shade_is_darker() -> None:
+def test_a_face_in_the_shade_is_darker() -> None:
     ground = mesh_faces(
         np.array([[(x, y, 0.0), (x + 0.1, y, 0.0), (x, y + 0.1, 0.0)] for x, y in ((-0.55, 0.45), (1.45, 0.45))]),
         np.full((2, 3), 200, np.uint8),
@@ -172,22 +172,22 @@ def test_what_is_in_the_shade_is_darker() -> None:
     assert sunny[0] > 1.3 * shaded[0]
 
 
-def test_nothing_is_background() -> None:
+def test_a_picture_without_faces_is_background() -> None:
     picture = draw(cubes((100.0, 100.0, 0.5)), DOWN)
     assert (picture == BACKGROUND).all()
 
 
 def test_too_many_faces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_view, "_MAX_FACES", 5)
-    with pytest.raises(ValueError, match="6 are more than can be drawn"):
+    with pytest.raises(ValueError, match="6 are more than the 5 that can be drawn"):
         draw(cubes((0.5, 0.5, 0.5)), DOWN)
 
 
-# --- maps over each other --------------------------------------------------------------------------------------------
+# --- overlays ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prior", [0.0, -0.7, 0.4])
-def test_an_overlay_is_the_mean_and_the_largest_distance(prior: float) -> None:
+def test_an_overlay_has_the_label_of_the_mean_and_the_largest_distance(prior: float) -> None:
     rng = np.random.default_rng(5)
     keys = [tuple(key) for key in np.unique(rng.integers(-5, 5, (150, 3)), axis=0).tolist()]
     known = [{key: rng.normal(0, 1, 2).astype(np.float32) for key in keys if rng.random() < 0.6} for _ in range(3)]
@@ -208,7 +208,7 @@ def test_an_overlay_is_the_mean_and_the_largest_distance(prior: float) -> None:
         assert deviation == pytest.approx(expected[center][1], rel=1e-5)
 
 
-def test_what_robots_agree_on_is_solid() -> None:
+def test_opacities_decrease_with_the_deviation() -> None:
     np.testing.assert_allclose(
         map_view.opacities(np.array([0.0, 1.0, 3.0, 4.0, 9.0]), 4.0), [1.0, 0.75, 0.25, 0.1, 0.1]
     )

@@ -5,12 +5,12 @@ from PIL import Image
 
 from octoreplay.report import paper_plots
 from octoreplay.report.map_view import BACKGROUND
-from result_factory import CLASSES, tick_metrics
+from support.result_factory import CLASSES, tick_metrics
 
 METRICS = [tick_metrics(tick) for tick in range(1, 9)]
 
 
-def test_figures_show_the_numbers() -> None:
+def test_figures_have_the_values_of_the_metrics() -> None:
     [axes] = paper_plots.distance_figure(METRICS, (1.0,)).axes
     np.testing.assert_array_equal(axes.get_lines()[0].get_ydata(), [tick.total_distance for tick in METRICS])
     np.testing.assert_array_equal(axes.get_lines()[0].get_xdata(), range(8))
@@ -19,13 +19,13 @@ def test_figures_show_the_numbers() -> None:
     upper, lower = paper_plots.agreement_figure(METRICS, ()).axes
     worst = [min(robot.agreement for robot in tick.robots if robot.active) for tick in METRICS]
     occupied = [min(robot.agreement_occupied for robot in tick.robots if robot.active) for tick in METRICS]
-    assert occupied[0] > occupied[1]  # The other robot, which agrees less, is not active at first.
+    assert occupied[0] > occupied[1]  # Beta, which agrees less, is inactive at first.
     np.testing.assert_array_equal(upper.get_lines()[0].get_ydata(), worst)
     np.testing.assert_array_equal(upper.get_lines()[1].get_ydata(), occupied)
     np.testing.assert_array_equal(lower.get_lines()[0].get_ydata(), [tick.label_disagreement for tick in METRICS])
 
 
-def test_packets_are_shown_as_mean_deviation_and_ratio() -> None:
+def test_packet_figure_has_mean_deviation_and_ratio() -> None:
     upper, lower = paper_plots.packet_figure(METRICS, ()).axes
     grid = np.array([[robot.grid_bytes for robot in tick.robots] for tick in METRICS])
     octree = np.array([[robot.octree_bytes for robot in tick.robots] for tick in METRICS])
@@ -38,7 +38,7 @@ def test_packets_are_shown_as_mean_deviation_and_ratio() -> None:
     assert set(lower.get_lines()[1].get_ydata()) == {4.0}
 
 
-def test_pictures_of_maps_are_put_beside_each_other() -> None:
+def test_pictures_of_maps_are_placed_side_by_side() -> None:
     colors = {"300 s": (200, 0, 0), "100 s": (0, 200, 0), "The village": (0, 0, 200)}
     pictures = {title: np.full((100, 160, 3), color, np.uint8) for title, color in colors.items()}
     png = paper_plots.maps_picture(pictures, CLASSES, 0.5)

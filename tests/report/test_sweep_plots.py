@@ -30,7 +30,7 @@ def axes_of(rows: list[dict[str, Any]], varied: list[tuple[str, ...]], column: s
     return [axes for axes in figure.axes if axes.get_visible()]
 
 
-def test_numbers_become_lines_of_means_with_their_range() -> None:
+def test_numeric_settings_become_lines_of_means_with_ranges() -> None:
     (axes,) = axes_of(ROWS, [("resolution",), ("rule",)])
     lines = {entry.get_label(): entry for entry in axes.containers}
     assert list(lines) == ["bayes", "gradient"]
@@ -43,7 +43,7 @@ def test_numbers_become_lines_of_means_with_their_range() -> None:
     assert axes.get_xlabel() == "resolution"
 
 
-def test_words_become_bars() -> None:
+def test_other_settings_become_bars() -> None:
     (axes,) = axes_of(ROWS, [("rule",), ("resolution",)])
     assert [text.get_text() for text in axes.get_xticklabels()] == ["bayes", "gradient"]
     assert [bars.get_label() for bars in axes.containers if hasattr(bars, "patches")] == ["0.2", "0.1", "0.4"]
@@ -51,20 +51,20 @@ def test_words_become_bars() -> None:
     np.testing.assert_allclose(heights, [[0.3, 0.33], [0.2, 0.23], [0.4 + 0.1, 0.4 + 0.13]])
 
 
-def test_what_else_was_varied_becomes_panels() -> None:
+def test_further_settings_become_panels() -> None:
     rows = [{**entry, "team": team, "loss": "0"} for team in ("a", "b", "c") for entry in ROWS]
     panels = axes_of(rows, [("resolution",), ("rule",), ("loss",)])
     assert [axes.get_title(loc="left") for axes in panels] == [f"loss 0, team {team}" for team in "abc"]
 
 
-def test_parameters_that_go_together_are_one_axis() -> None:
+def test_settings_that_are_varied_together_are_one_axis() -> None:
     rows = [row(a=a, b=b, agreement=0.5) for a, b in (("1", "x"), ("2", "y"))]
     (axes,) = axes_of(rows, [("a", "b")])
     assert [text.get_text() for text in axes.get_xticklabels()] == ["1 x", "2 y"]
     assert axes.get_xlabel() == "a+b"
 
 
-def test_figures_are_pictures_of_what_has_numbers(tmp_path: Path) -> None:
+def test_figures_are_drawn_of_columns_with_numbers(tmp_path: Path) -> None:
     rows = [*ROWS, {"team": "t", "seed": 0, "status": "failed", "resolution": "0.2", "rule": "bayes"}]
     varied = [("resolution",), ("rule",)]
     (path,) = write_sweep_figures(rows, varied, tmp_path / "f")
@@ -80,14 +80,14 @@ def test_figures_are_pictures_of_what_has_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("values", "scale"), [((1.0, 1e6, 0.0), "log"), ((0.0, 0.0, 0.0), "linear")])
-def test_what_spans_decades_is_logarithmic(values: tuple[float, ...], scale: str) -> None:
+def test_values_over_several_decades_have_a_logarithmic_axis(values: tuple[float, ...], scale: str) -> None:
     rows = [row(rule=str(n), total_distance_all=value) for n, value in enumerate(values)]
     (axes,) = axes_of(rows, [("rule",)], "total_distance_all")
     assert axes.get_yscale() == scale
     assert axes.get_ylim()[0] == (pytest.approx(1 / 3) if scale == "log" else 0.0)
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_raises(tmp_path: Path) -> None:
     (tmp_path / "f").touch()
     with pytest.raises(OutputError, match="f: cannot be written: "):
         write_sweep_figures(ROWS, [("rule",)], tmp_path / "f")

@@ -8,11 +8,11 @@ import pytest
 from rich.console import RenderableType
 
 from octoreplay.config.robot import RobotConfig
-from octoreplay.io.robots.discover import LogDescription, LogSummary, RobotSummary, TopicSummary
+from octoreplay.io.robots.describe import LogDescription, LogSummary, RobotSummary, TopicSummary
 from octoreplay.records import RobotMetrics
 from octoreplay.report import tables
 from octoreplay.result import PointQuery
-from result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
+from support.result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
 
 
 def rendered(*parts: RenderableType, width: int = 80) -> str:
@@ -28,7 +28,7 @@ def rendered(*parts: RenderableType, width: int = 80) -> str:
     [(0, "0"), (1234567.8, "1,234,568"), (0.12345, "0.123"), (1e-9, "1e-09"), (999.6, "1,000"), (math.nan, "-"),
      (1e12, "1e+12"), (12.34, "12.3")],
 )  # fmt: skip
-def test_numbers_are_short(value: float, text: str) -> None:
+def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert tables.number(value) == text
 
 
@@ -54,7 +54,7 @@ def test_results_show_the_team_the_robots_and_the_frames() -> None:
     text = rendered(tables.results(summary([tick_metrics(1), tick_metrics(2, settling=True)])))
     assert "12.5 s" in text
     assert "3.2 s (3.8 times real time)" in text
-    assert "1, and 1 to settle" in text
+    assert "1, and 1 settling" in text
     assert "it was over" in text
     assert "90.00 % of all cells, 79.67 % of occupied cells" in text
     assert "6 kB as uniform grid (sent: 2.51 % of it)" in text
@@ -63,7 +63,7 @@ def test_results_show_the_team_the_robots_and_the_frames() -> None:
     assert "no label" not in text
 
 
-def test_results_fit_a_large_team_and_say_nothing_of_an_unknown_wall_time() -> None:
+def test_results_fit_a_large_team_and_leave_out_an_unknown_wall_time() -> None:
     names = [f"a_long_robot_name_{index}" for index in range(12)]
     robot = tick_metrics(500).robots[0]
     big = {"num_leaves": 1_234_567, "observed_volume": 123_456.0, "agreement": 1.0, "agreement_occupied": 1.0}
@@ -74,14 +74,14 @@ def test_results_fit_a_large_team_and_say_nothing_of_an_unknown_wall_time() -> N
     assert all(name in text for name in names)
 
 
-def test_a_share_of_nothing_is_a_dash() -> None:
+def test_a_missing_share_is_a_dash() -> None:
     last = tick_metrics(1)
     robots = tuple(dataclasses.replace(robot, agreement=math.nan, agreement_occupied=math.nan) for robot in last.robots)
     text = rendered(tables.results(summary([dataclasses.replace(last, robots=robots)])))
     assert "- of all cells, - of occupied cells" in text
 
 
-def test_what_was_chosen_is_shown(tmp_path: Path) -> None:
+def test_inputs_and_classes_are_shown(tmp_path: Path) -> None:
     config = team(tmp_path)
     text = rendered(tables.chosen_inputs(config), tables.class_list(CLASSES))
     assert "alpha.bag" in text
@@ -89,7 +89,7 @@ def test_what_was_chosen_is_shown(tmp_path: Path) -> None:
     assert "\u25a0 ground  \u25a0 tree" in text
 
 
-def test_points_are_answered_with_runners_up() -> None:
+def test_point_answers_show_the_next_classes() -> None:
     answer = PointQuery(
         log_odds=np.array([[3.0, 1.0], [0.0, 0.0]], dtype=np.float32),
         probabilities=np.array([[0.042, 0.844, 0.114], [1 / 3, 1 / 3, 1 / 3]], dtype=np.float32),
@@ -101,17 +101,17 @@ def test_points_are_answered_with_runners_up() -> None:
         tables.point_answers(("free", "ground", "tree"), [(1.0, 2.5, -3.0), (9, 9, 9)], answer)
     ).splitlines()
     assert "1, 2.5, -3" in lines[2]
-    assert "ground    84.40 %  tree 11.40 %, free 4.20 %  0.4 m" in lines[2]
+    assert "ground       84.40 %  tree 11.40 %, free 4.20 %  0.4 m" in lines[2]
     assert lines[3].split() == ["9,", "9,", "9", "unknown"]
 
 
-def test_a_box_is_answered_with_volumes() -> None:
+def test_box_answers_show_volumes() -> None:
     text = rendered(tables.box_answer(("free", "ground", "tree"), leaf_table()))
     rows = {line.split()[0]: line.split()[1:3] for line in text.splitlines()[2:]}
     assert rows == {"free": ["1", "0.008"], "ground": ["2", "0.016"], "tree": ["1", "0.064"]}
 
 
-def test_logs_are_described_with_what_is_missing() -> None:
+def test_descriptions_of_logs_list_missing_inputs() -> None:
     topics = (
         TopicSummary("/camera/depth", "sensor_msgs/msg/Image", "cdr", 1200, 29.97, "16UC1 640x480"),
         TopicSummary("/status", "acme_msgs/msg/Status", "protobuf", 1, None, ""),
@@ -132,13 +132,13 @@ def test_logs_are_described_with_what_is_missing() -> None:
     assert "nothing is missing" not in text
 
 
-def test_an_empty_log_is_described_too() -> None:
+def test_description_of_an_empty_log() -> None:
     log = LogSummary(Path("robot.mcap"), None, None, 0, (), None)
     text = rendered(tables.description(LogDescription((log,), (), None, None, ())))
     assert "robot.mcap\nempty, 0 messages" in text
 
 
-def test_brackets_in_names_are_no_styles() -> None:
+def test_brackets_in_names_are_not_markup() -> None:
     robot = RobotConfig("r[bold]1", (Path("a[red].mcap"),), depth_topic="/[/]depth")
     text = rendered(tables.description(LogDescription((), (RobotSummary(robot, 0, 1, ()),), None, None, ())))
     assert "r[bold]1" in text

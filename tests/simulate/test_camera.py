@@ -1,4 +1,4 @@
-"""Pictures of a mesh, and how they are spoiled."""
+"""Tests of rendered images and their noise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA = CameraModel(width=9, height=7, fx=6.0, fy=5.0, cx=4.0, cy=3.0)
 
 
 def two_squares() -> World:
-    """A large square 8 m ahead on the optical axis (z), and a small one 3 m ahead in its middle."""
+    """World of a large square 8 m ahead on the optical axis (z) and a small square 3 m ahead at its centre."""
     points, faces = [], []
     for z, half in ((8.0, 20.0), (3.0, 0.63)):
         points += [(-half, -half, z), (half, -half, z), (half, half, z), (-half, half, z)]
@@ -38,8 +38,8 @@ def two_squares() -> World:
     return World(40.0, flat, np.array(points, np.float32), np.array(faces, np.int32), classes)
 
 
-def plain_pictures(T: np.ndarray, max_depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """The obvious twin: every pixel's ray against both squares, analytically."""
+def reference_images(T: np.ndarray, max_depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Reference implementation: analytic intersection of every pixel's ray with both squares."""
     depth, labels = np.zeros((CAMERA.height, CAMERA.width)), np.full((CAMERA.height, CAMERA.width), NO_LABEL)
     for v in range(CAMERA.height):
         for u in range(CAMERA.width):
@@ -56,12 +56,12 @@ def plain_pictures(T: np.ndarray, max_depth: float) -> tuple[np.ndarray, np.ndar
 
 @pytest.mark.parametrize("max_depth", [20.0, 5.0])
 @pytest.mark.parametrize(("x", "angle"), [(0.03, 0.0), (-0.4, 0.3), (1.0, -0.9), (0.0, np.pi)])
-def test_pictures_equal_the_plain_ones(x, angle, max_depth):
+def test_images_equal_the_reference(x, angle, max_depth):
     T = np.eye(4)
     T[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     T[:3, 3] = x, 0.02, 0.1
     depth, labels = MeshCamera(two_squares(), CAMERA).take(T, max_depth)
-    expected_depth, expected_labels = plain_pictures(T, max_depth)
+    expected_depth, expected_labels = reference_images(T, max_depth)
     assert (depth.dtype, labels.dtype) == (np.float32, np.uint8)
     np.testing.assert_array_equal(labels, expected_labels)
     np.testing.assert_allclose(depth, expected_depth, rtol=1e-5)
@@ -78,7 +78,7 @@ def test_noise_formula_at_known_ranges():
 
 
 @pytest.mark.parametrize("z", [1.0, 5.0, 10.0])
-def test_depth_noise_has_the_spread_of_its_range(z):
+def test_depth_noise_has_the_standard_deviation_of_its_range(z):
     image = np.full((200, 200), z, np.float32)
     image[:, :50] = 0.0
     noisy = add_depth_noise(image, np.random.default_rng(0))
@@ -89,38 +89,38 @@ def test_depth_noise_has_the_spread_of_its_range(z):
     assert error.std() == pytest.approx(sigma, rel=0.03)
 
 
-def test_a_measured_pixel_stays_measured_whatever_the_noise():
+def test_noise_keeps_measured_depths_positive():
     far = np.full((100, 100), 60.0, np.float32)
     assert (add_depth_noise(far, np.random.default_rng(1)) > 0).all()
 
 
-def test_millimetres_are_rounded_and_never_the_value_that_means_invalid():
+def test_millimetres_are_rounded_and_below_65535():
     depth = np.array([[0.0, 0.0004, 0.0006, 1.2345, 65.534, 65.535, 70.0]], np.float32)
     assert depth_to_millimetres(depth).tolist() == [[0, 0, 1, 1234, 65534, 65534, 65534]]
 
 
 @given(st.floats(0.0, 1.0), st.integers(2, 20), st.integers(0, 1000))
-def test_label_noise_changes_the_share_asked_for_into_real_other_classes(share, num_classes, seed):
+def test_label_noise_changes_the_given_share_to_other_classes(share, num_classes, seed):
     rng = np.random.default_rng(seed)
     labels = rng.integers(1, num_classes + 1, (60, 60)).astype(np.uint8)
     labels[:5] = NO_LABEL
     noisy = add_label_noise(labels, share, num_classes, rng)
     assert (noisy[:5] == NO_LABEL).all()
     changed = noisy[5:] != labels[5:]
-    # Five standard deviations, and five pixels where so few are expected that the count is not normal.
+    # Five standard deviations, plus five pixels for small counts, which are not normally distributed.
     assert abs(changed.sum() - share * changed.size) <= 5 * np.sqrt(share * (1 - share) * changed.size) + 5
     assert noisy[5:].min() >= 1
     assert noisy[5:].max() <= num_classes
 
 
-def test_wrong_labels_are_spread_over_all_other_classes():
+def test_wrong_labels_are_uniform_over_the_other_classes():
     labels = np.full((200, 200), 3, np.uint8)
     counts = np.bincount(add_label_noise(labels, 1.0, 5, np.random.default_rng(0)).ravel(), minlength=6)
     assert counts[3] == 0
     np.testing.assert_allclose(counts[[1, 2, 4, 5]], 10_000, rtol=0.05)
 
 
-def test_a_missing_open3d_is_one_sentence_with_the_remedy(monkeypatch):
+def test_a_missing_open3d_is_reported_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(InputError, match=r"needs Open3D.*apt-get install libusb-1\.0-0 libegl1 libgl1 libx11-6"):
         MeshCamera(two_squares(), CAMERA)

@@ -1,4 +1,4 @@
-"""Robots explore: they keep clear, keep moving, and each sees its own part."""
+"""Tests of the exploration: clearance, motion limits, coverage and path search."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from octoreplay.simulate.exploration import CELL, Motion, _shortest_paths, explore
-from octoreplay.simulate.world import make_village
+from octoreplay.simulate.village import make_village
 
 PERIOD = 0.1
 
@@ -26,9 +26,9 @@ def cells_of(world, xy: np.ndarray) -> np.ndarray:
     return np.floor((xy + world.size / 2) / CELL).astype(int)
 
 
-def test_nobody_comes_near_an_obstacle_or_the_edge(drive):
+def test_robots_keep_clear_of_obstacles_and_the_edge(drive):
     world, exploration = drive
-    # A cell of distance: half a metre at least from the robot's middle to anything that stands.
+    # One cell of distance is at least half a metre between the robot's centre and an obstacle.
     blocked = np.argwhere(world.obstacle_mask(CELL)) * CELL - world.size / 2
     visited = np.unique(cells_of(world, exploration.states[..., :2].reshape(-1, 2)), axis=0)
     for low in visited * CELL - world.size / 2:
@@ -37,19 +37,19 @@ def test_nobody_comes_near_an_obstacle_or_the_edge(drive):
     assert (np.abs(exploration.states[..., :2]) <= world.size / 2 - 0.5).all()
 
 
-def test_motion_stays_within_a_husky_s_limits(drive):
+def test_motion_is_within_the_limits(drive):
     _, exploration = drive
     steps = np.diff(exploration.states, axis=1)
     speed = np.hypot(steps[..., 0], steps[..., 1]) / PERIOD
     assert speed.max() <= Motion().speed + 1e-9
     assert np.abs(steps[..., 2]).max() <= Motion().turn_rate * PERIOD + 1e-9
-    # It drives the way it looks.
+    # Robots drive along their heading.
     heading = exploration.states[:, 1:, 2]
     ahead = steps[..., 0] * np.cos(heading) + steps[..., 1] * np.sin(heading)
     np.testing.assert_allclose(ahead, speed * PERIOD, atol=1e-9)
 
 
-def test_robots_do_not_run_into_each_other(drive):
+def test_robots_keep_clear_of_each_other(drive):
     _, exploration = drive
     states = exploration.states
     for a in range(len(states)):
@@ -58,14 +58,14 @@ def test_robots_do_not_run_into_each_other(drive):
             assert distance.min() > 0.9
 
 
-def test_nobody_gets_stuck(drive):
+def test_every_robot_keeps_moving(drive):
     _, exploration = drive
     steps = np.diff(exploration.states, axis=1)
     length = np.hypot(steps[..., 0], steps[..., 1]).sum(axis=1)
     assert (length > 0.6 * 60.0 * Motion().speed).all()
 
 
-def test_the_team_shares_the_work(drive):
+def test_robots_see_different_parts_that_overlap(drive):
     world, exploration = drive
     seen = exploration.first_seen >= 0
     team = seen.any(axis=0)
@@ -74,26 +74,26 @@ def test_the_team_shares_the_work(drive):
         assert team.mean() > 0.35
     else:
         assert team.mean() > 0.7
-    # Some of it is seen by more than one, or there is nothing to agree on.
+    # Some cells must be seen by several robots for a consensus.
     assert (seen.sum(axis=0) > 1).sum() > 0.05 * team.sum()
 
 
-def test_walls_hide_what_is_behind_them(drive):
+def test_cells_behind_walls_are_not_seen(drive):
     world, exploration = drive
     first = exploration.first_seen[0]
     from scipy.ndimage import label
 
-    # Closed houses have an inside that nobody can see, though robots drive all around.
+    # The inside of closed houses cannot be seen from outside.
     inside, count = label(~world.obstacle_mask(CELL))
     sizes = np.bincount(inside.ravel())
     rooms = [k for k in range(1, count + 1) if 20 < sizes[k] < 400]
     assert rooms
     for room in rooms:
-        # What stands beside a robot is felt through the wall, hence a rim may be known.
+        # Robots detect cells next to them through walls, so a rim may be known.
         assert (first[inside == room] < 0).mean() > 0.3
 
 
-def test_the_same_world_is_explored_the_same_way():
+def test_exploration_is_deterministic():
     world = make_village(26.0, 2)
     first, second = (explore(world, 3, 150, PERIOD) for _ in range(2))
     np.testing.assert_array_equal(first.states, second.states)
@@ -115,8 +115,8 @@ def test_many_robots_start_apart():
     assert distance.min() >= 1.2
 
 
-def plain_dijkstra(passable: np.ndarray, start: tuple[int, int]) -> dict[tuple[int, int], float]:
-    """The obvious twin of the shortest paths."""
+def reference_dijkstra(passable: np.ndarray, start: tuple[int, int]) -> dict[tuple[int, int], float]:
+    """Reference implementation of the shortest paths."""
     best = {start: 0.0}
     queue = [(0.0, start)]
     while queue:
@@ -139,13 +139,13 @@ def plain_dijkstra(passable: np.ndarray, start: tuple[int, int]) -> dict[tuple[i
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.integers(2, 9), st.floats(0.3, 1.0))
-def test_shortest_paths_equal_the_plain_ones(seed, rows, columns, density):
+def test_shortest_paths_equal_the_reference(seed, rows, columns, density):
     rng = np.random.default_rng(seed)
     passable = rng.random((rows, columns)) < density
     start = (int(rng.integers(rows)), int(rng.integers(columns)))
     passable[start] = True
     cells, distance, previous = _shortest_paths(passable, np.array(start))
-    expected = plain_dijkstra(passable, start)
+    expected = reference_dijkstra(passable, start)
     for k, cell in enumerate(map(tuple, cells.tolist())):
         assert distance[k] == pytest.approx(expected.get(cell, np.inf))
         if np.isfinite(distance[k]) and cell != start:

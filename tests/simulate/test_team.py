@@ -1,4 +1,4 @@
-"""A simulated team on disk: its logs, its team file and its ground truth, judged from what the files say."""
+"""Tests of a simulated team's logs, team file and ground truth, read from the files."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.simulate import team
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
-from octoreplay.simulate.world import make_village, village_classes
-from stored_messages import matrix, pixels, read_messages, stamp_ns
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import village_classes
+from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
 SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)
@@ -33,7 +34,7 @@ def small(tmp_path_factory) -> Path:
 
 
 def camera_pose(messages, robot_id: str, stamp: int) -> np.ndarray:
-    """The camera's pose in the map, interpolated as a reader of the log would."""
+    """Camera pose in the map frame, interpolated from the logged poses."""
     stamps = np.array([t for t, _ in messages[f"/{robot_id}/odom"]])
     k = int(np.searchsorted(stamps, stamp, side="right")) - 1
     first, second = (messages[f"/{robot_id}/odom"][i][1].pose.pose for i in (k, k + 1))
@@ -48,7 +49,7 @@ def camera_pose(messages, robot_id: str, stamp: int) -> np.ndarray:
 
 
 def measured_points(messages, robot_id: str, max_range: float = 10.0):
-    """World points (P, 3) and raw labels (P,) of every frame within a range."""
+    """World points (P, 3) and raw labels (P,) of all frames, within a range."""
     labels = dict(messages[f"/{robot_id}/camera/labels/image_raw"])
     info = messages[f"/{robot_id}/camera/depth/camera_info"][0][1]
     for stamp, image in messages[f"/{robot_id}/camera/depth/image_raw"]:
@@ -67,7 +68,7 @@ def truth_of(folder: Path) -> tuple[dict[tuple[int, ...], int], float]:
     return dict(zip(map(tuple, keys), class_ids, strict=True)), float(resolution)
 
 
-def test_the_folder_holds_what_is_promised(small):
+def test_the_folder_has_the_documented_files(small):
     names = sorted(path.name for path in small.iterdir())
     assert names == ["husky_1.mcap", "husky_2.mcap", "team.yaml", "world.npz", "world.ply"]
 
@@ -115,13 +116,13 @@ def test_stamps_are_fixed_ordered_and_paired(small):
     assert depth == [stamp_ns(m) for _, m in messages["/husky_1/camera/labels/image_raw"]]
     assert set(np.diff(depth)) == {200_000_000}
     assert odometry[0] < depth[0] < depth[-1] < odometry[-1]
-    # Never at a pose's own stamp: the poses have to be interpolated.
+    # Images are never at the stamp of a pose, so that poses have to be interpolated.
     assert not set(depth) & set(odometry)
     for found in messages.values():
         assert all(t == stamp_ns(m) for t, m in found if hasattr(m, "header"))
 
 
-def test_robots_take_pictures_at_different_times(small):
+def test_robots_take_images_at_different_times(small):
     stamps = [
         {stamp_ns(m) for _, m in read_messages(small / f"{r}.mcap")[f"/{r}/camera/depth/image_raw"]}
         for r in ("husky_1", "husky_2")
@@ -129,7 +130,7 @@ def test_robots_take_pictures_at_different_times(small):
     assert not stamps[0] & stamps[1]
 
 
-def test_odometry_and_tf_tell_the_same_poses_and_the_twist_is_their_change(small):
+def test_odometry_and_tf_have_equal_poses_and_the_twist_is_their_derivative(small):
     messages = read_messages(small / "husky_1.mcap")
     poses = []
     for (_, odometry), (_, tf) in zip(messages["/husky_1/odom"], messages["/tf"], strict=True):
@@ -147,13 +148,13 @@ def test_pose_errors_are_stationary_and_change_over_ten_seconds():
     np.testing.assert_allclose(errors.std(axis=0), [0.5, 0.5, 0.05], rtol=0.05)
     starts = np.array([pose_errors(0.5, 1, 0.05, np.random.default_rng(seed))[0] for seed in range(1000)])
     np.testing.assert_allclose(starts.std(axis=0), [0.5, 0.5, 0.05], rtol=0.1)
-    # Ten seconds are 200 steps: the correlation with what was then is 1 / e.
+    # Ten seconds are 200 steps, after which the correlation is 1 / e.
     correlation = [np.corrcoef(errors[:-200, axis], errors[200:, axis])[0, 1] for axis in range(3)]
     np.testing.assert_allclose(correlation, np.exp(-1.0), atol=0.05)
     assert not pose_errors(0.0, 100, 0.05, np.random.default_rng(0)).any()
 
 
-def test_pose_noise_moves_the_recorded_poses_and_not_the_pictures(small, tmp_path):
+def test_pose_noise_changes_the_recorded_poses_only(small, tmp_path):
     simulate_team(tmp_path / "team", dataclasses.replace(SMALL, pose_noise=0.3))
     exact, noisy = (read_messages(folder / "husky_1.mcap") for folder in (small, tmp_path / "team"))
     for topic in ("/husky_1/camera/depth/image_raw", "/husky_1/camera/labels/image_raw"):
@@ -164,14 +165,14 @@ def test_pose_noise_moves_the_recorded_poses_and_not_the_pictures(small, tmp_pat
     assert 0.01 < np.mean(moved) < 1.5
 
 
-def test_kinds_split_every_class_of_pictures_and_truth(small, tmp_path):
+def test_kinds_divide_every_class_of_images_and_truth(small, tmp_path):
     simulate_team(tmp_path / "team", dataclasses.replace(SMALL, kinds_per_class=4))
     names = load_team_file(tmp_path / "team" / "team.yaml").classes.names
     assert len(names) == 32
     assert names[:5] == ("grass_1", "grass_2", "grass_3", "grass_4", "dirt_road_1")
     (whole, _), (split, _) = truth_of(small), truth_of(tmp_path / "team")
     assert whole.keys() == split.keys()
-    # On the border of two kinds the rest of a cell may outvote them.
+    # At the border of two kinds the majority in a cell may be another one.
     same = [whole[key] == (split[key] - 1) // 4 + 1 for key in whole]
     assert np.mean(same) > 0.98
     assert len(set(split.values())) > 12
@@ -185,7 +186,7 @@ def test_robots_stand_on_the_ground(small):
         np.testing.assert_allclose(T[:3, 2], terrain.normal(T[:2, 3]), atol=1e-9)
 
 
-def test_exact_pictures_put_the_world_where_the_ground_truth_has_it(tmp_path):
+def test_points_of_exact_images_are_in_the_ground_truth(tmp_path):
     simulate_team(tmp_path / "team", EXACT)
     truth, resolution = truth_of(tmp_path / "team")
     total = known = agreed = 0
@@ -197,12 +198,12 @@ def test_exact_pictures_put_the_world_where_the_ground_truth_has_it(tmp_path):
             known += int((found > 0).sum())
             agreed += int((found == labels).sum())
     assert total > 20_000
-    # Pixels at a cell's edge fall to the other side by the rounding to millimetres.
+    # Rounding to millimetres moves points at a cell's face into the neighbouring cell.
     assert known / total > 0.99
     assert agreed / known > 0.95
 
 
-def test_noisy_labels_are_wrong_as_often_as_asked(small, tmp_path):
+def test_label_noise_has_the_given_share(small, tmp_path):
     clean_folder = tmp_path / "clean"
     simulate_team(clean_folder, SimulationConfig(**{**vars(SMALL), "label_noise": 0.0}))
     topic = "/husky_1/camera/labels/image_raw"
@@ -217,7 +218,7 @@ def test_noisy_labels_are_wrong_as_often_as_asked(small, tmp_path):
     np.testing.assert_array_equal(depth == 0, noisy == 255)
 
 
-def test_same_options_give_the_same_bytes_and_another_seed_others(small, tmp_path):
+def test_equal_settings_give_equal_bytes_and_other_seeds_do_not(small, tmp_path):
     simulate_team(tmp_path / "again", SMALL)
     for path in small.iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
@@ -239,9 +240,9 @@ def test_summary_and_progress(tmp_path):
     assert shares[-1] == 1.0
 
 
-def test_a_folder_that_is_not_empty_is_refused_and_left_alone(tmp_path):
+def test_a_folder_that_is_not_empty_is_refused_and_kept(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match="is not empty; give a new folder"):
+    with pytest.raises(OutputError, match="is not empty; use a new folder"):
         simulate_team(tmp_path, SMALL)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(OutputError, match=r"notes\.txt: is a file"):
@@ -252,7 +253,7 @@ def test_a_folder_that_is_not_empty_is_refused_and_left_alone(tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
 @pytest.mark.parametrize("exists", [True, False])
-def test_a_simulation_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, error, exists):
+def test_a_failed_simulation_removes_its_files(tmp_path, monkeypatch, error, exists):
     def fail(*args, **kwargs):
         raise error
 
@@ -277,7 +278,7 @@ def test_options_out_of_range_are_refused_by_name(options):
         SimulationConfig(**options)
 
 
-def test_the_camera_is_the_huskies(small):
+def test_the_camera_has_the_documented_intrinsics(small):
     camera = SimulationConfig().camera
     assert (camera.width, camera.height, camera.fx, camera.fy) == (160, 120, 65.25, 65.25)
     assert (camera.cx, camera.cy) == (79.5, 59.5)
@@ -286,7 +287,7 @@ def test_the_camera_is_the_huskies(small):
 
 
 @pytest.mark.parametrize("rate", [0.5, 3.0, 4.0, 30.0])
-def test_any_rate_gives_its_number_of_pictures(tmp_path, rate):
+def test_every_rate_gives_its_number_of_images(tmp_path, rate):
     config = SimulationConfig(num_robots=1, duration=4.0, rate=rate, image=(8, 6), world_size=20.0, resolution=1.0)
     assert abs(simulate_team(tmp_path / "team", config).num_frames - 4.0 * rate) <= 1
 
@@ -305,8 +306,8 @@ def test_midway_is_slerp_at_one_half():
         np.testing.assert_allclose(middle[:3, 3], (a[:3, 3] + b[:3, 3]) / 2)
 
 
-def test_in_the_default_world_every_robot_measures_less_than_its_share(tmp_path):
-    # Coarse pictures, but the default village, team, camera and duration.
+def test_no_robot_of_the_default_team_sees_more_than_its_share(tmp_path):
+    # Small images, with the default village, team, camera and duration.
     config = SimulationConfig(image=(40, 30), rate=1.0)
     simulate_team(tmp_path / "team", config)
     cells = []
@@ -321,7 +322,7 @@ def test_in_the_default_world_every_robot_measures_less_than_its_share(tmp_path)
 
 
 @pytest.mark.parametrize("name", sorted(FIXTURES))
-def test_the_committed_fixtures_are_small_and_as_their_script_says(name):
+def test_the_committed_fixtures_match_their_script(name):
     folder, config = COMMITTED / name, FIXTURES[name]
     stored = load_team_file(folder / "team.yaml")
     assert [robot.robot_id for robot in stored.robots] == list(config.robot_ids)

@@ -1,4 +1,4 @@
-"""The village's mesh and its ground truth."""
+"""Tests of the village's mesh and its ground truth."""
 
 from __future__ import annotations
 
@@ -7,20 +7,9 @@ import pytest
 from plyfile import PlyData
 
 from octoreplay.errors import OutputError
-from octoreplay.simulate.world import (
-    BUILDING,
-    CAR,
-    DIRT_ROAD,
-    FENCE,
-    GRASS,
-    Terrain,
-    World,
-    labelled_cells,
-    make_village,
-    village_classes,
-    write_ground_truth,
-    write_mesh,
-)
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import BUILDING, CAR, DIRT_ROAD, FENCE, GRASS, Terrain, World, village_classes
+from octoreplay.simulate.world_files import labelled_cells, write_ground_truth, write_mesh
 
 FLAT = Terrain(np.zeros((1, 2)), np.zeros(1), np.zeros(1))
 
@@ -42,7 +31,7 @@ def small_world(*parts: tuple[np.ndarray, int]) -> World:
 
 
 def random_surface_points(world: World, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points drawn evenly over the surface, and their triangles: a slow twin of the regular samples."""
+    """Points drawn uniformly over the surface and their triangles, as a reference for the regular samples."""
     rng = np.random.default_rng(0)
     corners = world.vertices[world.triangles].astype(np.float64)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -51,7 +40,7 @@ def random_surface_points(world: World, count: int) -> tuple[np.ndarray, np.ndar
     return np.einsum("pk,pkd->pd", weights, corners[chosen]), chosen
 
 
-def test_same_seed_same_village_and_another_seed_another(village):
+def test_the_village_depends_on_the_seed_only(village):
     again, other = make_village(40.0, 3), make_village(40.0, 4)
     np.testing.assert_array_equal(village.vertices, again.vertices)
     np.testing.assert_array_equal(village.triangle_classes, again.triangle_classes)
@@ -66,7 +55,7 @@ def test_the_default_village_has_all_classes(seed):
     assert world.triangles.max() < len(world.vertices)
 
 
-def test_ground_lies_on_the_terrain_and_reaches_the_edge(village):
+def test_the_ground_is_on_the_terrain_and_reaches_the_edge(village):
     ground = village.triangle_classes <= DIRT_ROAD
     corners = village.vertices[village.triangles[ground]].reshape(-1, 3).astype(np.float64)
     np.testing.assert_allclose(corners[:, 2], village.terrain.height(corners[:, :2]), atol=1e-4)
@@ -84,7 +73,7 @@ def test_the_terrain_is_drivable_and_its_normals_are_its_gradient(village):
     assert (normal[:, 2] > np.cos(np.deg2rad(15))).all()
 
 
-def test_sampled_points_lie_on_their_triangles_and_close_together():
+def test_sampled_points_are_on_their_triangles_and_dense():
     world = small_world((rectangle(0.5, (0.0, 2.0), (0.0, 1.0)), BUILDING))
     points = np.concatenate([batch for batch, _ in world.surface_points(0.1)])
     np.testing.assert_allclose(points[:, 2], 0.5)
@@ -95,7 +84,7 @@ def test_sampled_points_lie_on_their_triangles_and_close_together():
     assert KDTree(points[:, :2]).query(anywhere)[0].max() < 0.1
 
 
-def test_cells_of_a_plain_rectangle_are_exact():
+def test_cells_of_a_rectangle_are_exact():
     world = small_world((rectangle(0.35, (-0.9, 0.9), (0.0, 0.6)), BUILDING))
     keys, class_ids = labelled_cells(world, 0.3)
     expected = [(i, j, 1) for i in range(-3, 3) for j in range(2)]
@@ -105,7 +94,7 @@ def test_cells_of_a_plain_rectangle_are_exact():
 
 
 def test_a_cell_has_the_class_with_the_most_surface_and_ties_go_to_the_lower_id():
-    # Two sheets in one layer of cells; the second covers it twice as often, or just as often.
+    # Two sheets in one layer of cells; the second occurs twice or once.
     for copies, expected in ((2, CAR), (1, BUILDING)):
         parts = [(rectangle(0.1, (0.0, 0.3), (0.0, 0.3)), BUILDING)]
         parts += [(rectangle(0.2, (0.0, 0.3), (0.0, 0.3)), CAR)] * copies
@@ -114,12 +103,12 @@ def test_a_cell_has_the_class_with_the_most_surface_and_ties_go_to_the_lower_id(
         assert class_ids.tolist() == [expected]
 
 
-def test_what_lies_under_the_ground_is_left_out():
+def test_surfaces_under_the_ground_are_left_out():
     world = small_world((rectangle(0.01, (0, 0.3), (0, 0.3)), GRASS), (rectangle(-0.4, (0, 0.3), (0, 0.3)), BUILDING))
     assert labelled_cells(world, 0.3)[0].tolist() == [[0, 0, 0]]
 
 
-def test_the_ground_truth_holds_the_surface(village):
+def test_the_ground_truth_contains_the_surface(village):
     keys, class_ids = labelled_cells(village, 0.3)
     truth = dict(zip(map(tuple, keys.tolist()), class_ids.tolist(), strict=True))
     assert len(truth) == len(keys)
@@ -129,7 +118,7 @@ def test_the_ground_truth_holds_the_surface(village):
     found = [truth.get(tuple(key)) for key in np.floor(points[visible] / 0.3).astype(int).tolist()]
     known = np.array([value is not None for value in found])
     assert known.mean() > 0.995
-    # A cell at the foot of a wall is grass or wall, not both: most points agree with their cell, not all.
+    # A cell at the foot of a wall contains grass and wall but has one class, so not all points agree with their cell.
     agree = np.array([value == own for value, own in zip(found, classes[visible], strict=True)])
     assert agree.mean() > 0.9
 
@@ -143,7 +132,7 @@ def test_obstacles_are_walls_and_not_the_ground_or_roofs():
     assert np.argwhere(mask).tolist() == [[12, j] for j in range(8, 12)]
 
 
-def test_the_square_is_clear_and_houses_are_in_the_way(village):
+def test_the_square_is_clear_and_fences_are_obstacles(village):
     mask = village.obstacle_mask(0.5)
     middle = mask.shape[0] // 2
     assert not mask[middle - 6 : middle + 6, middle - 6 : middle + 6].any()
@@ -157,7 +146,7 @@ def test_the_square_is_clear_and_houses_are_in_the_way(village):
     assert mask[cells[:, 0], cells[:, 1]].mean() > 0.99
 
 
-def test_the_archive_says_what_it_holds(tmp_path, village):
+def test_the_archive_has_the_documented_arrays(tmp_path, village):
     count = write_ground_truth(tmp_path / "world.npz", village, 0.5, village_classes())
     with np.load(tmp_path / "world.npz") as archive:
         assert sorted(archive.files) == ["class_colors", "class_ids", "class_names", "keys", "resolution"]
@@ -171,7 +160,7 @@ def test_the_archive_says_what_it_holds(tmp_path, village):
         np.testing.assert_array_equal(order, np.arange(count))
 
 
-def test_the_mesh_file_is_the_mesh(tmp_path, village):
+def test_the_mesh_file_equals_the_mesh(tmp_path, village):
     write_mesh(tmp_path / "world.ply", village, village_classes())
     ply = PlyData.read(str(tmp_path / "world.ply"))
     np.testing.assert_array_equal(np.stack(ply["face"]["vertex_indices"]), village.triangles)
@@ -181,7 +170,7 @@ def test_the_mesh_file_is_the_mesh(tmp_path, village):
     assert (ply["face"]["red"][0], ply["face"]["green"][0], ply["face"]["blue"][0]) == first
 
 
-def test_files_that_cannot_be_written(tmp_path, village):
+def test_files_that_cannot_be_written_are_reported(tmp_path, village):
     world = small_world((rectangle(0.0, (0, 1), (0, 1)), GRASS))
     with pytest.raises(OutputError, match=r"world\.npz: cannot be written"):
         write_ground_truth(tmp_path / "none" / "world.npz", world, 0.3, village_classes())

@@ -1,4 +1,4 @@
-"""Sweeps on a real dask scheduler with two workers, which are processes of this test."""
+"""Tests of sweeps on a dask scheduler with two workers, started as processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.study import cluster
 from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
-from study.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
+from support.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
 
 pytest.importorskip("distributed")
 
@@ -31,15 +31,15 @@ class Cluster:
     scheduler: subprocess.Popen[bytes]
     workers: list[subprocess.Popen[bytes]]
 
-    def runs(self) -> list[Path]:
-        """The processes of runs that the workers have started."""
+    def children(self) -> list[Path]:
+        """Child processes of the workers, as folders in /proc."""
         lists = (path for worker in self.workers for path in Path(f"/proc/{worker.pid}/task").glob("*/children"))
         return [Path("/proc") / pid for path in lists for pid in path.read_text().split()]
 
 
 @pytest.fixture
 def dask(tmp_path: Path) -> Iterator[Cluster]:
-    """A scheduler and two workers."""
+    """Scheduler with two workers."""
     file = tmp_path / "scheduler.json"
     started: list[subprocess.Popen[bytes]] = []
 
@@ -72,75 +72,72 @@ def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
     assert "(4 runs, 4 of them before)" in done.stdout
 
 
-def test_what_happens_on_a_cluster_happens_to_one_run(dask: Cluster, tmp_path: Path) -> None:
-    """A worker is lost, and a run fails: the other worker does what is left."""
+def test_a_lost_worker_and_a_failed_run_do_not_stop_the_sweep(dask: Cluster, tmp_path: Path) -> None:
     arguments = command(TEAM, "--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address)
     process = subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_for(lambda: bool(dask.runs()))
+    wait_for(lambda: bool(dask.children()))
     dask.workers[0].kill()
-    out, said = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "(3 runs)" in out
-    assert "failed: team=team, start=99, seed=0: no robot has a frame" in said
-    assert "Traceback" not in said
+    assert "failed: team=team, start=99, seed=0: no robot has a frame" in err
+    assert "Traceback" not in err
     assert [row["status"] for row in table(tmp_path / "d")] == ["failed", "ok", "ok"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_an_interrupted_sweep_ends_its_runs_on_the_workers(
+def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
     dask: Cluster, tmp_path: Path, number: signal.Signals
 ) -> None:
     arguments = ("-o", tmp_path / "d", "--scheduler", dask.address)
     process = subprocess.Popen(command(TEAM, *ENDLESS, *arguments), text=True, stderr=subprocess.PIPE)
     wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
-    runs = dask.runs()
-    assert len(runs) == 1
+    running = dask.children()
+    assert len(running) == 1
     process.send_signal(number)
-    _, said = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
-        # Nothing could be said to the workers; the next sweep takes the folder away from the run.
+        # A killed sweep cannot stop its workers. The next sweep removes the folder of unfinished results.
         done = sweep(TEAM, *QUICK, *arguments)
         assert done.returncode == 0, done.stderr
     else:
         assert process.returncode == 130
-        assert "interrupted; 0 of 1 runs are finished" in said
-        assert "Traceback" not in said
-    wait_for(lambda: not is_running(runs[0]), 20)
+        assert "interrupted; 0 of 1 runs are finished" in err
+        assert "Traceback" not in err
+    wait_for(lambda: not is_running(running[0]), 20)
 
 
-def test_a_lost_scheduler_is_one_sentence(dask: Cluster, tmp_path: Path) -> None:
+def test_a_lost_scheduler_is_reported_in_one_sentence(dask: Cluster, tmp_path: Path) -> None:
     arguments = command(TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address)
     process = subprocess.Popen(arguments, text=True, stderr=subprocess.PIPE)
     wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
     dask.scheduler.kill()
-    _, said = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert said.splitlines()[-1] == (
-        f"error: {dask.address}: the scheduler was lost; what is finished is kept, and the same command goes on with"
-        " the others"
+    assert err.splitlines()[-1] == (
+        f"error: {dask.address}: the connection to the scheduler was lost; finished runs are kept, and the same command"
+        " continues with the others"
     )
-    assert "Traceback" not in said
+    assert "Traceback" not in err
 
 
-def test_a_scheduler_that_is_none_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unusable_scheduler_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = some_task(tmp_path)
     monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1.0)
-    with pytest.raises(
-        InputError, match=r"tcp://127\.0\.0\.1:9: no dask scheduler answers there within 1 s; start one"
-    ):
-        list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
+    with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: no dask scheduler answered within 1 s; start one"):
+        list(cluster.execute_on_cluster([task], "tcp://127.0.0.1:9"))
     for address in ("here", "http://127.0.0.1:80", "tcp://here", "tcp://:x"):
         with pytest.raises(ConfigError, match=f"scheduler: '{address}' is not an address such as tcp://host:8786"):
             check_workers(None, 1, address)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ConfigError, match=r"not installed; pip install 'octoreplay\[cluster\]'"):
-        list(cluster.run_on_cluster([task], "tcp://127.0.0.1:9"))
+    with pytest.raises(ConfigError, match=r"not installed; use pip install 'octoreplay\[cluster\]'"):
+        list(cluster.execute_on_cluster([task], "tcp://127.0.0.1:9"))
 
 
-def test_jobs_are_for_this_machine_only(tmp_path: Path) -> None:
+def test_jobs_and_scheduler_exclude_each_other(tmp_path: Path) -> None:
     done = sweep(TEAM, "-o", tmp_path / "d", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 2
-    assert "--jobs is for this machine and --scheduler for another; leave one out" in done.stderr
+    assert "--jobs applies to this machine and --scheduler to a cluster; leave one out" in done.stderr
 
 
 def some_task(folder: Path) -> Task:
@@ -148,14 +145,14 @@ def some_task(folder: Path) -> Task:
     return Task("x", "k", {}, "", unfinished, str(folder / "r"), False, None, octoreplay.__version__, 1)
 
 
-def test_a_worker_that_cannot_do_a_run_says_why(tmp_path: Path) -> None:
+def test_a_worker_that_cannot_execute_a_task_returns_the_reason(tmp_path: Path) -> None:
     content = dataclasses.asdict(some_task(tmp_path))
-    assert cluster.run_here(content)["error"] == (
-        f"a worker does not see '{tmp_path / 'none'}'; workers need the sweep's folder and the logs at the same paths"
+    assert cluster.execute_on_worker(content)["error"] == (
+        f"the worker cannot see '{tmp_path / 'none'}'; workers need the sweep's folder and the logs at the same paths"
     )
-    # Another version may know other tasks.
-    row = cluster.run_here({"version": "0.0.1", "wheels": 4})
+    # Another version may have other fields in its tasks.
+    row = cluster.execute_on_worker({"version": "0.0.1", "wheels": 4})
     assert row["status"] == "failed"
     assert row["error"] == (
-        f"a worker has octoreplay {octoreplay.__version__} and the sweep 0.0.1; install the same version"
+        f"the worker has octoreplay {octoreplay.__version__}, the sweep 0.0.1; install the same version"
     )

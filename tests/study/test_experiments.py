@@ -1,4 +1,4 @@
-"""Experiments: their questions are sweeps that can be run, and a small one is run from beginning to end."""
+"""Tests of the experiments: the plans of all are valid, and a small experiment runs from beginning to end."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.simulate.team import SimulationConfig
+from octoreplay.study import experiments
 from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_experiment
 from octoreplay.study.grid import check_variations, combinations, parse_variation
 from octoreplay.study.questions import QUESTIONS
@@ -26,7 +27,7 @@ NUM_RUNS = {
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
-def test_every_question_is_made_of_runs_that_can_be(name: str) -> None:
+def test_every_experiment_consists_of_valid_distinct_runs(name: str) -> None:
     experiment = QUESTIONS[name](30.0, 2)
     base = load_team_file(PAIR)
     counts = {}
@@ -37,12 +38,12 @@ def test_every_question_is_made_of_runs_that_can_be(name: str) -> None:
         runs = list(combinations(dict.fromkeys(plan.teams, base), variations, plan.settings, None))
         counts[plan.name] = len(runs)
     assert counts == NUM_RUNS[name]
-    # What is not varied is what every run has; each run is another one.
+    # All runs of the last plan differ.
     assert len({str(run.config) + run.team for run in runs}) == len(runs)
 
 
 def small(**plan) -> Experiment:
-    """Two robots for two seconds, in two villages; the second has fewer classes."""
+    """Two teams of two robots over two seconds, in two villages; the second team merges classes."""
     pytest.importorskip("open3d", exc_type=ImportError)
     teams = {
         f"village_{seed}": SimulatedTeam(
@@ -54,11 +55,13 @@ def small(**plan) -> Experiment:
     return Experiment(teams, (Plan("first", tuple(teams), **plan),))
 
 
-def test_a_small_experiment_from_beginning_to_end(tmp_path: Path) -> None:
+def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
     stages: list[str] = []
     experiment = small(
         vary=("rule=local,bayes",), settings={"settle": 0}, keep=True,
-        more=lambda team, row, sweep: {"seed_of_team": team.simulation.seed, "is_kept": sweep.result(row).is_file()},
+        extra_columns=lambda team, row, sweep: {
+            "seed_of_team": team.simulation.seed, "is_kept": sweep.result(row).is_file(),
+        },
     )  # fmt: skip
     rows = run_experiment(experiment, tmp_path, progress=lambda stage, _: stages.append(stage))["first"]
     assert [(row["team"], row["rule"]) for row in rows] == [
@@ -67,11 +70,11 @@ def test_a_small_experiment_from_beginning_to_end(tmp_path: Path) -> None:
     assert [row["seed_of_team"] for row in rows] == [0, 0, 1, 1]
     assert all(row["is_kept"] for row in rows)
     assert all(0 < row["central_mean_iou"] <= 1 for row in rows)
-    # Nothing is exchanged by rule local.
+    # Rule local exchanges nothing.
     assert [row["sent_bytes_per_second"] > 0 for row in rows] == [False, True, False, True]
     assert "simulating team 2 of 2" in stages
     assert stages[-1] == "first: run 4 of 4"
-    merged = load_team_file(tmp_path / "teams" / "village_1" / "merged.yaml")
+    merged = load_team_file(tmp_path / "teams" / "village_1" / "village_1.yaml")
     assert merged.classes is not None
     assert merged.classes.names[0] == "plant"
     assert merged.classes.num_classes == 7
@@ -82,7 +85,19 @@ def test_a_small_experiment_from_beginning_to_end(tmp_path: Path) -> None:
     assert str(again) == str(rows)
 
 
-def test_an_answer_is_given_only_where_all_runs_are_there(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"first: 2 of 4 runs failed, the first: .*epsilon.*; the same command does"):
+def test_teams_of_equal_simulations_share_their_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders: list[Path] = []
+    monkeypatch.setattr(experiments, "simulated_team", lambda folder, *_: folders.append(folder))
+    first, second = SimulationConfig(seed=1), SimulationConfig(seed=2)
+    teams = {"a": SimulatedTeam(first), "b": SimulatedTeam(second), "c": SimulatedTeam(SimulationConfig(seed=1))}
+    files = experiments._team_files(Experiment(teams, ()), tmp_path, lambda *_: None)
+    assert folders == [tmp_path / "a", tmp_path / "b"]
+    assert files == {label: tmp_path / folder / "team.yaml" for label, folder in zip("abc", "aba", strict=True)}
+
+
+def test_a_failed_run_fails_the_experiment(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"first: 2 of 4 runs failed, the first with: .*epsilon.*; the same command repeats"
+    ):
         run_experiment(small(vary=("epsilon=0.5,4",), settings={"topology": "range", "radio_range": 1e3}), tmp_path)
     assert not (tmp_path / "first.csv").exists()

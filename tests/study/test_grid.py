@@ -1,4 +1,4 @@
-"""What is varied, from text to configurations."""
+"""Tests of variations, from text to run configurations."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def grids(draw: st.DrawFn) -> dict[str, list[str]]:
 
 
 @given(grid=grids(), num_seeds=st.none() | st.integers(1, 3))
-def test_every_combination_is_a_run_once_and_in_order(grid: dict[str, list[str]], num_seeds: int | None) -> None:
+def test_every_combination_occurs_once_and_in_order(grid: dict[str, list[str]], num_seeds: int | None) -> None:
     variations = [parse_variation(f"{name}={','.join(values)}") for name, values in grid.items()]
     found = list(combinations({"one": BASE, "two": BASE}, variations, {}, num_seeds))
     expected = itertools.product(("one", "two"), *grid.values(), range(num_seeds or 1))
@@ -51,7 +51,7 @@ def test_every_combination_is_a_run_once_and_in_order(grid: dict[str, list[str]]
         assert run.config.network.network_seed == run.seed
 
 
-def test_parameters_are_varied_together() -> None:
+def test_parameters_vary_together() -> None:
     assert parse_variation("loss+latency=0+0.5,0.25+-") == Variation(("loss", "latency"), (("0", "0.5"), ("0.25", "-")))
     found = runs("loss+latency=0+0.5,0.25+-", latency=0.125)
     assert [(run.link.loss, run.link.latency) for run in found] == [(0.0, 0.5), (0.25, 0.125)]
@@ -68,7 +68,7 @@ def test_names_may_have_dashes_and_values_may_be_words() -> None:
     assert [run.consensus.epsilon for run in found] == [None, 0.25] * 4
 
 
-def test_a_varied_value_beats_a_varied_preset() -> None:
+def test_a_varied_value_overrides_a_varied_preset() -> None:
     found = runs("preset=-,paper", "gamma=-,0.125", resolution=0.5)
     assert [run.consensus.evidence for run in found] == ["sum", "sum", "time-average", "time-average"]
     assert [run.consensus.gamma for run in found] == [0.5, 0.125, 1.0, 0.125]
@@ -82,7 +82,7 @@ def test_a_varied_value_beats_a_varied_preset() -> None:
         ("topology=", "vary: 'topology=' is not NAME=VALUE"),
         ("topologie=ring", "vary: topologie: unknown parameter; did you mean 'topology'?"),
         ("preset=papr", "preset: 'papr' is not one of paper"),
-        ("loss=0,,1", "vary: loss: has an empty value; '-' stands for what the run has anyway"),
+        ("loss=0,,1", "vary: loss: has an empty value; use '-' to leave a parameter unchanged"),
         ("loss=0,much", "loss: expects a number, got 'much'"),
         ("every=1.5", "every: expects a whole number, got '1.5'"),
         ("hash=yes", "hash: expects true or false, got 'yes'"),
@@ -93,20 +93,20 @@ def test_a_varied_value_beats_a_varied_preset() -> None:
         ("topology=complete,star,disc", "topology=disc: "),
     ],
 )
-def test_a_wrong_text_is_one_sentence(text: str, sentence: str) -> None:
+def test_an_invalid_text_is_reported_in_one_sentence(text: str, sentence: str) -> None:
     with pytest.raises(ConfigError) as caught:
         runs(text)
     assert str(caught.value).startswith(sentence)
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_is_set_twice() -> None:
+def test_a_parameter_that_is_set_twice_is_refused() -> None:
     loss = parse_variation("loss=0,0.5")
     with pytest.raises(ConfigError, match="vary: 'loss' is listed twice"):
         check_variations([loss, parse_variation("loss+latency=0+1")], {}, None)
-    with pytest.raises(ConfigError, match=r"loss: is varied and set to 0\.25 as well; leave one out"):
+    with pytest.raises(ConfigError, match=r"loss: is varied and also set to 0\.25; leave one out"):
         check_variations([loss], {"loss": 0.25}, None)
-    with pytest.raises(ConfigError, match="network_seed: is varied, and so does --seeds; leave one out"):
+    with pytest.raises(ConfigError, match="network_seed: is set by --vary and by --seeds; leave one out"):
         check_variations([parse_variation("network_seed=1,2")], {}, 3)
     with pytest.raises(ConfigError, match="seeds: 0 is below the least value 1"):
         check_variations([loss], {}, 0)

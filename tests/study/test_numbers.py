@@ -1,4 +1,4 @@
-"""What a run comes to, against the result's own ticks."""
+"""Tests of a run's numbers against the ticks of its result."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from octoreplay.config.team_file import load_team_file
-from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.evaluate.records import SCORES, EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.records import RunSummary, TickMetrics
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import numbers
 from octoreplay.study.numbers import (
@@ -22,7 +22,7 @@ from octoreplay.study.numbers import (
     run_numbers,
     truth_numbers,
 )
-from result_factory import tick_metrics
+from support.result_factory import tick_metrics
 
 PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 
@@ -34,11 +34,11 @@ def ticks(*disagreements: float, num_log_ticks: int) -> list[TickMetrics]:
     ]
 
 
-def test_contraction_is_the_factor_of_the_later_half() -> None:
+def test_contraction_is_the_mean_factor_over_the_later_half() -> None:
     assert contraction([0.25**n for n in range(9)]) == pytest.approx(0.25)
-    # The first half counts for nothing; of the other one only how far it went in all.
+    # The first half is ignored; of the later half only the first and the last value count.
     assert contraction([7.0, 900.0, 8.0, 3.0, 1.0, 1.0]) == pytest.approx((1 / 8) ** (1 / 3))
-    # Rounding keeps a distance from vanishing; that is no mixing.
+    # Values at the level of rounding are ignored.
     assert contraction([*(0.25**n for n in range(14)), *[1e-13] * 40]) == pytest.approx(0.25)
     assert math.isnan(contraction([8.0, 4.0, 2.0]))
     assert math.isnan(contraction([8.0, 4.0, 2.0, 0.0]))
@@ -54,7 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunSummary, tuple[Tic
         return summary, tuple(result.metrics)
 
 
-def test_a_run_in_numbers(run: tuple[RunSummary, tuple[TickMetrics, ...]]) -> None:
+def test_the_numbers_of_a_run_match_its_ticks(run: tuple[RunSummary, tuple[TickMetrics, ...]]) -> None:
     summary, metrics = run
     row = run_numbers(summary, metrics)
     assert tuple(row) == RUN_COLUMNS
@@ -67,7 +67,7 @@ def test_a_run_in_numbers(run: tuple[RunSummary, tuple[TickMetrics, ...]]) -> No
         assert row[f"{name}_mean"] == pytest.approx(np.mean(values[1 : len(log_ticks)]))
         assert row[f"{name}_peak"] == max(values)
     for name in ("agreement", "agreement_occupied"):
-        # In the first tick no robot has seen anything.
+        # In the first tick no robot has integrated a scan.
         worst = [np.nan, *(min(getattr(r, name) for r in tick.robots if r.active) for tick in metrics[1:])]
         assert row[name] == worst[-1]
         assert row[f"{name}_log_end"] == worst[len(log_ticks) - 1] < row[name]
@@ -82,7 +82,7 @@ def test_a_run_in_numbers(run: tuple[RunSummary, tuple[TickMetrics, ...]]) -> No
     assert row["num_leaves"] == np.mean([robot.num_leaves for robot in metrics[-1].robots])
 
 
-def test_a_dormant_robot_is_not_the_worst() -> None:
+def test_dormant_robots_do_not_count_as_the_worst() -> None:
     tick = tick_metrics(1)
     summary_tick = dataclasses.replace(
         tick, robots=(tick.robots[0], dataclasses.replace(tick.robots[1], agreement=0.0, active=False))
@@ -92,20 +92,19 @@ def test_a_dormant_robot_is_not_the_worst() -> None:
 
 def scores(robot_id: str, number: float) -> MapScores:
     """Scores that differ by name and robot."""
-    names = [item.name for item in dataclasses.fields(MapScores)]
-    values = {name: number + index / 100 for index, name in enumerate(names)}
-    return MapScores(**{**values, "robot_id": robot_id, "is_active": True, "iou": (number,)})  # type: ignore[arg-type]
+    values = [number + index / 100 for index in range(len(SCORES))]
+    return MapScores(robot_id, True, 1000, *values[1:4], TruthScores((number,), *values[4:]))
 
 
-def test_the_truth_in_numbers() -> None:
+def test_the_truth_numbers_are_means_over_robots() -> None:
     maps = (scores("a", 0.25), scores("b", 0.5), scores("central", 0.75))
     tick = EvaluatedTick(3, 1.0, 0.0, maps)
     row = truth_numbers(Evaluation("r", "t", "central", ("x",), (tick,)))
     assert tuple(row) == TRUTH_COLUMNS
     for name in ("mean_iou", "coverage", "free_accuracy", "calibration_error", "team_calibration_error_occupied"):
-        assert row[name] == pytest.approx((getattr(maps[0], name) + getattr(maps[1], name)) / 2)
-    assert row["mean_iou_least"] == maps[0].mean_iou
-    assert row["central_mean_iou"] == maps[2].mean_iou
-    assert row["central_calibration_error"] == maps[2].calibration_error
+        assert row[name] == pytest.approx((maps[0].score(name) + maps[1].score(name)) / 2)
+    assert row["mean_iou_least"] == maps[0].score("mean_iou")
+    assert row["central_mean_iou"] == maps[2].score("mean_iou")
+    assert row["central_calibration_error"] == maps[2].score("calibration_error")
     alone = truth_numbers(Evaluation("r", "t", "central", ("x",), (dataclasses.replace(tick, maps=maps[:2]),)))
     assert math.isnan(alone["central_mean_iou"])

@@ -1,4 +1,4 @@
-"""The paper's experiment as a process, with a small team."""
+"""Tests of the paper's experiment, run as a process with a small team."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def command(folder: Path, *arguments: object) -> list[str]:
 
 
 def experiment(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command, 100 columns wide."""
+    """Run the command with a terminal width of 100 columns."""
     return subprocess.run(
         command(folder, *arguments), text=True, capture_output=True, check=False, timeout=300,
         env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"},
@@ -39,7 +39,7 @@ def experiment(folder: Path, *arguments: object) -> subprocess.CompletedProcess[
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The experiment of two robots over six seconds."""
+    """Folder of the experiment with two robots over six seconds."""
     folder = tmp_path_factory.mktemp("experiment") / "paper"
     process = experiment(folder, "--duration", 6, "--robots", 2)
     assert process.returncode == 0, process.stderr
@@ -55,14 +55,14 @@ def result(done: Path) -> Result:
         yield opened
 
 
-def test_the_folder_holds_the_team_the_result_figures_and_numbers(done: Path) -> None:
+def test_the_folder_holds_team_result_figures_and_numbers(done: Path) -> None:
     assert sorted(path.name for path in done.iterdir()) == ["figures", "numbers.json", "paper.mcap", "team"]
     assert sorted(path.name for path in (done / "figures").iterdir()) == sorted(FIGURES)
     team = {path.name for path in (done / "team").iterdir()}
     assert team == {"husky_1.mcap", "husky_2.mcap", "simulation.json", "team.yaml", "world.npz", "world.ply"}
 
 
-def test_the_run_is_the_papers(result: Result) -> None:
+def test_the_run_has_the_papers_settings(result: Result) -> None:
     config = result.config
     assert (config.consensus.rule, config.consensus.mode, config.network.topology) == (
         "gradient", "on-arrival", "complete",
@@ -72,7 +72,7 @@ def test_the_run_is_the_papers(result: Result) -> None:
     assert result.metrics[-1].tick == 6
 
 
-def test_the_numbers_are_those_of_the_result(done: Path, result: Result) -> None:
+def test_the_numbers_match_the_result(done: Path, result: Result) -> None:
     numbers = json.loads((done / "numbers.json").read_text(encoding="utf-8"))
     assert (numbers["preset"], numbers["simulation"]["num_robots"], numbers["simulation"]["duration"]) == (
         "paper",
@@ -115,7 +115,7 @@ def test_phi_is_the_sum_over_links_of_the_squared_distance_over_cells(done: Path
     assert numbers["moments"][-1]["relative_distance"] == pytest.approx(relative, rel=1e-5)
 
 
-def test_pictures_show_what_was_mapped(done: Path, result: Result) -> None:
+def test_pictures_show_the_mapped_cells(done: Path, result: Result) -> None:
     for name in FIGURES:
         with Image.open(done / "figures" / name) as image:
             assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 50, name
@@ -123,13 +123,13 @@ def test_pictures_show_what_was_mapped(done: Path, result: Result) -> None:
         maps = np.asarray(image.convert("RGB")).astype(int)
     background = np.abs(maps - map_view.BACKGROUND).max(axis=2) <= 3
     early, late, village = background[60:240, 810:], background[60:490, :800], background[300:490, 810:]
-    # What two robots saw in two seconds, in six, and all there is.
+    # Cells that two robots see in two seconds and in six, and the whole village.
     assert 0.005 < 1 - early.mean() < 0.1
     assert 0.02 < 1 - late.mean() < 0.3
     assert 1 - village.mean() > 0.4
 
 
-def test_what_is_complete_is_used_again(done: Path) -> None:
+def test_a_complete_team_and_result_are_used_again(done: Path) -> None:
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in done.rglob("*.*") if path.is_file()}
     process = experiment(done, "--duration", 6, "--robots", 2)
     assert process.returncode == 0, process.stderr
@@ -146,7 +146,7 @@ def test_other_settings_are_refused_in_a_used_folder(done: Path) -> None:
     assert "team: holds a team with seed 0, not 1; give another folder, or remove this one" in process.stderr
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "team").mkdir()
     (tmp_path / "team" / "names.txt").write_text("Ann")
     process = experiment(tmp_path, "--duration", 6)
@@ -169,16 +169,16 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path: Path) -> None:
     assert list((tmp_path / "paper").iterdir()) == []
 
 
-def test_an_experiment_has_to_last_a_while(tmp_path: Path) -> None:
+def test_too_short_a_duration_is_refused(tmp_path: Path) -> None:
     process = experiment(tmp_path / "paper", "--duration", 5)
     assert process.returncode == 2
-    assert "duration: 5 s is too short for the experiment; give 6 or more" in process.stderr
+    assert "duration: 5 s is too short for the experiment; use at least 6 s" in process.stderr
     assert not (tmp_path / "paper").exists()
     with pytest.raises(ConfigError):
         paper.paper_team(duration=5.9)
 
 
-def test_python_does_the_same(done: Path) -> None:
+def test_the_python_function_gives_the_same_numbers(done: Path) -> None:
     simulation = SimulationConfig(num_robots=2, duration=6.0)
     assert paper.paper_team(2, 6.0) == simulation
     numbers = paper.run_paper(done, simulation)
@@ -187,7 +187,7 @@ def test_python_does_the_same(done: Path) -> None:
     assert stored["moments"][1]["median_deviation"] == numbers.moments[1].median_deviation
 
 
-def test_maps_without_an_occupied_cell_are_one_sentence() -> None:
+def test_maps_without_occupied_cells_are_reported_in_one_sentence() -> None:
     empty = map_view.Overlay(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0), 0.3)
-    with pytest.raises(InputError, match="hold no occupied cell; give a longer duration"):
+    with pytest.raises(InputError, match="hold no occupied cell; use a longer duration"):
         paper.transparent_deviation([empty])

@@ -1,4 +1,4 @@
-"""Sweeps over the two recorded robots: killed, resumed, failing, and twice at once."""
+"""Tests of sweeps over the fixture with two robots: interruption, resumption, failures and locking."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ import pytest
 import octoreplay
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError, OutputError
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.study import local
 from octoreplay.study.folder import SweepFolder
 from octoreplay.study.numbers import run_numbers
-from octoreplay.study.process import RunProcess
+from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
-from study.sweeps import PAIR, QUICK, TEAM, command, is_running, runs_of, sweep, table, wait_for
+from support.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 SETTINGS = {"resolution": 0.6, "duration": 2.0}
@@ -33,7 +33,7 @@ SETTINGS = {"resolution": 0.6, "duration": 2.0}
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a sweep that nothing happened to."""
+    """Folder of an undisturbed sweep."""
     folder = tmp_path_factory.mktemp("sweep") / "whole"
     done = sweep(TEAM, *GRID, "-o", folder)
     assert (done.returncode, done.stdout, done.stderr) == (
@@ -43,11 +43,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows_in(folder: Path) -> dict[str, int]:
-    """The finished runs, and when each was written."""
+    """Modification times of the row files by name."""
     return {path.name: path.stat().st_mtime_ns for path in (folder / "rows").glob("*.json")}
 
 
-def test_a_row_is_what_the_run_alone_comes_to(whole: Path, tmp_path: Path) -> None:
+def test_a_row_equals_the_numbers_of_a_single_run(whole: Path, tmp_path: Path) -> None:
     rows = table(whole)
     assert [(row["rule"], row["loss"]) for row in rows] == [
         (rule, loss) for rule in ("gradient", "bayes") for loss in ("0", "0.3")
@@ -60,23 +60,23 @@ def test_a_row_is_what_the_run_alone_comes_to(whole: Path, tmp_path: Path) -> No
     assert {"team": "team", "status": "ok", "error": "", "seed": "0"}.items() <= rows[3].items()
 
 
-def test_what_a_sweep_leaves(whole: Path) -> None:
+def test_the_folder_of_a_finished_sweep(whole: Path) -> None:
     assert {path.name for path in whole.iterdir()} == {".lock", "figures", "rows", "sweep.json", "table.csv"}
-    said = json.loads((whole / "sweep.json").read_text())
-    assert said["teams"] == {"team": str(TEAM)}
-    assert said["vary"] == {"rule": ["gradient", "bayes"], "loss": ["0", "0.3"]}
-    assert len(said["runs"]) == 4
+    description = json.loads((whole / "sweep.json").read_text())
+    assert description["teams"] == {"team": str(TEAM)}
+    assert description["vary"] == {"rule": ["gradient", "bayes"], "loss": ["0", "0.3"]}
+    assert len(description["runs"]) == 4
     assert (whole / "figures" / "agreement.png").stat().st_size > 1000
 
 
-def test_a_sweep_that_is_killed_goes_on_to_the_same_table(whole: Path, tmp_path: Path) -> None:
+def test_a_killed_sweep_continues_to_the_same_table(whole: Path, tmp_path: Path) -> None:
     arguments = (TEAM, *GRID, "-o", tmp_path / "s", "--jobs", 1)
     process = subprocess.Popen(command(*arguments), text=True)
-    wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(runs_of(process)) == 1)
-    runs = runs_of(process)
+    wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(children(process)) == 1)
+    running = children(process)
     process.kill()
     process.wait()
-    wait_for(lambda: not any(is_running(run) for run in runs), 10)
+    wait_for(lambda: not any(map(is_running, running)), 10)
     finished = rows_in(tmp_path / "s")
     assert 1 <= len(finished) < 4
     done = sweep(*arguments)
@@ -88,26 +88,26 @@ def test_a_sweep_that_is_killed_goes_on_to_the_same_table(whole: Path, tmp_path:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_sweep_ends_its_runs_and_says_so(tmp_path: Path, number: signal.Signals) -> None:
-    # Runs that settle for ever.
+def test_an_interrupted_sweep_ends_its_processes_and_reports_it(tmp_path: Path, number: signal.Signals) -> None:
+    # Runs that do not stop settling.
     endless = ("--vary", "loss=0,0.25,0.5", "--settle", "100000", "--settle-max", "100000", *QUICK)
     process = subprocess.Popen(command(TEAM, *endless, "-o", tmp_path / "s"), text=True, stderr=subprocess.PIPE)
     wait_for(lambda: any((tmp_path / "s" / "unfinished").glob("*/*.mcap")))
-    runs = runs_of(process)
-    assert runs
+    running = children(process)
+    assert running
     process.send_signal(number)
-    _, said = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
-        wait_for(lambda: not any(is_running(run) for run in runs), 10)
+        wait_for(lambda: not any(map(is_running, running)), 10)
         return
     assert process.returncode == 130
-    # click ends the terminal's line with its ^C first.
-    assert said == "\ninterrupted; 0 of 3 runs are finished, and the same command goes on with the others\n"
-    assert not any(is_running(run) for run in runs)
+    # click writes a line feed first, to end the terminal's line with ^C.
+    assert err == "\ninterrupted; 0 of 3 runs are finished, and the same command continues with the others\n"
+    assert not any(map(is_running, running))
     assert not (tmp_path / "s" / "unfinished").exists()
 
 
-def test_a_row_that_is_not_whole_is_no_row(whole: Path, tmp_path: Path) -> None:
+def test_damaged_row_files_are_replaced(whole: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "s")
     first, second, third = sorted((folder / "rows").iterdir())[:3]
     first.write_bytes(first.read_bytes()[:-40])
@@ -119,7 +119,7 @@ def test_a_row_that_is_not_whole_is_no_row(whole: Path, tmp_path: Path) -> None:
     assert not list((folder / "rows").glob("*.partial"))
 
 
-def test_a_run_that_fails_stops_no_other_and_is_tried_again(tmp_path: Path) -> None:
+def test_a_failed_run_does_not_stop_the_others_and_is_repeated(tmp_path: Path) -> None:
     arguments = (TEAM, "--vary", "start=99,0", "--resolution", "0.6", "-o", tmp_path)
     for others in ("2 runs", "2 runs, 1 of them before"):
         done = sweep(*arguments)
@@ -134,17 +134,17 @@ def test_a_run_that_fails_stops_no_other_and_is_tried_again(tmp_path: Path) -> N
     assert {bad[name] for name in bad if name not in ("team", "start", "seed", "status", "error")} == {""}
 
 
-def test_a_run_that_is_killed_has_failed(tmp_path: Path) -> None:
+def test_a_killed_process_is_a_failed_run(tmp_path: Path) -> None:
     task = Task("x", "k", {}, "", str(tmp_path / "u"), str(tmp_path / "r"), False, None, octoreplay.__version__, 1)
-    process = RunProcess(task)
+    process = TaskProcess(task)
     process.kill()
     row = process.wait(30)
     assert row is not None
     assert row["status"] == "failed"
-    assert row["error"].startswith("killed by signal 9 (SIGKILL); the system does this when memory runs out")
+    assert row["error"].startswith("killed by signal 9 (SIGKILL); the system may be out of memory")
 
 
-def test_lost_data_is_exit_code_3_and_not_run_again(tmp_path: Path) -> None:
+def test_lost_data_gives_exit_code_3_and_no_repetition(tmp_path: Path) -> None:
     team = shutil.copytree(PAIR, tmp_path / "pair") / "team.yaml"
     log = team.with_name("husky_2.mcap")
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
@@ -157,7 +157,7 @@ def test_lost_data_is_exit_code_3_and_not_run_again(tmp_path: Path) -> None:
     assert row["error"].startswith("husky_2: ")
 
 
-def test_what_a_run_depends_on_makes_it_run_again(tmp_path: Path) -> None:
+def test_a_run_is_repeated_if_its_inputs_change(tmp_path: Path) -> None:
     team = shutil.copytree(PAIR, tmp_path / "pair") / "team.yaml"
 
     def num_earlier(**settings: object) -> int:
@@ -172,7 +172,7 @@ def test_what_a_run_depends_on_makes_it_run_again(tmp_path: Path) -> None:
     assert num_earlier(hit=0.5) == 0
 
 
-def test_other_combinations_keep_what_is_there(whole: Path, tmp_path: Path) -> None:
+def test_other_combinations_use_finished_runs_again(whole: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "s")
     done = run_sweep(TEAM, ["rule=bayes,local", "loss=0.3"], folder, settings=SETTINGS)
     assert [(row["rule"], row["status"]) for row in done.rows] == [("bayes", "ok"), ("local", "ok")]
@@ -180,7 +180,7 @@ def test_other_combinations_keep_what_is_there(whole: Path, tmp_path: Path) -> N
     assert table(folder)[0] == table(whole)[3]
 
 
-def test_results_are_kept_and_missed(tmp_path: Path) -> None:
+def test_a_run_is_repeated_if_its_kept_result_is_missing(tmp_path: Path) -> None:
     for _ in range(2):
         done = run_sweep([TEAM], ["rule=bayes"], tmp_path / "s", settings=SETTINGS, keep=True)
         result = tmp_path / "s" / "runs" / "team=team,rule=bayes,seed=0.mcap"
@@ -191,7 +191,7 @@ def test_results_are_kept_and_missed(tmp_path: Path) -> None:
         result.unlink()
 
 
-def test_teams_are_told_apart(tmp_path: Path) -> None:
+def test_labels_of_teams_are_distinct(tmp_path: Path) -> None:
     for name in ("one", "two"):
         shutil.copytree(PAIR, tmp_path / name)
     steps: list[SweepProgress] = []
@@ -206,32 +206,32 @@ def test_teams_are_told_apart(tmp_path: Path) -> None:
         run_sweep([TEAM, TEAM], [], tmp_path / "s")
 
 
-def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
+def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     with SweepFolder.locked(tmp_path / "s"):
         done = sweep(TEAM, "-o", tmp_path / "s", *QUICK)
     assert done.returncode == 1
     assert done.stderr == (
-        f"error: {tmp_path / 's'}: another sweep is at work here (process {os.getpid()}); wait for it, or give another"
+        f"error: {tmp_path / 's'}: is in use by another sweep (process {os.getpid()}); wait for it, or use another"
         " folder\n"
     )
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").touch()
-    with pytest.raises(OutputError, match="is not empty and holds no sweep; give a folder of its own"):
+    with pytest.raises(OutputError, match="is not empty and holds no sweep; use another folder"):
         run_sweep(TEAM, [], tmp_path)
     with pytest.raises(OutputError, match=r"thesis\.txt: cannot be written: "):
         run_sweep(TEAM, [], tmp_path / "thesis.txt")
 
 
-def test_what_cannot_be_done_is_said_before_any_run(tmp_path: Path) -> None:
+def test_invalid_options_are_reported_before_any_run(tmp_path: Path) -> None:
     for arguments, code, sentence in (
         (["--vary", "rule=bays"], 2, "error: rule=bays: "),
         (["--vary", "rule"], 2, "error: vary: 'rule' is not NAME=VALUE"),
         (["--jobs", "0"], 2, "error: jobs: 0 is below the least value 1"),
         (["--threads", "0"], 2, "error: threads: 0 is below the least value 1"),
         (["--seeds", "0"], 2, "error: seeds: 0 is below the least value 1"),
-        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither beside {TEAM} nor here"),
+        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither beside {TEAM} nor in"),
     ):
         done = sweep(TEAM, *arguments, "-o", tmp_path / "s")
         assert done.returncode == code, done.stderr
@@ -242,16 +242,16 @@ def test_what_cannot_be_done_is_said_before_any_run(tmp_path: Path) -> None:
         run_sweep(TEAM, [], tmp_path / "s", truth="none.npz")
 
 
-def test_runs_are_kept_to_processors_of_their_own() -> None:
+def test_each_worker_has_a_processor_of_its_own() -> None:
     allowed = sorted(os.sched_getaffinity(0))
     code = "import os; print(*sorted(os.sched_getaffinity(0)))"
     found: dict[int, str] = {}
 
-    def look(slot: int) -> None:
+    def record_processors(slot: int) -> None:
         local._pin(slot, 1)
         found[slot] = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=True).stdout
 
-    threads = [threading.Thread(target=look, args=(slot,)) for slot in range(len(allowed))]
+    threads = [threading.Thread(target=record_processors, args=(slot,)) for slot in range(len(allowed))]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -1,4 +1,4 @@
-"""Teams and results that are made once."""
+"""Simulated teams and results that are used again."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def made(stored: Path, tmp_path: Path) -> Path:
-    """A copy of them to spoil."""
+    """A copy of them, which a test may change."""
     return Path(shutil.copytree(stored, tmp_path / "made"))
 
 
 def content(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Every file with the time of its last change."""
+    """Content and time of change of every file."""
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in folder.rglob("*")
@@ -56,7 +56,7 @@ def test_a_team_is_simulated_once(stored: Path) -> None:
     assert content(stored) == before
 
 
-def test_nothing_is_there_before(tmp_path: Path) -> None:
+def test_missing_and_empty_folders_hold_no_team(tmp_path: Path) -> None:
     assert not is_simulated(tmp_path / "none", SMALL)
     assert not is_simulated(tmp_path, SMALL)
 
@@ -97,12 +97,12 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path: Path, text: str
     (tmp_path / "diary.txt").write_text("mine")
     if text is not None:
         (tmp_path / "simulation.json").write_text(text)
-    with pytest.raises(OutputError, match="is there and holds no simulated team; give another folder"):
+    with pytest.raises(OutputError, match="exists and holds no simulated team; give another folder"):
         simulated_team(tmp_path, SMALL)
     assert (tmp_path / "diary.txt").read_text() == "mine"
 
 
-def test_a_file_in_the_folders_place_is_refused(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "team").write_text("mine")
     with pytest.raises(OutputError, match="holds no simulated team"):
         simulated_team(tmp_path / "team", SMALL)
@@ -130,7 +130,7 @@ def test_a_simulation_that_cannot_be_finished_leaves_nothing(tmp_path: Path, mon
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_simulation_left_is_no_obstacle(stored: Path, tmp_path: Path) -> None:
+def test_the_remains_of_a_killed_simulation_are_removed(stored: Path, tmp_path: Path) -> None:
     left = tmp_path / ".team.partial"
     left.mkdir()
     (left / "husky_7.mcap").write_text("half")
@@ -154,7 +154,7 @@ def test_a_team_is_replayed_once(stored: Path) -> None:
 def test_a_result_of_other_settings_is_refused(stored: Path) -> None:
     config = load_team_file(stored / "team" / "team.yaml").with_parameters({"rule": "bayes"})
     assert not is_replayed(config, stored / "other.mcap")
-    with pytest.raises(OutputError, match=r"result\.mcap: is there and was made from other logs, with other settings"):
+    with pytest.raises(OutputError, match=r"result\.mcap: exists and was made from other logs, with other settings"):
         replayed_team(config, stored / "result.mcap")
 
 
@@ -173,7 +173,7 @@ def test_a_result_of_another_version_is_refused(stored: Path, monkeypatch: pytes
         is_replayed(load_team_file(stored / "team" / "team.yaml"), stored / "result.mcap")
 
 
-def test_what_is_no_result_is_refused(made: Path) -> None:
+def test_a_file_that_is_not_a_result_is_refused(made: Path) -> None:
     (made / "result.mcap").write_text("mine")
     with pytest.raises(InputError, match=r"result\.mcap: not a finished MCAP file"):
         replayed_team(load_team_file(made / "team" / "team.yaml"), made / "result.mcap")

@@ -1,1 +1,1 @@
-"""The commands of the command line, a module for each kind."""
+"""Commands of the command line, one module for each kind."""

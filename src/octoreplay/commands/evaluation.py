@@ -1,4 +1,4 @@
-"""The command that judges a result: evaluate."""
+"""Command that evaluates the maps of a result: evaluate."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ from octoreplay.commands.progress import progress_bar, warn
 from octoreplay.records import CENTRAL
 
 
-@click.command(short_help="Judge a result's maps: IoU, coverage, calibration, agreement.")
+@click.command(short_help="Evaluate a result's maps: IoU, coverage, calibration, agreement.")
 @click.argument("result", type=existing_path, metavar="RESULT.mcap")
 @click.option("--truth", type=existing_path, metavar="WORLD",
-              help="the truth: world.npz, the folder of a simulated team, or a labelled PLY file")  # fmt: skip
+              help="ground truth: world.npz, the folder of a simulated team, or a labelled PLY file")  # fmt: skip
 @click.option("--against", default=CENTRAL, show_default=True, metavar="central|OTHER.mcap",
-              help="whose centralised map the maps should agree with: this result's, or another's")  # fmt: skip
-@click.option("--csv", type=existing_path, metavar="FILE.csv", help="every map's scores at every stored tick as CSV")
-@click.option("--json", type=existing_path, metavar="FILE.json", help="the same as JSON")
-@click.option("--plot", type=existing_path, metavar="DIR", help="figures: IoU, coverage, calibration, agreement")
-@click.option("--last", is_flag=True, help="the last stored maps alone, which is quick")
+              help="centralised map to compare with: that of this result, or of another one")  # fmt: skip
+@click.option("--csv", type=existing_path, metavar="FILE.csv",
+              help="write the scores of every map at every stored tick as CSV")  # fmt: skip
+@click.option("--json", type=existing_path, metavar="FILE.json", help="write the same scores as JSON")
+@click.option("--plot", type=existing_path, metavar="DIR",
+              help="write figures of IoU, coverage, calibration and agreement into this folder")  # fmt: skip
+@click.option("--last", is_flag=True, help="evaluate only the last stored maps, which is faster")
 def evaluate(
     result: Path, truth: Path | None, against: str, csv: Path | None, json: Path | None, plot: Path | None, last: bool
 ) -> int:
-    """Judge the maps of a result, over time and at the end.
+    """Evaluate the maps of a result, over time and at the end.
 
-    Against the truth, where it is known: IoU per class, occupied and free cells found, coverage of the surface,
-    calibration of the probabilities. Without it: entropy, agreement with the centralised map, labels in dispute.
+    With --truth: IoU per class, occupied and free cells found, coverage of the surface, calibration of the
+    probabilities. Without it only scores that need no ground truth: entropy, agreement with the centralised map,
+    disputed labels.
     """
     from octoreplay.evaluate.evaluation import evaluate_result, truth_beside_logs
     from octoreplay.report import tables
@@ -45,7 +48,7 @@ def evaluate(
     out, err = tables.terminal(), tables.terminal(stderr=True)
     with open_result(result) as opened:
         if not opened.is_complete:
-            warn(err, f"{result}: is of an interrupted run; these are the maps that it had stored")
+            warn(err, f"{result}: the run was interrupted; only the maps stored before are evaluated")
     with progress_bar("evaluate") as update:
         evaluation = evaluate_result(
             result, truth=truth, against=against, over_time=not last, progress=lambda share: update(share, None, "")
@@ -53,8 +56,8 @@ def evaluate(
     tables.show(out, evaluation_tables(evaluation))
     if truth is None:
         beside = truth_beside_logs(result)
-        found = "" if beside is None else f"; beside the logs lies {beside}"
-        err.print(f"IoU, coverage and calibration need the truth: --truth WORLD{found}", soft_wrap=True)
+        found = "" if beside is None else f"; found beside the logs: {beside}"
+        err.print(f"IoU, coverage and calibration need the ground truth: --truth WORLD{found}", soft_wrap=True)
     write_evaluation(evaluation, csv_path=csv, json_path=json)
     written = [path for path in (csv, json) if path is not None]
     if plot is not None:

@@ -1,3 +1,3 @@
-"""The exit codes of all commands (docs/cli.md)."""
+"""Exit codes of the commands (docs/cli.md)."""
 
 EXIT_ERROR, EXIT_USAGE, EXIT_DATA_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130

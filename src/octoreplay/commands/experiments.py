@@ -1,4 +1,4 @@
-"""Experiments that one command repeats: octoreplay experiment NAME."""
+"""Commands that repeat the experiments of the documentation: experiment NAME."""
 
 from __future__ import annotations
 
@@ -13,64 +13,63 @@ from octoreplay.commands.progress import progress_bar, replay_bar
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from octoreplay.simulate.team import SimulationConfig
-    from octoreplay.study.paper import PaperNumbers
 
 
 @click.group(short_help="Repeat the experiments of the documentation.")
 def experiment() -> None:
     """Repeat an experiment: simulate, replay, and write its figures and numbers.
 
-    What a folder holds already is used again where it is complete and of the same settings.
+    Complete logs and results of the same settings in the folder are used again.
     """
 
 
 @experiment.command(short_help="The paper's experiment: six robots explore a village for 300 s.")
 @click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-paper"), required=False)
 @click.option("--duration", type=float, default=300.0, show_default=True, help="length of the logs, 6 s or more [s]")
-@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
-@click.option("--seed", type=int, default=0, show_default=True, help="another seed, another village")
+@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
+@click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
 def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
-    """Do the paper's experiment into DIR (octoreplay-paper): figures of disagreement, packets and maps, and numbers.
+    """Repeat the paper's experiment and write its figures and numbers into DIR (default: octoreplay-paper).
 
-    Takes about three minutes. What DIR holds already is used again where it is complete and of the same settings.
+    The figures show disagreement, packet sizes and maps. Takes about three minutes. Complete logs and results of the
+    same settings in DIR are used again.
     """
     from octoreplay.report import tables
+    from octoreplay.report.experiment_tables import paper_table
     from octoreplay.study import paper as study
 
     simulation = study.paper_team(robots, duration, seed)
     team_file = team_with_bar(folder / study.TEAM, simulation)
     result_with_bar(study.paper_config(team_file, simulation), folder / study.RESULT)
-    click.echo("drawing", err=True)
+    click.echo("drawing figures", err=True)
     numbers = study.write_paper(folder, simulation)
     out = tables.terminal()
-    tables.show(out, _paper_table(numbers))
+    tables.show(out, paper_table([vars(moment) for moment in numbers.moments]))
     peak = tables.number(numbers.peak_total_distance)
     out.print(
-        f"\u03a6 is largest at {numbers.peak_seconds:.0f} s, {peak}; uniform grid / octree is {numbers.mean_ratio:.2f}"
-        f" in the mean over time, {numbers.least_ratio:.2f} at least\n",
+        f"\u03a6 has its maximum {peak} at {numbers.peak_seconds:.0f} s; uniform grid / octree is"
+        f" {numbers.mean_ratio:.2f} on average over time, {numbers.least_ratio:.2f} at least\n",
         soft_wrap=True,
     )
     figures = folder / study.FIGURES
     made = {
-        figures / "maps.png": "the maps, cells as transparent as robots deviate, and the village",
+        figures / "maps.png": "maps, with cells more transparent where robots deviate, and the village",
         figures / "total_distance.png": "\u03a6 over time",
-        figures / "agreement.png": "agreement and different labels over time",
-        figures / "packet_size.png": "bytes of a map as octree and as uniform grid, and the ratio",
-        folder / study.NUMBERS: "the numbers of this table and more",
-        folder / study.RESULT: "the result, for 'octoreplay metrics', 'export' and 'query'",
-        folder / study.TEAM: "what the robots recorded, and the village they drove through",
+        figures / "agreement.png": "agreement and label disagreement over time",
+        figures / "packet_size.png": "size of a map as octree and as uniform grid, and their ratio",
+        folder / study.NUMBERS: "all numbers, including those of this table",
+        folder / study.RESULT: "result, for 'octoreplay metrics', 'export' and 'query'",
+        folder / study.TEAM: "logs of the robots, team file and ground truth",
     }
     tables.show(out, tables.made_files(made))
     return 0
 
 
-def _add_question(name: str, duration: float, num_villages: int, question: str, *, is_timed: bool = False) -> None:
-    """Add the command of one of the questions."""
+def _add_experiment(name: str, duration: float, num_villages: int, question: str, *, is_timed: bool = False) -> None:
+    """Add the command of one experiment; ``is_timed`` if it measures time."""
 
-    def answer(
+    def run_and_report(
         folder: Path,
         duration: float,
         villages: int = 1,
@@ -94,83 +93,63 @@ def _add_question(name: str, duration: float, num_villages: int, question: str, 
         write_whole(summary, answer_tables(name, found))
         written = {
             **dict.fromkeys(save_figures(figures(name, found), folder / "figures"), "figure"),
-            summary: "the answer as tables",
-            **{folder / f"{plan}.csv": "every run" for plan in found},
+            summary: "tables",
+            **{folder / f"{plan}.csv": "numbers of every run" for plan in found},
         }
         tables.show(tables.terminal(), tables.made_files(written))
         return 0
 
     default = Path(f"octoreplay-{name}")
-    # These make no sense where time is measured.
-    of_sweeps = (
+    # Parallel runs would disturb time measurements, and run times hardly depend on the village.
+    sweep_options = (
         click.option("--villages", type=click.IntRange(1, 100), default=num_villages, show_default=True,
-                     help="so many villages, each with a team of its own"),
-        click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="runs at once  [default: processors]"),
-        click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster, not on this machine"),
+                     help="number of villages, each with a team of its own"),
+        click.option("--jobs", type=click.IntRange(min=1), metavar="N",
+                     help="number of parallel runs on this machine  [default: number of processors]"),
+        click.option("--scheduler", metavar="tcp://HOST:PORT",
+                     help="address of a dask scheduler; runs are executed on its workers instead of this machine"),
     )  # fmt: skip
     options = (
         click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False),
         click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]"),
-        *(() if is_timed else of_sweeps),
+        *(() if is_timed else sweep_options),
     )
     text = (
-        f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR ({default}). The same"
-        " command goes on where it was stopped."
+        f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default: {default}). The"
+        " same command continues after an interruption."
     )
-    command: Callable[..., int] = answer
+    command: Callable[..., int] = run_and_report
     for option in reversed(options):
         command = option(command)
     experiment.command(name, help=text, short_help=question)(command)
 
 
-_add_question("rules", 60.0, 3, "Which rule, on which graph?")
-_add_question("steps", 60.0, 1, "How do epsilon and gamma trade consensus against the robots' own evidence?")
-_add_question("scale", 20.0, 1, "How many robots, cells and classes are mapped in real time?", is_timed=True)
-_add_question("noise", 60.0, 1, "What does consensus repair of noisy labels, poses and depths, what does it spread?")
-_add_question("choose", 60.0, 2, "Which settings for a good radio, for a poor one, and for many robots?")
+_add_experiment("rules", 60.0, 3, "Compare the consensus rules on four graphs.")
+_add_experiment("steps", 60.0, 1, "Vary the step sizes epsilon and gamma.")
+_add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
+_add_experiment(
+    "noise", 60.0, 1, "Measure which errors of noisy labels, poses and depths consensus repairs and spreads."
+)
+_add_experiment("choose", 60.0, 2, "Compare settings for a good radio, for a poor radio and for many robots.")
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig) -> Path:
-    """A simulated team with a progress bar, and a sentence that says whether it was there; the team file."""
+    """Simulate a team with a progress bar, or use it again, and report which; return the team file."""
     from octoreplay.study.teams import is_simulated, simulated_team
 
-    is_there = is_simulated(folder, simulation)
+    exists = is_simulated(folder, simulation)
     with progress_bar("simulate") as update:
         team_file = simulated_team(folder, simulation, lambda share: update(share, None, ""))
-    click.echo(f"used the team in {folder} again" if is_there else f"simulated the team in {folder}", err=True)
+    click.echo(f"used the team in {folder} again" if exists else f"simulated the team in {folder}", err=True)
     return team_file
 
 
 def result_with_bar(config: RunConfig, output: Path) -> Path:
-    """A team's result with a progress bar, and a sentence that says whether it was there; the result."""
+    """Replay a team with a progress bar, or use its result again, and report which; return the result."""
     from octoreplay.study.teams import is_replayed, replayed_team
 
-    is_there = is_replayed(config, output)
+    exists = is_replayed(config, output)
     with replay_bar() as show:
         replayed_team(config, output, show)
-    click.echo(f"used {output} again" if is_there else f"wrote {output}", err=True)
+    click.echo(f"used {output} again" if exists else f"wrote {output}", err=True)
     return output
-
-
-def _paper_table(numbers: PaperNumbers) -> Table:
-    """The experiment's numbers at its two moments."""
-    from octoreplay.report.tables import number, share, size, styled_table
-
-    table = styled_table("The paper's experiment")
-    table.add_column("")
-    for moment in numbers.moments:
-        table.add_column(f"{moment.seconds:.0f} s", justify="right")
-    rows = {
-        "total distance \u03a6": [number(m.total_distance) for m in numbers.moments],
-        "\u03a6 per pair / squared norm of a map": [share(m.relative_distance) for m in numbers.moments],
-        "known cells": [f"{m.num_known_cells:,}" for m in numbers.moments],
-        "cells with different labels": [share(m.label_disagreement) for m in numbers.moments],
-        "agreement, worst robot, all cells": [share(m.agreement) for m in numbers.moments],
-        "agreement, worst robot, occupied cells": [share(m.agreement_occupied) for m in numbers.moments],
-        "map as uniform grid": [size(m.grid_bytes) for m in numbers.moments],
-        "map as octree": [size(m.octree_bytes) for m in numbers.moments],
-        "uniform grid / octree": [f"{m.ratio:.2f}" for m in numbers.moments],
-    }
-    for name, values in rows.items():
-        table.add_row(name, *values)
-    return table

@@ -1,4 +1,4 @@
-"""Commands about logs: info, init, import-rgbd, import-clouds."""
+"""Commands for logs: info, init, import-rgbd, import-clouds."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from octoreplay.errors import InputError, OutputError
 from octoreplay.io.text_files import write_whole
 
 
-@click.command(short_help="Show what logs hold and what is missing for a run.")
+@click.command(short_help="Show the contents of logs and what is missing for a run.")
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
 def info(logs: tuple[Path, ...]) -> int:
-    """Show what logs hold: robots, topics, types, rates, spans, and what is missing for a run."""
-    from octoreplay.io.robots import discover
+    """Show the contents of logs: robots, topics, types, rates and time spans, and what is missing for a run."""
+    from octoreplay.io.robots.describe import describe
     from octoreplay.report import tables
 
-    description = discover.describe(logs)
+    description = describe(logs)
     if any(log.error is None for log in description.logs):
         tables.show(tables.terminal(), tables.description(description))
     errors = [log.error for log in description.logs if log.error is not None]
@@ -31,22 +31,22 @@ def info(logs: tuple[Path, ...]) -> int:
     return EXIT_ERROR if errors else 0
 
 
-@click.command(short_help="Write a team file for some logs, to be changed by hand.")
+@click.command(short_help="Write a team file for logs, to be edited by hand.")
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
-@click.option("-o", "--output", type=existing_path, required=True, metavar="TEAM.yaml", help="the team file")
-@click.option("--force", is_flag=True, help="write over a file that is there")
+@click.option("-o", "--output", type=existing_path, required=True, metavar="TEAM.yaml", help="team file to write")
+@click.option("--force", is_flag=True, help="overwrite an existing file")
 def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
-    """Write a team file with all that is found in logs, and all that can be set as comments.
+    """Write a team file with the robots and topics found in logs, and every other setting as a comment.
 
-    What a run would still miss stands in it too, and is said.
+    Anything that is missing for a run is named in the file and on the terminal.
     """
-    from octoreplay.config.team_file import team_template
-    from octoreplay.io.robots import discover
+    from octoreplay.config.team_template import team_template
+    from octoreplay.io.robots.describe import describe
 
     check_output(output, ".yaml", logs)
     if output.exists() and not force:
-        raise OutputError(f"{output}: is there already; name another file, or give --force to write over it")
-    description = discover.describe(logs)
+        raise OutputError(f"{output}: already exists; name another file, or use --force to overwrite it")
+    description = describe(logs)
     for log in description.logs:
         if log.error is not None:
             raise InputError(log.error)
@@ -62,25 +62,26 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
     return 0
 
 
-@click.command("import-rgbd", short_help="Write a folder of depth images as a log.")
+@click.command("import-rgbd", short_help="Convert a folder of depth images to a log.")
 @click.argument("folder", type=existing_path, metavar="DIR")
-@click.option("-o", "--output", type=existing_path, required=True, metavar="LOG.mcap", help="the log")
-@click.option("--rate", type=float, default=None, help="images per second, where the folder has no times [Hz]")
-@click.option(
-    "--times", type=existing_path, default=None, metavar="FILE", help="one time per line [s], in place of --rate"
-)
-@click.option("--robot", "robot_id", default=None, metavar="ID", help="the robot's name  [default: the log's]")
-@click.option("--intrinsics", default=None, metavar="FX,FY,CX,CY", help="in place of the folder's [pixels]")
-@click.option("--depth-unit", type=float, default=None, help="metres per depth value, in place of the format's own")
-@click.option("--labels", type=existing_path, default=None, metavar="DIR", help="label PNGs, named like the depth ones")
-@click.option(
-    "--classes-from", type=existing_path, default=None, metavar="TEAM.yaml", help="a team file that names the labels"
-)
-@click.option("--first", type=int, default=0, show_default=True, help="first image to take, counted from 0")
-@click.option("--last", type=int, default=None, help="last image to take  [default: the last one]")
-@click.option("--every", type=int, default=1, show_default=True, help="take one image of so many")
+@click.option("-o", "--output", type=existing_path, required=True, metavar="LOG.mcap", help="log to write")
+@click.option("--rate", type=float, default=None, help="image rate, if the folder contains no times [Hz]")
+@click.option("--times", type=existing_path, default=None, metavar="FILE",
+              help="file with the time of each image, one a line, instead of --rate [s]")  # fmt: skip
+@click.option("--robot", "robot_id", default=None, metavar="ID", help="robot id  [default: name of the log]")
+@click.option("--intrinsics", default=None, metavar="FX,FY,CX,CY",
+              help="camera intrinsics, instead of those in the folder [pixels]")  # fmt: skip
+@click.option("--depth-unit", type=float, default=None,
+              help="metres per depth value  [default: that of the dataset's format]")  # fmt: skip
+@click.option("--labels", type=existing_path, default=None, metavar="DIR",
+              help="folder of label PNGs, named like the depth images")  # fmt: skip
+@click.option("--classes-from", type=existing_path, default=None, metavar="TEAM.yaml",
+              help="team file whose classes the labels have")  # fmt: skip
+@click.option("--first", type=int, default=0, show_default=True, help="index of the first image to import, from 0")
+@click.option("--last", type=int, default=None, help="index of the last image to import  [default: the last]")
+@click.option("--every", type=int, default=1, show_default=True, help="import every n-th image")
 def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, **options: Any) -> int:
-    """Write a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) as a robot's log."""
+    """Convert a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) to a robot's log."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import rgbd_folder
 
@@ -98,33 +99,30 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
         f" {summary.duration:.1f} s)"
     )
     if summary.num_without_pose:
-        click.echo(f"warning: {summary.num_without_pose:,} images without a usable pose were left out", err=True)
+        click.echo(f"warning: {summary.num_without_pose:,} images without a usable pose were skipped", err=True)
     return EXIT_DATA_LOST if summary.num_without_pose else 0
 
 
-@click.command("import-clouds", short_help="Write a folder of point clouds as a log.")
+@click.command("import-clouds", short_help="Convert a folder of point clouds to a log.")
 @click.argument("folder", type=existing_path, metavar="DIR")
-@click.option("-o", "--output", type=existing_path, required=True, metavar="LOG.mcap", help="the log")
-@click.option("--rate", type=float, default=None, help="clouds per second, where the folder has no times [Hz]")
-@click.option(
-    "--times", type=existing_path, default=None, metavar="FILE", help="one time per line [s], in place of --rate"
-)
+@click.option("-o", "--output", type=existing_path, required=True, metavar="LOG.mcap", help="log to write")
+@click.option("--rate", type=float, default=None, help="cloud rate, if the folder contains no times [Hz]")
+@click.option("--times", type=existing_path, default=None, metavar="FILE",
+              help="file with the time of each cloud, one a line, instead of --rate [s]")  # fmt: skip
 @click.option("--poses", type=existing_path, default=None, metavar="FILE",
-              help="poses as TUM or KITTI have them  [default: those beside the clouds, or VIEWPOINT]")  # fmt: skip
+              help="trajectory in TUM or KITTI format  [default: a pose file in DIR, or VIEWPOINT of PCD]")  # fmt: skip
 @click.option("--frame", type=click.Choice(("sensor", "world")), default=None,
-              help="what the points are given in  [default: sensor, but world with VIEWPOINT]")  # fmt: skip
-@click.option("--robot", "robot_id", default=None, metavar="ID", help="the robot's name  [default: the log's]")
-@click.option(
-    "--labels", type=existing_path, default=None, metavar="DIR", help="KITTI .label files, named like the clouds"
-)
-@click.option(
-    "--classes-from", type=existing_path, default=None, metavar="TEAM.yaml", help="a team file that names the labels"
-)
-@click.option("--first", type=int, default=0, show_default=True, help="first cloud to take, counted from 0")
-@click.option("--last", type=int, default=None, help="last cloud to take  [default: the last one]")
-@click.option("--every", type=int, default=1, show_default=True, help="take one cloud of so many")
+              help="frame of the points  [default: sensor; world for poses from VIEWPOINT]")  # fmt: skip
+@click.option("--robot", "robot_id", default=None, metavar="ID", help="robot id  [default: name of the log]")
+@click.option("--labels", type=existing_path, default=None, metavar="DIR",
+              help="folder of KITTI .label files, named like the clouds")  # fmt: skip
+@click.option("--classes-from", type=existing_path, default=None, metavar="TEAM.yaml",
+              help="team file whose classes the labels have")  # fmt: skip
+@click.option("--first", type=int, default=0, show_default=True, help="index of the first cloud to import, from 0")
+@click.option("--last", type=int, default=None, help="index of the last cloud to import  [default: the last]")
+@click.option("--every", type=int, default=1, show_default=True, help="import every n-th cloud")
 def import_clouds(folder: Path, output: Path, classes_from: Path | None, **options: Any) -> int:
-    """Write a folder of point clouds with poses (PCD, PLY, KITTI) as a robot's log."""
+    """Convert a folder of point clouds with poses (PCD, PLY, KITTI) to a robot's log."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import cloud_folder
 
@@ -143,5 +141,5 @@ def import_clouds(folder: Path, output: Path, classes_from: Path | None, **optio
         click.echo(f"warning: {sentence}", err=True)
     for count, reason in ((summary.num_without_pose, "a usable pose"), (summary.num_empty, "a finite point")):
         if count:
-            click.echo(f"warning: {count:,} clouds without {reason} were left out", err=True)
+            click.echo(f"warning: {count:,} clouds without {reason} were skipped", err=True)
     return EXIT_DATA_LOST if summary.num_without_pose or summary.num_empty else 0

@@ -1,4 +1,4 @@
-"""What commands share in their options: configuration parameters, paths, and checks of outputs."""
+"""Options shared by commands: configuration parameters, paths, and checks of outputs."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import click
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, Parameter
 from octoreplay.errors import ConfigError, OutputError
 
-_WORDS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
-"""What ``--help`` calls the value of a parameter."""
+_METAVARS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
+"""Placeholders of values in ``--help``, by the kind of the parameter."""
 
 existing_path = click.Path(path_type=Path, readable=False)
 
 
 class _ParameterOption(click.Option):
-    """A command line option made from a configuration parameter."""
+    """Command line option of a configuration parameter."""
 
     section = ""
 
 
 class SectionedCommand(click.Command):
-    """Lists its options under the headings of the configuration's sections."""
+    """Command whose help lists the options under the titles of the configuration's sections."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, section by section."""
@@ -40,52 +40,57 @@ class SectionedCommand(click.Command):
 
 
 def _option(parameter: Parameter) -> _ParameterOption:
-    """The option of one parameter: ``--name-with-dashes``, without a default, so that only what is given counts."""
+    """Option ``--name-with-dashes`` of a parameter; its value is None unless it is given."""
     name = parameter.name.replace("_", "-")
     declaration = f"--{name}/--no-{name}" if parameter.kind == "bool" else f"--{name}"
     kind: Any = {"float": float, "int": int, "bool": bool}.get(parameter.kind, str)
-    shown = parameter.kind != "bool" and parameter.default not in (None, ())
-    default = f"  [default: {parameter.default}]" if shown else ""
+    value = parameter.default
+    if parameter.kind == "bool":
+        value = name if value else f"no-{name}"
+    default = "" if value in (None, ()) else f"  [default: {value}]"
     option = _ParameterOption(
         [declaration, parameter.name],
         type=click.Choice(parameter.choices) if parameter.choices else kind,
         default=None,
         help=parameter.help + default,
-        metavar=None if parameter.choices else _WORDS.get(parameter.kind),
+        metavar=None if parameter.choices else _METAVARS.get(parameter.kind),
     )
     option.section = parameter.section
     return option
 
 
 def with_parameters(command: click.Command) -> click.Command:
-    """Add every configuration parameter to a command as an option."""
+    """Add an option for every configuration parameter to a command."""
     command.params.extend(_option(parameter) for parameter in PARAMETERS.values())
     return command
 
 
 def numbers(name: str, text: str, count: int) -> tuple[float, ...]:
-    """So many numbers from text with commas."""
+    """Parse ``count`` numbers separated by commas. Raises ConfigError."""
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        found = tuple(float(part) for part in text.split(","))
     except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise ConfigError(f"{name}: expects {count} numbers with commas between them, got '{text}'")
-    return numbers
+        found = ()
+    if len(found) != count:
+        raise ConfigError(f"{name}: expects {count} numbers separated by commas, got '{text}'")
+    return found
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder for figures that is a file, before any work is done."""
+    """Check, before any work is done, that the path of an output folder is not a file. Raises OutputError."""
     if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file; give a folder")
+        raise OutputError(f"{path}: is a file; name a folder")
 
 
 def check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
-    """Refuse an output before any work is done: another kind of file, no file at all, or an input of the command."""
+    """Check, before any work is done, that an output file can be written and is not an input of the command.
+
+    Raises ConfigError for a wrong suffix, OutputError otherwise.
+    """
     if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: is a folder or a device; give a file name such as out{suffix}")
+        raise OutputError(f"{path}: is a folder or a device; use a file name such as out{suffix}")
     if path.suffix.lower() != suffix and not (suffix == ".yaml" and path.suffix.lower() == ".yml"):
-        raise ConfigError(f"{path}: the output's name must end in {suffix}")
+        raise ConfigError(f"{path}: the name of the output must end in {suffix}")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: cannot be written: the folder '{path.parent}' does not exist")
     if any(path.resolve() == entry.resolve() for entry in inputs):

@@ -1,4 +1,4 @@
-"""What is shown while a command works, and what is said about a run when it has ended."""
+"""Progress bars of commands, and the warnings after a run."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from octoreplay.records import FrameCounts, RunSummary
-    from octoreplay.replay.session import Progress
+    from octoreplay.replay.run import Progress
 
 
 def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
-    """Run with a progress bar; says where the finished part is when interrupted."""
+    """Replay with a progress bar. An interrupt's message names the partial result."""
     from octoreplay.io.results.result_writer import partial_path
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
 
     with replay_bar() as show:
         try:
             return replay_team(config, output, progress=show)
         except KeyboardInterrupt:
             partial = partial_path(output)
-            kept = f"; what was finished is in {partial}" if partial.exists() else ""
+            kept = f"; the finished part is in {partial}" if partial.exists() else ""
             raise KeyboardInterrupt(f"interrupted{kept}") from None
 
 
 @contextlib.contextmanager
 def replay_bar() -> Iterator[Callable[[Progress], None]]:
-    """A progress bar of a replay: what is to be told of every tick."""
+    """Progress bar of a replay; gives a callback for the progress of every tick."""
     with progress_bar("replay") as update:
 
         def show(progress: Progress) -> None:
@@ -47,7 +47,7 @@ def replay_bar() -> Iterator[Callable[[Progress], None]]:
 
 
 def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
-    """Simulate with a progress bar and say what was written; the team file."""
+    """Simulate with a progress bar and report the files written; return the team file."""
     from octoreplay.report.tables import size
     from octoreplay.simulate.team import SimulationConfig, simulate_team
 
@@ -60,12 +60,12 @@ def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
 
 
 def _ignore(*_: object) -> None:
-    """Progress that nobody watches."""
+    """Progress callback without a terminal."""
 
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, str], None]]:
-    """A progress bar on stderr when that is a terminal: update(share done, log seconds done, text)."""
+    """Progress bar on stderr if that is a terminal; gives update(finished share, replayed seconds of log, text)."""
     from rich import progress as bars
 
     from octoreplay.report.tables import terminal
@@ -90,7 +90,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, s
 
 
 def show_warnings(err: Console, summary: RunSummary) -> None:
-    """The run's warnings, and what was lost of each robot's log."""
+    """Print a run's warnings, and the data that each robot's logs lost."""
     for sentence in summary.warnings:
         warn(err, sentence)
     # Robots may share a log.
@@ -102,19 +102,19 @@ def show_warnings(err: Console, summary: RunSummary) -> None:
 
 
 def losses(counts: FrameCounts) -> Iterator[str]:
-    """What could not be used of what one robot's logs hold, a sentence each."""
-    for cause, what in (
-        ("no_pose", "had no pose: none within pose_gap on both sides, or one beyond the map's reach"),
+    """Yield a sentence for each kind of data of one robot's logs that could not be used."""
+    for cause, reason in (
+        ("no_pose", "had no pose: none within pose_gap on both sides, or one outside the map's range"),
         ("no_label", "had no labels or confidences within pair_tolerance"),
-        ("late", "came more than reorder_window late"),
+        ("late", "were more than reorder_window late"),
         ("undecodable", "could not be read"),
     ):
         count, first = getattr(counts, cause), counts.first_missing.get(cause)
         if count:
-            yield f"{count:,} of the images or clouds {what}" + (f"; the first: {first}" if first else "")
+            yield f"{count:,} of the images or clouds {reason}" + (f"; the first: {first}" if first else "")
     if counts.duplicate:
-        yield f"{counts.duplicate:,} images or clouds had the stamp of another one, and were left out"
-    for what, numbers, spelling in (
+        yield f"{counts.duplicate:,} images or clouds had the same stamp as another one and were skipped"
+    for kind, numbers, spelling in (
         ("labels", counts.unknown_label_pixels, "{}"),
         ("colours", counts.unknown_colors, "#{:06x}"),
     ):
@@ -122,11 +122,11 @@ def losses(counts: FrameCounts) -> Iterator[str]:
             shown = ", ".join(spelling.format(number) for number in sorted(numbers)[:8])
             more = ", ..." if len(numbers) > 8 else ""
             total = sum(numbers.values())
-            yield f"{total:,} pixels or points with {what} that no class has were ignored: {shown}{more}"
+            yield f"{total:,} pixels or points with {kind} without a class were ignored: {shown}{more}"
 
 
 def warn(err: Console, sentence: str) -> None:
-    """Say one warning."""
+    """Print one warning."""
     from rich.text import Text
 
     err.print(Text.assemble(("warning: ", "yellow"), sentence), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Commands that look at a result: metrics, export, query."""
+"""Commands that read a result: metrics, export, query."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from octoreplay.commands.options import check_folder, check_output, existing_pat
 from octoreplay.errors import ConfigError
 
 
-@click.command(short_help="Show a result's numbers, as table, CSV or figures.")
+@click.command(short_help="Show the metrics of a result as tables, CSV or figures.")
 @click.argument("result", type=existing_path, metavar="RESULT.mcap")
-@click.option("--csv", type=existing_path, metavar="FILE.csv", help="every tick's metrics as CSV")
-@click.option("--plot", type=existing_path, metavar="DIR", help="figures: disagreement over time, packet sizes")
+@click.option("--csv", type=existing_path, metavar="FILE.csv", help="write the metrics of every tick as CSV")
+@click.option("--plot", type=existing_path, metavar="DIR",
+              help="write figures of disagreement over time and packet sizes into this folder")  # fmt: skip
 def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
-    """Show what a run came to, and write its metrics as CSV or pictures."""
+    """Show the metrics of a result, and write them as CSV or figures."""
     from octoreplay.report import plots, tables
     from octoreplay.result import open_result
 
@@ -40,19 +41,18 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
 
 @click.command(short_help="Write a map of a result as a PLY file.")
 @click.argument("result", type=existing_path, metavar="RESULT.mcap")
-@click.option("-o", "--output", type=existing_path, required=True, metavar="MAP.ply", help="the PLY file")
-@click.option(
-    "--robot", default=None, metavar="ID", help="whose map  [default: the first robot's; all with color robot]"
-)
-@click.option(
-    "--at", type=float, default=None, metavar="SECONDS", help="time since the run's start  [default: the end]"
-)
+@click.option("-o", "--output", type=existing_path, required=True, metavar="MAP.ply", help="PLY file to write")
+@click.option("--robot", default=None, metavar="ID",
+              help="robot id, or 'central'  [default: the first robot; all robots with --color robot]")  # fmt: skip
+@click.option("--at", type=float, default=None, metavar="SECONDS",
+              help="time of the map since the run's start [s]  [default: the end]")  # fmt: skip
 @click.option("--what", type=click.Choice(("points", "voxels")), default="points", show_default=True,
-              help="leaf centres, or cubes of the leaves' sizes")  # fmt: skip
+              help="write the centres of leaves (points) or cubes of their sizes (voxels)")  # fmt: skip
 @click.option("--color", type=click.Choice(("label", "robot", "disagreement", "probability")), default="label",
-              show_default=True, help="what the colours say")  # fmt: skip
-@click.option("--free", is_flag=True, help="free leaves too")
-@click.option("--team-posterior", is_flag=True, help="h_0 + N (h - h_0) in place of the robot's own h")
+              show_default=True, help="quantity shown by the colours")  # fmt: skip
+@click.option("--free", is_flag=True, help="write free leaves too")
+@click.option("--team-posterior", is_flag=True,
+              help="use the posterior of the whole team, h_0 + N (h - h_0), instead of the robot's own h")  # fmt: skip
 def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
     """Write a map of a result as a PLY file, which CloudCompare, MeshLab and Open3D open."""
     from octoreplay.report.export import export_ply
@@ -65,28 +65,29 @@ def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
     return 0
 
 
-@click.command(short_help="Ask a map what is at a point or in a box.")
+@click.command(short_help="Show the classes at points or in a box of a map.")
 @click.argument("result", type=existing_path, metavar="RESULT.mcap")
 @click.option("--at", "points", type=(float, float, float), multiple=True, metavar="X Y Z",
-              help="what is at this point [m], in the team's frame; may be given several times")  # fmt: skip
+              help="point in the team's frame [m]; may be repeated")  # fmt: skip
 @click.option("--box", type=(float,) * 6, default=None, metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX",
-              help="what is in this box [m]")  # fmt: skip
-@click.option("--robot", default=None, metavar="ID", help="whose map is asked  [default: the first robot's]")
+              help="box in the team's frame [m]")  # fmt: skip
+@click.option("--robot", default=None, metavar="ID", help="robot id, or 'central'  [default: the first robot]")
 @click.option("--time", "seconds", type=float, default=None, metavar="SECONDS",
-              help="time since the run's start  [default: the end]")  # fmt: skip
-@click.option("--team-posterior", is_flag=True, help="h_0 + N (h - h_0) in place of the robot's own h")
+              help="time of the map since the run's start [s]  [default: the end]")  # fmt: skip
+@click.option("--team-posterior", is_flag=True,
+              help="use the posterior of the whole team, h_0 + N (h - h_0), instead of the robot's own h")  # fmt: skip
 def query(
     result: Path, points: tuple[tuple[float, float, float], ...], box: tuple[float, ...] | None, robot: str | None,
     seconds: float | None, team_posterior: bool,
 ) -> int:  # fmt: skip
-    """Ask a robot's map what is at a point or in a box, and how sure it is."""
+    """Show the class probabilities of a robot's map at points, or the classes in a box."""
     import numpy as np
 
     from octoreplay.report import tables
     from octoreplay.result import open_result
 
     if not points and box is None:
-        raise click.UsageError("ask for a point, --at X Y Z, or a box, --box XMIN YMIN ZMIN XMAX YMAX ZMAX")
+        raise click.UsageError("name a point with --at X Y Z, or a box with --box XMIN YMIN ZMIN XMAX YMAX ZMAX")
     if not all(math.isfinite(number) for point in points for number in point):
         raise ConfigError("at: expects finite numbers")
     if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
@@ -98,7 +99,7 @@ def query(
         names = ("free", *opened.class_table.names)
         out.print(
             f"map of {robot_id} {opened.seconds(stored.stamp_ns):.1f} s after the start"
-            f" ({'team posterior' if team_posterior else 'as the robot holds it'})",
+            f" ({'team posterior' if team_posterior else 'own map'})",
             soft_wrap=True,
         )
         if points:

@@ -1,4 +1,4 @@
-"""Commands that make results: run, simulate, demo."""
+"""Commands that produce logs and results: run, simulate, demo."""
 
 from __future__ import annotations
 
@@ -18,48 +18,52 @@ from octoreplay.errors import ConfigError
 
 
 @with_parameters
-@click.command(cls=SectionedCommand, short_help="Replay logs into maps that the team agrees on.")
+@click.command(cls=SectionedCommand, short_help="Replay logs into maps and run a distributed consensus on them.")
 @click.argument("inputs", nargs=-1, type=existing_path, metavar="TEAM.yaml | LOG...")
-@click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="the result")
-@click.option(
-    "--config-from", type=existing_path, metavar="RESULT.mcap", help="repeat a run with the settings it stored"
-)
-@click.option(
-    "--save-team", type=existing_path, metavar="TEAM.yaml", help="save robots, topics and settings as a team file"
-)
-@click.option("--preset", type=click.Choice(tuple(PRESETS)), help="a named set of settings; options override it")
-@click.option("--edges", metavar="A:B[:W],...", help="links of the communication graph, with weights if all have one")
-@click.option("--one-way", metavar="A:B,...", help="links that carry from A to B only")
-@click.option("--schedule", type=existing_path, metavar="FILE.yaml", help="when which robots and links are up or down")
-@click.option("--classes", metavar="NAME|FILE", help=f"what labels mean: {', '.join(BUILT_IN)}, or a file")
+@click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="result to write")
+@click.option("--config-from", type=existing_path, metavar="RESULT.mcap",
+              help="use the logs and settings stored in this result, instead of TEAM.yaml or LOG")  # fmt: skip
+@click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
+              help="write robots, topics and settings to this team file")  # fmt: skip
+@click.option("--preset", type=click.Choice(tuple(PRESETS)),
+              help="named set of settings, overridden by options; paper: the paper's experiment")  # fmt: skip
+@click.option("--edges", metavar="A:B[:W],...",
+              help="edge list of the communication graph; give a weight W for all edges or for none")  # fmt: skip
+@click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")
+@click.option("--schedule", type=existing_path, metavar="FILE.yaml",
+              help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
+@click.option("--classes", metavar="NAME|FILE",
+              help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, classes: str | None,
     **parameters: Any,
 ) -> int:  # fmt: skip
-    """Replay a team's logs into maps that the team agrees on.
+    """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
 
-    Give a team file, or logs (MCAP, ROS 1 bags, rosbag2 folders) in which robots and topics are found by themselves.
-    What was found is shown, and --save-team saves it.
+    The input is a team file, or logs (MCAP, ROS 1 bags, rosbag2 folders) in which robots and topics are detected. What
+    is detected is shown, and --save-team writes it to a team file.
     """
     from octoreplay.io.robots import discover
+    from octoreplay.io.robots.survey import LogSurveys
     from octoreplay.report import tables
 
     if output is None and save_team is None:
-        raise click.UsageError("give the result's name: -o OUT.mcap (or --save-team TEAM.yaml to stop before the run)")
+        raise click.UsageError("name the result with -o OUT.mcap (or use --save-team TEAM.yaml to stop before the run)")
     if output is not None:
         check_output(output, ".mcap")
     if save_team is not None:
         check_output(save_team, ".yaml", inputs)
     out, err = tables.terminal(), tables.terminal(stderr=True)
-    base = base_config(inputs, config_from, err)
-    base = base if classes is None else with_classes(base, classes)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config = discover.resolve(with_network(with_options(base, preset, edges, given), one_way, schedule))
+    with LogSurveys() as surveys:
+        base = base_config(inputs, config_from, err, surveys)
+        base = base if classes is None else with_classes(base, classes)
+        chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
+        config = discover.resolve(chosen, surveys)
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
-        if config.classes is not None:
-            tables.show(out, tables.class_list(config.classes))
+        tables.show(out, tables.class_list(config.classes))
     if save_team is not None:
         save_team_file(config, save_team)
         out.print(f"saved {save_team}", soft_wrap=True)
@@ -74,42 +78,41 @@ def run(
 
 @click.command(short_help="Write the logs of a simulated team.")
 @click.argument("folder", type=existing_path, metavar="DIR")
-@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
+@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
 @click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
 @click.option("--rate", type=float, default=4.0, show_default=True, help="images per second and robot [Hz]")
 @click.option("--image", default="160x120", show_default=True, metavar="WxH", help="image size [pixels]")
-@click.option("--seed", type=int, default=0, show_default=True, help="the village, the drives and the noise")
-@click.option("--resolution", type=float, default=0.3, show_default=True, help="edge of the finest cell [m]")
+@click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
+@click.option("--resolution", type=float, default=0.3, show_default=True,
+              help="cell size of the ground truth, and resolution in the team file [m]")  # fmt: skip
 @click.option("--label-noise", type=float, default=0.1, show_default=True, help="share of pixels with a wrong label")
 @click.option("--depth-noise", type=float, default=1.0, show_default=True, metavar="FACTOR",
-              help="times a depth camera's noise, which grows with range")  # fmt: skip
+              help="factor on the noise of a depth camera, whose standard deviation grows with depth")  # fmt: skip
 @click.option("--pose-noise", type=float, default=0.0, show_default=True,
-              help="error of the recorded poses, which changes over some ten seconds [m]")  # fmt: skip
-@click.option("--kinds-per-class", type=int, default=1, show_default=True, help="split the eight classes into kinds")
-@click.option("--world-size", type=float, default=None, help="edge of the square village [m]  [default: fits the team]")
-def simulate(folder: Path, robots: int, image: str, world_size: float | None, **options: Any) -> int:
-    """Write the logs of a simulated team that explores a village into DIR.
+              help="standard deviation of the recorded poses' error, correlated over ten seconds [m]")  # fmt: skip
+@click.option("--kinds-per-class", type=int, default=1, show_default=True,
+              help="divide each of the eight classes into this many classes")  # fmt: skip
+@click.option("--world-size", type=float, default=70.0, show_default=True, help="edge length of the square village [m]")
+def simulate(folder: Path, robots: int, image: str, **options: Any) -> int:
+    """Simulate a team that explores a village and write its logs into DIR.
 
-    One ordinary MCAP log per robot, team.yaml, and the ground truth (world.npz, world.ply). The same options give the
-    same bytes.
+    Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply). Equal options give equal
+    bytes.
     """
-    values = {"num_robots": robots, "image": _image_size(image), **options}
-    if world_size is not None:
-        values["world_size"] = world_size
-    team_file = simulate_with_bar(folder, values)
+    team_file = simulate_with_bar(folder, {"num_robots": robots, "image": _image_size(image), **options})
     click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
     return 0
 
 
-@click.command(short_help="Simulate, replay and export, to see it all at once.")
+@click.command(short_help="Simulate a team, replay it and export its map.")
 @click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-demo"), required=False)
-@click.option("--robots", type=int, default=6, show_default=True, help="robots in the team")
+@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
 @click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
-@click.option("--seed", type=int, default=0, show_default=True, help="another seed, another village")
+@click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
 def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
-    """Simulate a team, replay it, and export what it found, all into DIR (octoreplay-demo).
+    """Simulate a team, replay it, and export its map and figures into DIR (default: octoreplay-demo).
 
-    Takes under two minutes. Says what it made and how to look at it.
+    Takes less than two minutes. Lists the files written and the programs that open them.
     """
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.robots import discover
@@ -131,11 +134,11 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
         out,
         tables.made_files(
             {
-                folder / "logs": f"what {robots} robots recorded, and the village they drove through (world.ply)",
-                result_path: f"the result; open it in Foxglove: 3D panel, frame 'team', topic /{first}/map",
-                ply: "the agreed map as cubes; open it in CloudCompare, MeshLab or Open3D",
-                figures: "disagreement over time and packet sizes, as pictures",
-                csv: "every number of every tick",
+                folder / "logs": f"logs of {robots} robots, team file and the village as a mesh (world.ply)",
+                result_path: f"result; open it in Foxglove: 3D panel, frame 'team', topic /{first}/map",
+                ply: "final map as cubes; open it in CloudCompare, MeshLab or Open3D",
+                figures: "figures of disagreement over time and packet sizes",
+                csv: "all metrics of every tick",
             }
         ),
     )
@@ -144,7 +147,7 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
 
 
 def _image_size(text: str) -> tuple[int, int]:
-    """Width and height from WxH."""
+    """Width and height of a text WxH."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise ConfigError(f"image: expects WIDTHxHEIGHT such as 160x120, got '{text}'")

@@ -1,4 +1,4 @@
-"""Commands that do many runs: sweep."""
+"""Command that runs combinations of settings: sweep."""
 
 from __future__ import annotations
 
@@ -18,27 +18,33 @@ if TYPE_CHECKING:
 
 
 @with_parameters
-@click.command(cls=SectionedCommand, short_help="Run many combinations of settings into one table.")
+@click.command(cls=SectionedCommand, short_help="Run every combination of settings and write one table.")
 @click.argument("teams", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml...")
-@click.option("-o", "--output", type=existing_path, required=True, metavar="DIR", help="where the table goes")
+@click.option(
+    "-o", "--output", type=existing_path, required=True, metavar="DIR", help="folder for the table and figures"
+)
 @click.option("--vary", multiple=True, metavar="NAME=V1,V2,...",
-              help="a parameter and its values, or NAME+NAME=V1+V1,V2+V2,... for several; may be repeated")  # fmt: skip
-@click.option("--seeds", type=int, metavar="N", help="every combination with network_seed 0 to N - 1")
+              help="parameter and its values, or NAME+NAME=V1+V1,V2+V2,... to vary several together; may be"
+                   " repeated")  # fmt: skip
+@click.option("--seeds", type=int, metavar="N", help="run every combination with network_seed 0 to N - 1")
 @click.option("--truth", type=existing_path, metavar="FILE",
-              help="evaluate against this truth, found beside each team file or as given")  # fmt: skip
-@click.option("--keep", is_flag=True, help="keep every run's result in DIR/runs")
-@click.option("--jobs", type=int, metavar="N", help="runs at once on this machine  [default: processors over threads]")
-@click.option("--threads", type=int, default=1, show_default=True, metavar="N", help="threads of each run")
-@click.option("--scheduler", metavar="tcp://HOST:PORT", help="run on this dask cluster in place of this machine")
-@click.option("--preset", type=click.Choice(tuple(PRESETS)), help="a named set of settings; options override it")
+              help="evaluate against this ground truth, relative to each team file or the working folder")  # fmt: skip
+@click.option("--keep", is_flag=True, help="keep the result of every run in DIR/runs")
+@click.option("--jobs", type=int, metavar="N",
+              help="number of parallel runs on this machine  [default: processors / threads]")  # fmt: skip
+@click.option("--threads", type=int, default=1, show_default=True, metavar="N", help="number of threads of each run")
+@click.option("--scheduler", metavar="tcp://HOST:PORT",
+              help="address of a dask scheduler; runs are executed on its workers instead of this machine")  # fmt: skip
+@click.option("--preset", type=click.Choice(tuple(PRESETS)),
+              help="named set of settings, overridden by options; paper: the paper's experiment")  # fmt: skip
 def sweep(
     teams: tuple[Path, ...], output: Path, vary: tuple[str, ...], seeds: int | None, truth: Path | None, keep: bool,
     jobs: int | None, threads: int, scheduler: str | None, preset: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Run every combination of teams and settings, and write one table and figures into DIR.
 
-    What is finished in DIR already is not run again, so that the same command goes on after an interruption. A run that
-    fails does not stop the others.
+    Runs that are already finished in DIR are not repeated, so the same command continues after an interruption. A
+    failed run does not stop the others.
     """
     from octoreplay.report import tables
     from octoreplay.study.sweep import run_sweep
@@ -61,7 +67,7 @@ def sweep(
 
 
 def _stage(progress: SweepProgress) -> str:
-    """How far a sweep is, in words."""
+    """Text of a sweep's progress."""
     from octoreplay.report.tables import seconds
 
     left = progress.num_runs - progress.num_finished
@@ -71,7 +77,7 @@ def _stage(progress: SweepProgress) -> str:
 
 
 def _end(done: Sweep) -> int:
-    """Say which runs failed; the exit code."""
+    """Report the failed runs and return the exit code."""
     names = ("team", *done.names, "seed")
     for row in done.failed:
         click.echo(f"failed: {', '.join(f'{name}={row[name]}' for name in names)}: {row['error']}", err=True)

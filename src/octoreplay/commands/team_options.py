@@ -1,4 +1,4 @@
-"""From the options of a command to a configuration: what counts, from weak to strong, is in docs/cli.md."""
+"""Run configuration from the options of a command; docs/cli.md has the precedence of settings."""
 
 from __future__ import annotations
 
@@ -17,39 +17,41 @@ from octoreplay.io.text_files import write_whole
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from octoreplay.io.robots.survey import LogSurveys
+
 
 def is_team_file(inputs: Sequence[Path]) -> bool:
-    """True where an input is a team file rather than a log."""
+    """True if an input is a team file, not a log."""
     return any(path.suffix.lower() in (".yaml", ".yml") for path in inputs)
 
 
-def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console) -> RunConfig:
-    """The configuration before any option: of a stored result, of a team file, or found in logs."""
+def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console, surveys: LogSurveys) -> RunConfig:
+    """Return the configuration before options: from a stored result, from a team file, or detected in logs."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.results.result_reader import ResultReader
     from octoreplay.io.robots import discover
 
     if config_from is not None:
         if inputs:
-            raise click.UsageError(f"--config-from {config_from} names the logs too; leave out {inputs[0]}")
+            raise click.UsageError(f"--config-from {config_from} also sets the logs; leave out {inputs[0]}")
         with ResultReader(config_from) as reader:
             for sentence in reader.changed_inputs():
                 warn(err, sentence)
             return reader.config
     if not inputs:
-        raise click.UsageError("give a team file or logs: octoreplay run TEAM.yaml -o OUT.mcap")
+        raise click.UsageError("name a team file or logs: octoreplay run TEAM.yaml -o OUT.mcap")
     if is_team_file(inputs):
         if len(inputs) > 1:
-            raise click.UsageError("give one team file, or logs, not both")
+            raise click.UsageError("name one team file or several logs, not both")
         return load_team_file(inputs[0])
     for path in inputs:
         if (path / "team.yaml").is_file():
-            raise ConfigError(f"{path}: holds a team file; give {path / 'team.yaml'}, or its logs one by one")
-    return RunConfig(robots=discover.discover(inputs))
+            raise ConfigError(f"{path}: contains a team file; name {path / 'team.yaml'}, or its logs one by one")
+    return RunConfig(robots=discover.discover(inputs, surveys))
 
 
 def with_network(config: RunConfig, one_way: str | None, schedule: Path | None) -> RunConfig:
-    """The configuration with one-way links and a schedule, where they are given."""
+    """Return the configuration with one-way links and a schedule, if given."""
     from octoreplay.config.team_file import load_schedule
 
     changes: dict[str, Any] = {}
@@ -61,7 +63,7 @@ def with_network(config: RunConfig, one_way: str | None, schedule: Path | None) 
 
 
 def _pair(text: str) -> tuple[str, str]:
-    """A one-way link from A:B."""
+    """One-way link of a text A:B."""
     sender, _, receiver = text.strip().partition(":")
     if not sender or not receiver or ":" in receiver:
         raise ConfigError(f"one_way: '{text}' is not A:B")
@@ -69,7 +71,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def save_team_file(config: RunConfig, path: Path) -> None:
-    """Write a team file whose log paths hold from its own folder."""
+    """Write a team file with log paths relative to its own folder, or absolute if elsewhere."""
     from octoreplay.config.team_file import dump_team
 
     robots = tuple(robot.with_absolute_paths() for robot in config.robots)

@@ -1,4 +1,4 @@
-"""Commands that judge results, with exit codes for machines: check, compare."""
+"""Commands with a verdict as exit code: check, compare."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from octoreplay.commands.exit_codes import EXIT_ERROR
 from octoreplay.commands.options import check_output, existing_path
 from octoreplay.evaluate.checks import LIMITS, check_result
 
-_json_option = click.option("--json", "json_file", type=existing_path, metavar="FILE.json", help="the same as JSON")
+_json_option = click.option("--json", "json_file", type=existing_path, metavar="FILE.json",
+                            help="write the table as JSON")  # fmt: skip
 
 
 def _with_limits(command: Callable[..., int]) -> Callable[..., int]:
-    """Add an option for every limit."""
+    """Add an option for every limit to a command."""
     for name, quantity in reversed(LIMITS.items()):
         option = f"--{name.replace('_', '-')}"
         command = click.option(option, name, type=float, metavar="LIMIT", help=quantity.meaning)(command)
     return command
 
 
-@click.command(short_help="Hold a result against limits; exit code 1 where one fails.")
+@click.command(short_help="Check a result against limits; exit code 1 if one is violated.")
 @click.argument("result", type=existing_path, metavar="RESULT.mcap")
 @_with_limits
-@click.option("--settled", is_flag=True, help="the maps must have come to rest at the end")
-@click.option("--truth", type=existing_path, metavar="WORLD", help="the true world, which some limits need")
+@click.option("--settled", is_flag=True, help="the maps must have settled at the end")
+@click.option("--truth", type=existing_path, metavar="WORLD",
+              help="ground truth for limits that need it: world.npz, its folder, or a labelled PLY file")  # fmt: skip
 @_json_option
 def check(result: Path, settled: bool, truth: Path | None, json_file: Path | None, **options: float | None) -> int:
-    """Hold a result against limits, for continuous integration.
+    """Check a result against limits, for continuous integration.
 
-    Exit code 0 where all hold, 1 where one fails. An interrupted run's result fails.
+    Exit code 0 if all limits hold, 1 if one is violated. The result of an interrupted run fails.
     """
     from octoreplay.io.text_files import json_text, write_whole
     from octoreplay.report import tables, verdict_tables
@@ -50,19 +52,19 @@ def check(result: Path, settled: bool, truth: Path | None, json_file: Path | Non
     return 0 if passed else EXIT_ERROR
 
 
-@click.command(short_help="Compare the maps of two results; exit code 1 where they differ.")
+@click.command(short_help="Compare the maps of two results; exit code 1 if they differ.")
 @click.argument("a", type=existing_path, metavar="A.mcap")
 @click.argument("b", type=existing_path, metavar="B.mcap")
-@click.option("--robot", default=None, metavar="ID", help="only this robot's maps, or 'central'  [default: all]")
+@click.option("--robot", default=None, metavar="ID", help="robot id, or 'central'  [default: all maps]")
 @click.option("--at", type=float, default=None, metavar="SECONDS",
-              help="time since each run's start  [default: the end]")  # fmt: skip
+              help="time of the maps since each run's start [s]  [default: the end]")  # fmt: skip
 @click.option("--tolerance", type=float, default=0.0, show_default=True,
-              help="log-odds that differ by no more count as the same")  # fmt: skip
+              help="largest difference of log-odds that counts as equal")  # fmt: skip
 @_json_option
 def compare(a: Path, b: Path, json_file: Path | None, **options: Any) -> int:
-    """Compare the maps of two results: the same, or where and by how much they differ.
+    """Compare the maps of two results and show where and by how much they differ.
 
-    Exit code 0 where all maps are the same, 1 where one differs.
+    Exit code 0 if all maps are equal, 1 otherwise.
     """
     from octoreplay.evaluate.comparison import compare_results
     from octoreplay.io.text_files import json_text, write_whole

@@ -1,4 +1,4 @@
-"""Class tables as team files and files of classes hold them."""
+"""Class tables in team files and class files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _CLASS_KEYS = ("name", "color", "raw_labels", "raw_colors")
 
 
 def with_classes(config: RunConfig, name: str) -> RunConfig:
-    """A configuration with the classes that a built-in table or a file gives, in place of its own.
+    """Return a configuration with the classes of a built-in table or a file instead of its own.
 
-    A file without 'classes' says what to make of the configuration's own classes, or of those that the logs bring.
-    Raises ConfigError with the file for anything that is not understood.
+    A file without 'classes' edits the configuration's own classes, or those of the logs. Raises ConfigError that names
+    the file for an unknown key or a wrong value.
     """
     settings = _named_classes(name, Path())
     if "classes" not in settings and config.classes is not None:
@@ -33,20 +33,23 @@ def with_classes(config: RunConfig, name: str) -> RunConfig:
 
 
 def class_settings(content: Mapping[str, Any], folder: Path, files: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """What a mapping says about classes: RunConfig's ``classes``, or what to make of those that the logs bring."""
+    """Return the fields of RunConfig that a mapping sets: ``classes``, or the edits of the logs' own classes.
+
+    ``files`` are the files whose 'classes' led to this mapping. Raises ConfigError.
+    """
     merge, ignore = _merges(content.get("merge_classes") or {}), _names("ignore_hits", content.get("ignore_hits") or ())
     entries = content.get("classes")
     if entries is None:
         for key in ("ignored_raw_labels", "ignored_raw_colors"):
             if content.get(key):
                 raise ConfigError(
-                    f"{key}: goes with 'classes'; of the logs' own classes, ignore_hits ignores some by name"
+                    f"{key}: needs 'classes'; to ignore some of the logs' own classes, list them in ignore_hits"
                 )
         return {"merge_classes": merge, "ignore_hits": ignore}
     if isinstance(entries, str):
         table = _named_classes(entries, folder, files).get("classes")
         if table is None:
-            raise ConfigError(f"classes: the file '{entries}' holds no classes")
+            raise ConfigError(f"classes: the file '{entries}' has no key 'classes'")
     else:
         table = class_table(entries)
     table = _ignoring(table, content.get("ignored_raw_labels") or (), content.get("ignored_raw_colors") or ())
@@ -54,15 +57,15 @@ def class_settings(content: Mapping[str, Any], folder: Path, files: tuple[Path, 
 
 
 def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The settings that a built-in table or a file gives; ``files`` are those that led to it."""
+    """Class settings of a built-in table or a file; ``files`` are the files that led to it."""
     if name in BUILT_IN:
         return {"classes": table_of_rows(built_in_rows(name), PALETTE)}
     path = folder / name
     if not _is_file(path):
         near = suggestion(name.lower(), BUILT_IN)
-        raise ConfigError(f"classes: '{name}' is no file and no built-in table ({', '.join(BUILT_IN)}){near}")
+        raise ConfigError(f"classes: '{name}' is neither a file nor a built-in table ({', '.join(BUILT_IN)}){near}")
     if path.resolve() in files:
-        raise ConfigError(f"classes: the file '{name}' takes its classes from itself")
+        raise ConfigError(f"classes: the file '{name}' refers to itself")
     text = read_text(path, "class")
     content = None if path.suffix.lower() == ".csv" else load_yaml(text, str(path))
     try:
@@ -72,10 +75,10 @@ def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dic
             return {"classes": edited(table_of_rows(hydra_rows(content), PALETTE), (), ())}
         content = {"classes": content} if isinstance(content, list) else content
         if isinstance(content, Mapping) and "robots" in content:
-            # Of a team file its classes are meant.
+            # A team file: only its class settings are used.
             content = {key: value for key, value in content.items() if key in CLASSES_KEYS}
             if not content:
-                raise ConfigError("the team file holds no classes")
+                raise ConfigError("the team file has no class settings")
         if not isinstance(content, Mapping):
             raise ConfigError("a class file is a list of classes, or a mapping with 'classes'")
         for key in content:
@@ -87,7 +90,7 @@ def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dic
 
 
 def _is_file(path: Path) -> bool:
-    """True for a file; False also for what cannot be the name of one."""
+    """True for a file; False also for an invalid file name."""
     try:
         return path.is_file()
     except OSError:
@@ -95,7 +98,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _merges(entries: Any) -> Merges:
-    """What 'merge_classes' holds: new names, each with the names of the classes that become it."""
+    """Merged classes from a mapping of new names to lists of class names."""
     if not isinstance(entries, Mapping):
         raise ConfigError("merge_classes: expects new names, each with a list of classes, such as vehicle: [car, bus]")
     merges = tuple((str(new), _names("merge_classes", names)) for new, names in entries.items())
@@ -106,7 +109,7 @@ def _merges(entries: Any) -> Merges:
 
 
 def _names(key: str, value: Any) -> tuple[str, ...]:
-    """Names of classes from a list, or from one name."""
+    """Class names from a list or a single name."""
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not all(isinstance(name, str | int) for name in names):
         raise ConfigError(f"{key}: expects a list of class names, got {value!r}")
@@ -114,9 +117,10 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 
 
 def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
-    """A class table from the list that a team file holds: mappings with name, color [r, g, b], raw_labels, raw_colors.
+    """Return the class table of a list of mappings with name, color [r, g, b], raw_labels and raw_colors.
 
-    Raises ConfigError for an unknown key, a wrong type, a name that occurs twice, or a raw label that has two meanings.
+    ``ignored`` are further raw labels to ignore. Raises ConfigError for an unknown key, a wrong type, a repeated name
+    or a raw label of two classes.
     """
     if not isinstance(entries, list | tuple) or not entries:
         raise ConfigError(
@@ -132,31 +136,31 @@ def class_table(entries: Any, ignored: Any = ()) -> ClassTable:
                 raise ConfigError(f"classes: {key}: unknown key{suggestion(str(key), _CLASS_KEYS)}")
         name = str(entry["name"])
         if any(item.name == name for item in classes):
-            raise ConfigError(f"classes: '{name}' is listed twice; give one entry all its raw_labels")
+            raise ConfigError(f"classes: '{name}' is listed twice; list all its raw_labels in one entry")
         if name == "free":
-            raise ConfigError(
-                "classes: 'free' is the name of free space, which is no class; give the class another one"
-            )
+            raise ConfigError("classes: 'free' is the name of free space, which is not a class; rename the class")
         raw_labels = _raw_labels(entry.get("raw_labels", [index + 1]), name)
         for raw in raw_labels:
             if raw in meaning:
-                raise ConfigError(f"classes: raw label {raw} means both '{meaning[raw]}' and '{name}'")
+                raise ConfigError(f"classes: raw label {raw} belongs to both '{meaning[raw]}' and '{name}'")
             meaning[raw] = name
         given = entry.get("color")
         color = _color(given or PALETTE[index % len(PALETTE)], f"the color of '{name}'")
-        # A colour that was made up here means nothing in an image.
+        # A colour of the palette does not occur in label images.
         raw_colors: Any = entry.get("raw_colors", [color] if given else [])
         classes.append(SemanticClass(index + 1, name, color, raw_labels, _colors(raw_colors, f"'{name}'")))
     return _ignoring(ClassTable(tuple(classes)), ignored, ())
 
 
 def _ignoring(table: ClassTable, labels: Any, colors: Any) -> ClassTable:
-    """A class table with further raw labels and colours of images to ignore."""
+    """Class table with additional raw labels and colours to ignore."""
     ignored = _raw_labels(labels, "ignored_raw_labels")
     meaning = {raw: item.name for item in table.classes for raw in item.raw_labels}
     for raw in ignored:
         if raw in meaning:
-            raise ConfigError(f"classes: raw label {raw} means '{meaning[raw]}' and is in ignored_raw_labels")
+            raise ConfigError(
+                f"classes: raw label {raw} belongs to '{meaning[raw]}' and is listed in ignored_raw_labels"
+            )
     return ClassTable(
         table.classes,
         tuple(dict.fromkeys((*table.ignored_raw_labels, *ignored))),
@@ -165,30 +169,30 @@ def _ignoring(table: ClassTable, labels: Any, colors: Any) -> ClassTable:
 
 
 def _raw_labels(value: Any, name: str) -> tuple[int, ...]:
-    """Raw labels as whole numbers."""
+    """Raw labels from a number or a list."""
     values = [value] if is_number(value) else value
     if not isinstance(values, list | tuple) or not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
         raise ConfigError(f"classes: the raw labels of '{name}' must be whole numbers")
     return tuple(values)
 
 
-def _color(value: Any, what: str) -> Color:
-    """A colour from a list [r, g, b]."""
+def _color(value: Any, subject: str) -> Color:
+    """Colour from a list [r, g, b]."""
     is_color = isinstance(value, list | tuple) and len(value) == 3
     if not is_color or not all(type(part) is int and 0 <= part <= 255 for part in value):
-        raise ConfigError(f"classes: {what} must be three whole numbers from 0 to 255, got {value!r}")
+        raise ConfigError(f"classes: {subject} must be three whole numbers from 0 to 255, got {value!r}")
     return value[0], value[1], value[2]
 
 
 def _colors(values: Any, name: str) -> tuple[Color, ...]:
-    """Colours of label images from a list of lists [r, g, b]."""
+    """Distinct colours from a list of lists [r, g, b]."""
     if not isinstance(values, list | tuple):
         raise ConfigError(f"classes: the raw colors of {name} must be a list of [r, g, b]")
     return tuple(dict.fromkeys(_color(value, f"every raw color of {name}") for value in values))
 
 
 def class_to_mapping(item: SemanticClass) -> dict[str, Any]:
-    """One class as a team file holds it."""
+    """Return the content of one class in a team file."""
     entry: dict[str, Any] = {"name": item.name, "color": list(item.color), "raw_labels": list(item.raw_labels)}
     if item.raw_colors != (item.color,):
         entry["raw_colors"] = [list(color) for color in item.raw_colors]

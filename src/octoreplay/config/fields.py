@@ -11,7 +11,7 @@ from typing import Any
 from octoreplay.errors import ConfigError
 
 LARGEST, SMALLEST = 1e12, 1e-15
-"""No number of a configuration is larger, nor smaller where it must be above 0: what times become still has room."""
+"""Limits of all numbers; SMALLEST applies to numbers above 0. They keep nanosecond times within int64."""
 
 
 def parameter(
@@ -23,7 +23,7 @@ def parameter(
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
 ) -> Any:
-    """A dataclass field that carries its help text and the range that it is checked against."""
+    """Dataclass field of a parameter, with its help text, range (inclusive, or ``above`` a number) and choices."""
     return field(
         default=default,
         metadata={"help": help_text, "minimum": minimum, "maximum": maximum, "above": above, "choices": choices},
@@ -31,12 +31,12 @@ def parameter(
 
 
 def help_text(text: str) -> Mapping[str, str]:
-    """What a key of a robot is for, as a team file's comments say it."""
+    """Metadata of a robot's key: the help text for comments in team files."""
     return {"help": text}
 
 
 def check_ranges(config: Any) -> None:
-    """Check every parameter of one section against its type and range."""
+    """Check the parameters of one section. Raises ConfigError for a value out of range."""
     for item in dataclasses.fields(config):
         value, meta = getattr(config, item.name), item.metadata
         if value is None or not meta:
@@ -63,7 +63,7 @@ def is_number(value: Any) -> bool:
 
 
 def as_number(value: Any) -> float:
-    """A float from a number or its text."""
+    """Float of a number or its text. Raises TypeError and ValueError."""
     if isinstance(value, str):
         return float(value)
     if not is_number(value):

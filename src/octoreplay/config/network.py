@@ -16,7 +16,7 @@ WEIGHTS = ("metropolis", "degree", "max-degree", "given")
 
 @dataclass(frozen=True)
 class ScheduleEntry:
-    """What is up or down from ``start`` up to, but not with, ``end`` [s since the run's start].
+    """Entry of a schedule: robots and links that are down or up in [start, end) [s since the run's start].
 
     ``groups`` cut all links between robots of different groups; ``links_down`` and ``links_up`` are links, both
     directions; ``robots_off`` neither map nor talk, and ``forget`` what they knew when they come back;
@@ -43,27 +43,34 @@ class ScheduleEntry:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The simulated communication graph: who can hear whom, and when."""
+    """Configuration of the simulated communication graph."""
 
-    topology: str = parameter("complete", "communication graph", choices=TOPOLOGIES)
+    topology: str = parameter(
+        "complete",
+        "communication graph: complete, ring, line, star, grid, nearest (neighbours), range (radio range), random"
+        " (Erdos-Renyi) or edges (edge list)",
+        choices=TOPOLOGIES,
+    )
     edges: tuple[tuple[str, str, float | None], ...] = field(default=())
     one_way: tuple[tuple[str, str], ...] = field(default=())
     schedule: tuple[ScheduleEntry, ...] = field(default=())
-    num_nearest: int = parameter(2, "topology nearest: links to so many nearest robots", minimum=1)
-    radio_range: float = parameter(30.0, "topology range: robots nearer than this get a link [m]", above=0.0)
+    num_nearest: int = parameter(2, "topology nearest: number of nearest robots that a robot has links to", minimum=1)
+    radio_range: float = parameter(30.0, "topology range: distance below which two robots get a link [m]", above=0.0)
     range_hysteresis: float = parameter(
-        3.0, "topology range: a link breaks this much beyond radio_range [m]", minimum=0.0
+        3.0, "topology range: additional distance at which a link breaks [m]", minimum=0.0
     )
-    prob_link: float = parameter(
-        0.5, "topology random: probability of each link (Erdos-Renyi)", minimum=0.0, maximum=1.0
+    prob_link: float = parameter(0.5, "topology random: probability of each link", minimum=0.0, maximum=1.0)
+    network_seed: int = parameter(0, "seed of the random graph, packet losses, corruption and jitter", minimum=0)
+    weights: str = parameter(
+        "metropolis",
+        "link weights: metropolis, degree (1 / degree), max-degree, or given in the edge list",
+        choices=WEIGHTS,
     )
-    network_seed: int = parameter(0, "seed of the random graph, losses and jitter", minimum=0)
-    weights: str = parameter("metropolis", "weights A_ij of the links", choices=WEIGHTS)
     publish_period: float = parameter(
-        1.0, "every robot publishes its map every so often [s]", above=0.0, maximum=86_400.0
+        1.0, "period between a robot's published maps, the length of a tick [s]", above=0.0, maximum=86_400.0
     )
     after_end: str = parameter(
-        "stay", "after a robot's last scan it stays in the team or leaves", choices=("stay", "leave")
+        "stay", "after its last scan a robot keeps exchanging maps (stay) or not (leave)", choices=("stay", "leave")
     )
 
     def __post_init__(self) -> None:
@@ -86,27 +93,33 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """What happens to a packet on a link (one direction): delay, loss, rate and queue.
+    """Configuration of one direction of a link: delay, loss, rate and queue.
 
     Losses follow Gilbert and Elliott's two states: a packet is lost with ``loss`` in the good state and ``burst_loss``
     in the bad one; before every packet the good state turns bad with ``burst_start`` and the bad one good with
     ``burst_end``. Without ``burst_start`` they are independent (Bernoulli).
     """
 
-    latency: float = parameter(0.0, "mean delay of a packet [s]", minimum=0.0)
-    jitter: float = parameter(0.0, "the delay varies evenly by up to this much both ways [s]", minimum=0.0)
-    loss: float = parameter(0.0, "probability that a packet is lost (in the good state)", minimum=0.0, maximum=1.0)
+    latency: float = parameter(0.0, "mean packet delay [s]", minimum=0.0)
+    jitter: float = parameter(
+        0.0, "largest deviation from the mean packet delay, uniformly distributed [s]", minimum=0.0
+    )
+    loss: float = parameter(0.0, "probability that a packet is lost, outside bursts", minimum=0.0, maximum=1.0)
     burst_start: float = parameter(
-        0.0, "probability that a burst of losses starts with a packet (Gilbert-Elliott)", minimum=0.0, maximum=1.0
+        0.0, "probability per packet that a burst of losses starts (Gilbert-Elliott model)", minimum=0.0, maximum=1.0
     )
-    burst_end: float = parameter(0.5, "probability that a burst ends with a packet", above=0.0, maximum=1.0)
-    burst_loss: float = parameter(1.0, "probability that a packet is lost in a burst", minimum=0.0, maximum=1.0)
-    corruption: float = parameter(0.0, "probability that a packet arrives damaged", minimum=0.0, maximum=1.0)
-    rate: float | None = parameter(None, "what a link carries [bytes/s] (default: no limit)", above=0.0)
+    burst_end: float = parameter(0.5, "probability per packet that a burst ends", above=0.0, maximum=1.0)
+    burst_loss: float = parameter(1.0, "probability that a packet is lost within a burst", minimum=0.0, maximum=1.0)
+    corruption: float = parameter(
+        0.0, "probability that a packet arrives damaged and is dropped", minimum=0.0, maximum=1.0
+    )
+    rate: float | None = parameter(None, "link capacity [bytes/s] (default: no limit)", above=0.0)
     queue: str = parameter(
-        "newest", "a busy link keeps the newest packet waiting, or all that fit", choices=("newest", "drop-tail")
+        "newest",
+        "packets waiting for a busy link: the newest, or all that fit into queue_bytes (drop-tail)",
+        choices=("newest", "drop-tail"),
     )
-    queue_bytes: int = parameter(1_000_000, "what fits in the queue of a link, for drop-tail [bytes]", minimum=1)
+    queue_bytes: int = parameter(1_000_000, "queue drop-tail: capacity of a link's queue [bytes]", minimum=1)
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -115,18 +128,18 @@ class LinkConfig:
 
     @property
     def is_random(self) -> bool:
-        """True where chance decides what becomes of a packet."""
+        """True where delay, loss or damage is random."""
         return any((self.jitter, self.loss, self.burst_start, self.corruption))
 
     @property
     def mean_loss(self) -> float:
-        """Share of the packets that do not arrive whole, over a long time and without rate limit."""
+        """Long-term share of the packets that are lost or damaged, without a rate limit."""
         in_burst = self.burst_start / (self.burst_start + self.burst_end)
         return (1.0 - in_burst) * self._missing(self.loss) + in_burst * self._missing(self.burst_loss)
 
     @property
     def repeated_loss(self) -> float:
-        """The factor by which one more packet lost in a row is rarer than one less, in long rows.
+        """Ratio of the probabilities of n + 1 and of n lost packets in a row, for large n.
 
         The largest eigenvalue of the two states' transitions, each times the loss in the state that it leads to.
         """
@@ -138,5 +151,5 @@ class LinkConfig:
         return (stay_good + stay_bad + math.sqrt((stay_good - stay_bad) ** 2 + 4.0 * change)) / 2.0
 
     def _missing(self, loss: float) -> float:
-        """Share of the packets that are lost or damaged."""
+        """Share of lost or damaged packets, with the loss of one state."""
         return 1.0 - (1.0 - loss) * (1.0 - self.corruption)

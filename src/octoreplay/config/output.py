@@ -9,12 +9,16 @@ from octoreplay.config.fields import check_ranges, parameter
 
 @dataclass(frozen=True)
 class OutputConfig:
-    """What the result holds."""
+    """Configuration of the result's contents."""
 
-    state_every: float = parameter(5.0, "each robot's map is stored every so often and at the end [s]", above=0.0)
-    view_every: float = parameter(10.0, "fused maps for viewing, every so often and at the end [s]", above=0.0)
-    keep_packets: bool = parameter(False, "store the radio packets themselves")
-    hash: bool = parameter(False, "fingerprint inputs by a SHA-256 of the whole file")
+    state_every: float = parameter(
+        5.0, "period between stored maps of each robot; the last map is stored too [s]", above=0.0
+    )
+    view_every: float = parameter(
+        10.0, "period between stored fused maps for viewers; the last one is stored too [s]", above=0.0
+    )
+    keep_packets: bool = parameter(False, "store the exchanged packets")
+    hash: bool = parameter(False, "identify input files by the SHA-256 of the whole file instead of samples")
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -10,23 +10,41 @@ from octoreplay.errors import ConfigError
 
 @dataclass(frozen=True)
 class PacketConfig:
-    """What robots send: whole maps or changes, how exactly, and how much of it."""
+    """Configuration of packets: full maps or deltas, number format and budget."""
 
-    packets: str = parameter("full", "whole maps, or what the receiver does not have yet", choices=("full", "delta"))
-    acknowledge: bool = parameter(True, "receivers of deltas acknowledge what they have")
-    key_frame_every: int = parameter(10, "deltas without acknowledgement: every so many packets a whole map", minimum=1)
-    content: str = parameter("float32", "numbers in packets", choices=("float32", "float16", "int8"))
-    int8_step: float = parameter(0.05, "log-odds of one step of int8", minimum=1e-6, maximum=1e6)
-    top_classes: int | None = parameter(
-        None, "only so many of a cell's classes are sent, one value for the others (default: all)", minimum=1
+    packets: str = parameter(
+        "full", "packets hold the full map, or the delta to what the receiver has", choices=("full", "delta")
     )
-    packet_compression: str = parameter("zstd", "compression of the packets", choices=("zstd", "none"))
-    zstd_level: int = parameter(1, "zstd's level: higher is smaller and slower", minimum=1, maximum=22)
+    acknowledge: bool = parameter(True, "packets delta: receivers acknowledge packets")
+    key_frame_every: int = parameter(
+        10, "packets delta without acknowledgements: every n-th packet holds the full map", minimum=1
+    )
+    content: str = parameter(
+        "float32",
+        "number format in packets: float32 (lossless), float16 or int8",
+        choices=("float32", "float16", "int8"),
+    )
+    int8_step: float = parameter(0.05, "content int8: quantisation step [log-odds]", minimum=1e-6, maximum=1e6)
+    top_classes: int | None = parameter(
+        None,
+        "number of most probable classes sent per cell; the others share one value (default: all classes)",
+        minimum=1,
+    )
+    packet_compression: str = parameter("zstd", "packet compression: zstd or none", choices=("zstd", "none"))
+    zstd_level: int = parameter(1, "zstd compression level; higher is smaller and slower", minimum=1, maximum=22)
     budget: int | None = parameter(
-        None, "most bytes of a packet to one receiver; what changes most goes first (default: no limit)", minimum=256
+        None,
+        "packets delta: maximum packet size; the largest changes are sent first [bytes] (default: no limit)",
+        minimum=256,
     )
     cast: str = parameter(
-        "unicast", "one packet for each receiver, or one for all of them", choices=("unicast", "broadcast")
+        "unicast",
+        "one packet for each receiver (unicast), or one for all (broadcast)",
+        choices=("unicast", "broadcast"),
+    )
+
+    decode_packets: bool = parameter(
+        False, "receivers decode every packet instead of sharing the sender's map: slower, with the same maps"
     )
 
     def __post_init__(self) -> None:
@@ -38,5 +56,5 @@ class PacketConfig:
 
     @property
     def is_exact(self) -> bool:
-        """True when receivers have just what was published."""
+        """True when packets hold the map's values unchanged."""
         return self.content == "float32" and self.top_classes is None and self.budget is None

@@ -20,7 +20,7 @@ from octoreplay.errors import ConfigError, suggestion
 
 @dataclass(frozen=True)
 class Parameter:
-    """One flat parameter: its name, section, type and what its help says."""
+    """One flat parameter: name, section, type, default, help text and choices."""
 
     name: str
     section: str
@@ -30,7 +30,7 @@ class Parameter:
     choices: tuple[str, ...] | None
 
     def coerce(self, value: Any) -> Any:
-        """The value in the parameter's type. Raises ConfigError where it has another."""
+        """Value in the parameter's type. Raises ConfigError for another type."""
         try:
             return self._coerce(value)
         except (TypeError, ValueError):
@@ -82,7 +82,7 @@ SECTIONS: Mapping[str, Section] = MappingProxyType(
 
 
 def _parameters() -> Iterator[Parameter]:
-    """All flat parameters, in the order of the sections and their fields."""
+    """Flat parameters in the order of the sections and their fields."""
     kinds = {"float": "float", "float | None": "float", "int": "int", "int | None": "int", "bool": "bool",
              "str": "str", "tuple[float, ...]": "floats"}  # fmt: skip
     for name, section in SECTIONS.items():
@@ -99,7 +99,7 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: paramete
 
 
 def coerced(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Flat parameters in their types, by section. Raises ConfigError for an unknown name and a wrong type."""
+    """Values of flat parameters in their types, by section. Raises ConfigError for an unknown name or a wrong type."""
     changes: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         parameter = PARAMETERS.get(name)

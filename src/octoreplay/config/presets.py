@@ -1,4 +1,4 @@
-"""Presets and parameters on top of a configuration: what counts, from weak to strong, is in docs/cli.md."""
+"""Presets, and the precedence of command line, preset and team file (docs/cli.md)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         )
     }
 )  # fmt: skip
-"""Named sets of parameters. 'paper' is the literal reading of the paper."""
+"""Sets of parameters by name. 'paper' follows the paper's text literally."""
 
 
 def with_options(base: RunConfig, preset: str | None, edges: str | None, given: Mapping[str, Any]) -> RunConfig:
-    """The configuration with preset and options: an option beats the preset, which beats the file."""
+    """Return the configuration with a preset and options applied; precedence: options, preset, base.
+
+    ``edges`` is the text of the option ``--edges``. Raises ConfigError for an invalid value.
+    """
     parameters = {**(PRESETS[preset] if preset is not None else {}), **given}
     network: dict[str, Any] = {name: parameters.pop(name) for name in ("topology", "weights") if name in parameters}
     config = base.with_parameters(parameters)
@@ -33,7 +36,7 @@ def with_options(base: RunConfig, preset: str | None, edges: str | None, given: 
         weighted = any(weight is not None for *_, weight in links)
         network = {"topology": "edges", "weights": "given" if weighted else "metropolis", **network, "edges": links}
     elif network.get("topology", "edges") != "edges":
-        # A topology by name replaces the file's list of edges, and with it the weights given there.
+        # A topology of another kind replaces the file's list of edges and the weights in it.
         network["edges"] = ()
         if base.network.weights == "given":
             network.setdefault("weights", "metropolis")
@@ -41,7 +44,7 @@ def with_options(base: RunConfig, preset: str | None, edges: str | None, given: 
 
 
 def _links(text: str) -> tuple[tuple[str, str, float | None], ...]:
-    """Edges from A:B[:W],C:D[:W],..."""
+    """Edges of a text A:B[:W],C:D[:W],..."""
     links = []
     for entry in text.split(","):
         ends = entry.strip().split(":")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 from octoreplay.config.fields import LARGEST, help_text
 from octoreplay.errors import ConfigError
@@ -15,79 +16,97 @@ from octoreplay.records import CENTRAL
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """One robot: its log files, topics, clock and frames. Topics and frames that are None are found in the log.
+    """Configuration of one robot: log files, topics, clock and frames.
 
-    ``depth_topic``, ``label_topic`` and ``confidence_topic`` are images; ``cloud_topic`` is a point cloud or a laser
-    scan, with its labels in ``label_field`` and how sure they are in ``confidence_field``. ``pose_file`` takes the
-    place of a pose topic: a trajectory in TUM's or KITTI's format, the latter with ``pose_times``, a time in each line,
-    or else with a pose for every message of the sensor.
-    ``intrinsics`` is (fx, fy, cx, cy) in pixels in place of CameraInfo; ``rectified`` says whether CameraInfo's P
-    holds (None: where the topic's name says 'rect') or K and the distortion. Transforms are (x, y, z, qx, qy, qz, qw):
-    ``T_team_map`` from the robot's map frame to the team's, ``T_body_sensor`` from the sensor's frame to the frame
-    whose pose the pose topic gives, in place of TF. ``body_box`` is (xmin, ymin, zmin, xmax, ymax, zmax) of the robot
-    itself [m] in ``body_frame``, the frame whose pose the pose topic gives unless named: what the sensor sees in it is
-    left out. ``clock_offset`` [s] is added to the robot's stamps. The robot publishes every ``publish_period`` [s], the
-    team's unless given, ``publish_phase`` [s] after the ticks that are multiples of it.
+    Topics and frames that are None are found in the logs. Raises ConfigError for values that are out of range or do not
+    fit together.
+
+    Attributes
+    ----------
+    robot_id : str
+        Name of the robot in the team.
+    logs : tuple of Path
+        Log files or folders.
+    depth_topic, label_topic, confidence_topic : str or None
+        Image topics.
+    cloud_topic : str or None
+        Topic of point clouds or laser scans, with labels in ``label_field`` and confidences in ``confidence_field``.
+    pose_topic, pose_file, pose_times : str or Path or None
+        Pose source: a topic, or a trajectory file in TUM or KITTI format. A KITTI file goes with ``pose_times``, the
+        time of each line, or has one pose per message of the sensor.
+    intrinsics : tuple of 4 float or None
+        (fx, fy, cx, cy) [pixels], instead of CameraInfo.
+    rectified : bool or None
+        True: CameraInfo's P holds. False: K and the distortion hold. None: P where the topic's name contains 'rect'.
+    T_team_map, T_body_sensor : tuple of 7 float
+        Transforms (x, y, z, qx, qy, qz, qw) [m]: from the robot's map frame to the team's frame, and from the sensor's
+        frame to the frame of the poses (None: from TF).
+    body_box : tuple of 6 float or None
+        (xmin, ymin, zmin, xmax, ymax, zmax) of the robot's body [m] in ``body_frame``, by default the frame of the
+        poses. Points inside are left out.
+    clock_offset : float
+        Seconds that are added to the robot's stamps.
+    publish_period, publish_phase : float
+        The robot publishes ``publish_phase`` seconds after the multiples of ``publish_period`` (None: the team's).
     """
 
     robot_id: str
     logs: tuple[Path, ...]
-    depth_topic: str | None = field(default=None, metadata=help_text("depth images, raw or compressed"))
+    depth_topic: str | None = field(default=None, metadata=help_text("topic of the depth images, raw or compressed"))
     label_topic: str | None = field(
-        default=None, metadata=help_text("label images, ids or colours; '' to map without labels")
+        default=None, metadata=help_text("topic of the label images, ids or colours; '' to map without labels")
     )
-    confidence_topic: str | None = field(default=None, metadata=help_text("images that say how sure the labels are"))
-    camera_info_topic: str | None = field(default=None, metadata=help_text("CameraInfo of the depth images"))
+    confidence_topic: str | None = field(
+        default=None, metadata=help_text("topic of the images with the labels' confidences")
+    )
+    camera_info_topic: str | None = field(default=None, metadata=help_text("topic of the depth images' CameraInfo"))
     cloud_topic: str | None = field(
-        default=None, metadata=help_text("point clouds or laser scans, in place of depth_topic")
+        default=None, metadata=help_text("topic of point clouds or laser scans, instead of depth_topic")
     )
-    label_field: str | None = field(
-        default=None, metadata=help_text("field of the points that holds their labels, such as rgb")
+    label_field: str | None = field(default=None, metadata=help_text("point field with the labels, such as rgb"))
+    confidence_field: str | None = field(default=None, metadata=help_text("point field with the labels' confidences"))
+    pose_topic: str | None = field(
+        default=None, metadata=help_text("topic of the poses: odometry, stamped poses, a path or TF")
     )
-    confidence_field: str | None = field(
-        default=None, metadata=help_text("field of the points that says how sure the labels are")
-    )
-    pose_topic: str | None = field(default=None, metadata=help_text("odometry, stamped poses, a path or TF"))
     pose_file: Path | None = field(
-        default=None, metadata=help_text("a trajectory in place of pose_topic: TUM or KITTI format")
+        default=None, metadata=help_text("trajectory file in TUM or KITTI format, instead of pose_topic")
     )
     pose_times: Path | None = field(
-        default=None, metadata=help_text("times of a KITTI trajectory, one in each line [s]")
+        default=None, metadata=help_text("file with the times of a KITTI trajectory, one a line [s]")
     )
-    label_info_topic: str | None = field(default=None, metadata=help_text("LabelInfo that names the labels"))
-    map_frame: str | None = field(default=None, metadata=help_text("the frame that the poses are in"))
+    label_info_topic: str | None = field(
+        default=None, metadata=help_text("topic of the LabelInfo with the classes' names")
+    )
+    map_frame: str | None = field(default=None, metadata=help_text("reference frame of the poses"))
     sensor_frame: str | None = field(
-        default=None, metadata=help_text("the sensor's frame, if not the one that its messages name")
+        default=None, metadata=help_text("frame of the sensor (default: frame_id of its messages)")
     )
     intrinsics: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("[fx, fy, cx, cy] in place of CameraInfo [pixels]")
+        default=None, metadata=help_text("[fx, fy, cx, cy], instead of CameraInfo [pixels]")
     )
     rectified: bool | None = field(
-        default=None, metadata=help_text("true: CameraInfo's P holds; false: K and the distortion")
+        default=None, metadata=help_text("true: use CameraInfo's P; false: use K and the distortion")
     )
     depth_unit: float | None = field(
-        default=None, metadata=help_text("metres per depth value, in place of the encoding's")
+        default=None, metadata=help_text("metres per depth value (default: that of the encoding)")
     )
-    clock_offset: float = field(default=0.0, metadata=help_text("added to this robot's stamps [s]"))
+    clock_offset: float = field(default=0.0, metadata=help_text("offset added to the robot's stamps [s]"))
     T_team_map: tuple[float, ...] = field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        metadata=help_text("its map frame in the team's: x y z [m], quaternion x y z w"),
+        metadata=help_text("transform from map_frame to the team's frame: x y z [m], quaternion x y z w"),
     )
     T_body_sensor: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("the sensor in the frame that the poses are of, in place of TF")
+        default=None,
+        metadata=help_text("transform from the sensor to the frame that the poses describe, instead of TF"),
     )
     body_frame: str | None = field(
-        default=None, metadata=help_text("the frame of body_box, if not the one that the poses are of")
+        default=None, metadata=help_text("frame of body_box (default: the frame that the poses describe)")
     )
     body_box: tuple[float, ...] | None = field(
-        default=None, metadata=help_text("the robot itself: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
+        default=None, metadata=help_text("box around the robot: XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX [m]")
     )
-    publish_period: float | None = field(
-        default=None, metadata=help_text("publishes its map every so often, in place of the team's [s]")
-    )
-    publish_phase: float = field(
-        default=0.0, metadata=help_text("and so much after the ticks that are multiples of it [s]")
-    )
+    publish_period: float | None = field(default=None, metadata=help_text("the robot's own publish_period [s]"))
+    publish_phase: float = field(default=0.0, metadata=help_text("delay after the multiples of publish_period [s]"))
 
     def __post_init__(self) -> None:
         if not self.robot_id or "/" in self.robot_id:
@@ -98,7 +117,7 @@ class RobotConfig:
             raise ConfigError(f"robot '{self.robot_id}': {problem}")
 
     def _wrong_sources(self) -> Iterator[str]:
-        """What does not go together in the files and topics."""
+        """Problems of files and topics."""
         if not self.logs:
             yield "needs a log"
         if self.depth_topic and self.cloud_topic:
@@ -109,7 +128,7 @@ class RobotConfig:
             yield "pose_times goes with pose_file"
 
     def _wrong_geometry(self) -> Iterator[str]:
-        """What is no transform, no camera or no box."""
+        """Problems of transforms, intrinsics and the body box."""
         for name in ("T_team_map", "T_body_sensor"):
             value = getattr(self, name)
             if value is not None and len(value) != 7:
@@ -123,7 +142,7 @@ class RobotConfig:
             yield "body_box expects 6 numbers XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX, every minimum below its maximum"
 
     def _wrong_numbers(self) -> Iterator[str]:
-        """What is out of range."""
+        """Problems of numbers."""
         if self.depth_unit is not None and self.depth_unit <= 0:
             yield "depth_unit must be greater than 0"
         if self.publish_period is not None and not 0 < self.publish_period < math.inf:
@@ -140,10 +159,10 @@ class RobotConfig:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files and folders that the robot's data come from."""
+        """All files and folders with the robot's data."""
         return (*self.logs, *(path for path in (self.pose_file, self.pose_times) if path is not None))
 
-    def with_absolute_paths(self) -> RobotConfig:
+    def with_absolute_paths(self) -> Self:
         """This robot with paths that hold from everywhere."""
         logs = tuple(log.resolve() for log in self.logs)
         pose_file, pose_times = (None if path is None else path.resolve() for path in (self.pose_file, self.pose_times))

@@ -1,5 +1,104 @@
-"""Consensus rules and their traits."""
+"""Consensus rules and their traits.
+
+This table is the only place that knows what distinguishes one rule from another. Other modules read the traits and
+never compare names. The class that runs a rule is in ``replay/robots/team.py``.
+"""
 
 from __future__ import annotations
 
-RULES = ("gradient", "bayes", "natural", "ratio", "flood", "merge", "local")
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+
+class Exchanged(enum.Enum):
+    """Content of the packets that a robot publishes."""
+
+    NOTHING = "nothing"
+    MAP = "the robot's map h_i"
+    EVIDENCE = "the evidence of every robot, by origin"
+    RUNNING_SUMS = "running sums of shares"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """Traits of one consensus rule.
+
+    Attributes
+    ----------
+    name : str
+        Name in team files, on the command line and in results.
+    exchanges : Exchanged
+        Content of the packets.
+    has_step_size : bool
+        True where the rule mixes maps with the step size epsilon, which the graph bounds.
+    has_gamma : bool
+        True where a gradient step of size gamma_k follows the mixing; gamma ramps to 0 while the team settles.
+    mixes_differences : bool
+        True where neighbours' maps enter as differences h_j - h_i, False where they are added whole.
+    needs_symmetric_links : bool
+        True where the team's sum is kept only if both ends of a link exchange maps in every tick.
+    keeps_last_evidence : bool
+        True where an iteration adds the change of the evidence since the last iteration.
+    survives_losses : bool
+        True where the maps end exact although packets are lost or late.
+    survives_restarts : bool
+        True where the maps end exact although robots lose their memory.
+    modes : tuple of str
+        Modes of iteration that the rule supports.
+    packets : tuple of str
+        Packet kinds that the rule can send; the first is its default.
+    needs_exact_packets : bool
+        True where receivers need exactly the published values.
+    warning : str
+        Sentence that every run with this rule reports; '' for none.
+    """
+
+    name: str
+    exchanges: Exchanged
+    has_step_size: bool = False
+    has_gamma: bool = False
+    mixes_differences: bool = True
+    needs_symmetric_links: bool = False
+    keeps_last_evidence: bool = False
+    survives_losses: bool = False
+    survives_restarts: bool = False
+    modes: tuple[str, ...] = ("sync", "on-arrival")
+    packets: tuple[str, ...] = ("full", "delta")
+    needs_exact_packets: bool = False
+    warning: str = ""
+
+
+_RULES = (
+    Rule(name="gradient", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True),
+    Rule(
+        name="bayes",
+        exchanges=Exchanged.MAP,
+        has_step_size=True,
+        needs_symmetric_links=True,
+        keeps_last_evidence=True,
+    ),
+    Rule(name="natural", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True),
+    Rule(
+        name="ratio",
+        exchanges=Exchanged.RUNNING_SUMS,
+        keeps_last_evidence=True,
+        survives_losses=True,
+        modes=("sync",),
+        packets=("full",),
+        needs_exact_packets=True,
+    ),
+    Rule(name="flood", exchanges=Exchanged.EVIDENCE, survives_losses=True, survives_restarts=True, modes=("sync",)),
+    Rule(
+        name="merge",
+        exchanges=Exchanged.MAP,
+        mixes_differences=False,
+        keeps_last_evidence=True,
+        warning="rule 'merge' counts received evidence again in every tick; it is a baseline, not a map to trust",
+    ),
+    Rule(name="local", exchanges=Exchanged.NOTHING),
+)
+
+RULES: Mapping[str, Rule] = MappingProxyType({rule.name: rule for rule in _RULES})
+"""Every rule by name, in the order of help texts and tables."""

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.consensus import ConsensusConfig
@@ -26,11 +26,20 @@ from octoreplay.records import ClassTable
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that a run depends on.
+    """Configuration of a run.
 
-    ``classes`` is None where the logs bring their own class table; ``merge_classes`` and ``ignore_hits`` are what to
-    make of that (``edited``). ``link_overrides`` are (sender, receiver, values): what differs from ``link`` in one
-    direction of a link.
+    Raises ConfigError for values that are out of range or do not fit together.
+
+    Attributes
+    ----------
+    robots : tuple of RobotConfig
+        The team.
+    classes : ClassTable or None
+        Class table; None where the logs contain it.
+    merge_classes, ignore_hits : tuple
+        Classes of the logs' class table to merge, and classes that free their rays and are not mapped.
+    link_overrides : tuple of (sender, receiver, values)
+        Values that differ from ``link`` in one direction of a link.
     """
 
     robots: tuple[RobotConfig, ...]
@@ -50,22 +59,33 @@ class RunConfig:
     def __post_init__(self) -> None:
         if not self.robots:
             raise ConfigError("robots: a team needs at least one robot")
-        seen: set[str] = set()
-        for robot in self.robots:
-            if robot.robot_id in seen:
-                raise ConfigError(f"robots: '{robot.robot_id}' is listed twice")
-            seen.add(robot.robot_id)
+        ids = [robot.robot_id for robot in self.robots]
+        for robot_id in ids:
+            if ids.count(robot_id) > 1:
+                raise ConfigError(f"robots: '{robot_id}' is listed twice")
+        self._check_edges(ids)
+        for key, robot_id in _named_robots(self):
+            if robot_id not in ids:
+                raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(ids))}")
+        self._check_link_overrides()
+        self._check_publish_times()
+        if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
+            raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
+        _check_rule(self)
+
+    def _check_edges(self, ids: Sequence[str]) -> None:
+        """Raise ConfigError for an edge with an unknown robot, to itself, or with an invalid weight."""
         for sender, receiver, weight in self.network.edges:
             for robot_id in (sender, receiver):
-                if robot_id not in seen:
-                    raise ConfigError(f"edges: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+                if robot_id not in ids:
+                    raise ConfigError(f"edges: robot '{robot_id}' is not in the team: {', '.join(sorted(ids))}")
             if sender == receiver:
                 raise ConfigError(f"edges: '{sender}' cannot have a link to itself")
             if weight is not None and not 0 <= weight < math.inf:
-                raise ConfigError(f"edges: the weight of {sender} - {receiver} must be a finite number from 0 on")
-        for key, robot_id in _named_robots(self):
-            if robot_id not in seen:
-                raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(seen))}")
+                raise ConfigError(f"edges: the weight of {sender} - {receiver} must be finite and at least 0")
+
+    def _check_link_overrides(self) -> None:
+        """Raise ConfigError for a link to itself, and for values that do not fit together."""
         for sender, receiver, _ in self.link_overrides:
             if sender == receiver:
                 raise ConfigError(f"links: '{sender}' cannot have a link to itself")
@@ -73,6 +93,9 @@ class RunConfig:
                 self.link_config(sender, receiver)
             except ConfigError as error:
                 raise ConfigError(f"links: {sender} -> {receiver}: {error}") from error
+
+    def _check_publish_times(self) -> None:
+        """Raise ConfigError where a robot's period or phase is not a multiple of the team's period."""
         for robot in self.robots:
             for name, value in (("publish_period", robot.publish_period), ("publish_phase", robot.publish_phase)):
                 ticks = (value or 0.0) / self.network.publish_period
@@ -81,17 +104,14 @@ class RunConfig:
                         f"robot '{robot.robot_id}': {name} {value:g} s is not a multiple of the team's publish_period"
                         f" {self.network.publish_period:g} s, the length of a tick"
                     )
-        if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
-            raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
-        _check_rule(self)
 
     def link_config(self, sender: str, receiver: str) -> LinkConfig:
-        """What happens to a packet from one robot to another."""
+        """Link configuration from one robot to another."""
         values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
         return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
 
-    def with_parameters(self, values: Mapping[str, Any]) -> RunConfig:
-        """This configuration with flat parameters replaced.
+    def with_parameters(self, values: Mapping[str, Any]) -> Self:
+        """Return the configuration with flat parameters replaced.
 
         Raises ConfigError for a name that is no parameter, a value of the wrong type or one out of range.
         """
@@ -101,7 +121,7 @@ class RunConfig:
 
 
 def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
-    """Every robot that the network's parameters name, with the parameter; edges are checked with their weights."""
+    """Pairs (parameter, robot) of the robots that the network's parameters name, except in edges."""
     for pair in config.network.one_way:
         yield from (("one_way", robot_id) for robot_id in pair)
     for entry in config.network.schedule:
@@ -112,14 +132,16 @@ def _named_robots(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 
 def _check_rule(config: RunConfig) -> None:
-    """Refuse what a rule cannot do."""
-    rule, packet = config.consensus.rule, config.packet
-    if rule in ("ratio", "flood") and config.consensus.mode != "sync":
-        raise ConfigError(f"mode: rule '{rule}' adds up what arrived once in a tick; use mode 'sync'")
-    if rule == "ratio":
-        is_exact = packet.is_exact and config.map.prune_tolerance == 0
-        if not is_exact or packet.packets != "full":
-            raise ConfigError(
-                "rule: 'ratio' sends running sums, all of which change in every tick and must be exact; use packets"
-                " 'full', content 'float32' and prune_tolerance 0, without budget and top_classes"
-            )
+    """Raise ConfigError where the rule does not support the mode or the packets."""
+    rule, packet = config.consensus.traits, config.packet
+    if config.consensus.mode not in rule.modes:
+        raise ConfigError(
+            f"mode: rule '{rule.name}' does not support '{config.consensus.mode}';"
+            f" use {' or '.join(map(repr, rule.modes))}"
+        )
+    is_exact = packet.is_exact and config.map.prune_tolerance == 0
+    if packet.packets not in rule.packets or (rule.needs_exact_packets and not is_exact):
+        raise ConfigError(
+            f"rule: '{rule.name}' sends {rule.exchanges.value}, which receivers need whole and exact; use packets"
+            f" '{rule.packets[0]}', content 'float32' and prune_tolerance 0, without budget and top_classes"
+        )

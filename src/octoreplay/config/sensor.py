@@ -11,20 +11,24 @@ from octoreplay.errors import ConfigError
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """The inverse sensor model: log-odds increments, clamping and ranges."""
+    """Configuration of the inverse sensor model: log-odds increments, clamping and ranges."""
 
-    hit: float = parameter(1.0, "log-odds added to a hit cell's class (psi)", above=0.0)
-    miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray passes (phi)", maximum=0.0)
-    hit_other: float | None = parameter(None, "log-odds added to a hit cell's other classes (default: miss)")
-    clamp_min: float = parameter(-5.0, "least log-odds of a class", maximum=0.0)
-    clamp_max: float = parameter(5.0, "largest log-odds of a class", minimum=0.0)
-    min_range: float = parameter(0.0, "points nearer than this carry no information [m]", minimum=0.0)
-    max_range: float = parameter(10.0, "rays are cut here [m]", above=0.0)
-    rays: str = parameter("cells", "one ray per distinct end cell, or per measured point", choices=("cells", "all"))
-    hide_robots: bool = parameter(False, "points in another robot's body_box free their ray and hit nothing")
-    invalid_depth: tuple[float, ...] = parameter((), "raw depth values that carry no information")
+    hit: float = parameter(1.0, "log-odds added to the observed class of the cell where a ray ends (psi)", above=0.0)
+    miss: float = parameter(-0.3, "log-odds added to all classes of a cell that a ray crosses (phi)", maximum=0.0)
+    hit_other: float | None = parameter(
+        None, "log-odds added to the other classes of the cell where a ray ends (default: miss)"
+    )
+    clamp_min: float = parameter(-5.0, "lower limit of a class's log-odds", maximum=0.0)
+    clamp_max: float = parameter(5.0, "upper limit of a class's log-odds", minimum=0.0)
+    min_range: float = parameter(0.0, "minimum range of a measured point; nearer points are ignored [m]", minimum=0.0)
+    max_range: float = parameter(10.0, "maximum length of a ray; farther points only mark free space [m]", above=0.0)
+    rays: str = parameter(
+        "cells", "one ray for each end cell (cells) or for each measured point (all)", choices=("cells", "all")
+    )
+    hide_robots: bool = parameter(False, "treat points inside another robot's body_box as free space")
+    invalid_depth: tuple[float, ...] = parameter((), "raw depth values to ignore")
     no_return_depth: tuple[float, ...] = parameter(
-        (), "raw depth values that mean 'no return' and free their ray up to max_range"
+        (), "raw depth values that mean 'no return': free space up to max_range"
     )
 
     def __post_init__(self) -> None:
@@ -36,23 +40,25 @@ class SensorConfig:
 
     @property
     def clamp(self) -> tuple[float, float]:
-        """The least and the largest log-odds of a class."""
+        """Smallest and largest log-odds of a class."""
         return self.clamp_min, self.clamp_max
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """The map's geometry and prior."""
+    """Configuration of the map: geometry, prior and pruning."""
 
-    resolution: float = parameter(0.2, "edge of the finest leaf [m]", above=0.0)
+    resolution: float = parameter(0.2, "edge length of the finest cell [m]", above=0.0)
     bounds: tuple[float, ...] = parameter(
-        (), "mapped region: ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m]"
+        (), "mapped region, ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m] (default: no limit)"
     )
     prob_free: float | None = parameter(
-        None, "prior probability of free space (default: uniform over all classes)", above=0.0, maximum=0.999999
+        None, "prior probability of free space (default: the same as of every class)", above=0.0, maximum=0.999999
     )
     prune_tolerance: float = parameter(
-        0.0, "siblings whose log-odds differ by at most this are one leaf when published (0: lossless)", minimum=0.0
+        0.0,
+        "largest log-odds difference between siblings that published maps merge into one leaf (0: lossless)",
+        minimum=0.0,
     )
 
     def __post_init__(self) -> None:
@@ -67,7 +73,7 @@ class MapConfig:
 
     @property
     def box(self) -> tuple[float, float, float, float, float, float]:
-        """The mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres; infinite where it is not limited."""
+        """Mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres in the team's frame; infinite without bounds."""
         infinity = math.inf
         if len(self.bounds) == 2:
             return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
@@ -76,7 +82,7 @@ class MapConfig:
         return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
 
     def prior(self, num_classes: int) -> float:
-        """h_0: the log-odds of each occupied class in an unobserved cell."""
+        """h_0, the log-odds of each occupied class in an unobserved cell."""
         if self.prob_free is None:
             return 0.0
         return math.log((1.0 - self.prob_free) / num_classes / self.prob_free)

@@ -1,13 +1,10 @@
-"""Team files: the robots of a team, their classes and every parameter of a run, read and written."""
+"""Reading and writing of team files: robots, classes and parameters of a run."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
-import json
-import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,33 +19,36 @@ from octoreplay.errors import ConfigError, suggestion
 
 _ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
 _SCHEDULE_KEYS = {"from": "start", "to": "end", **{f.name: f.name for f in dataclasses.fields(ScheduleEntry)[2:]}}
-_PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_/.-]*")
-_WORDS_OF_YAML = ("true", "false", "null", "yes", "no", "on", "off", "y", "n")
 _LINK_KEYS = tuple(f.name for f in dataclasses.fields(LinkConfig))
 _TEAM_KEYS = ("robots", *CLASSES_KEYS, "edges", "one_way", "schedule", "links")
+"""Keys of a team file that are not parameters."""
 
 
 def load_team_file(path: str | Path) -> RunConfig:
-    """Read a team file. Log paths in it are relative to its folder.
+    """Read a team file. Relative paths in it are relative to its folder.
 
-    Raises ConfigError with the file and the key for anything that is not understood.
+    Raises ConfigError that names the file and the key for an unreadable file, an unknown key or a wrong value.
     """
     path = Path(path)
-    return parse_team(read_text(path, "team"), source=str(path), folder=path.parent)
+    return parse_team(read_text(path, "team"), name=str(path), folder=path.parent)
 
 
-def parse_team(text: str, *, source: str, folder: Path) -> RunConfig:
-    """A configuration from a team file's text; ``source`` names it in errors. Raises ConfigError."""
-    content = load_yaml(text, source)
+def parse_team(text: str, *, name: str, folder: Path) -> RunConfig:
+    """Return the configuration of a team file's text. Relative paths in it are relative to ``folder``.
+
+    Raises ConfigError that starts with ``name``.
+    """
+    content = load_yaml(text, name)
     try:
         return _team_from_mapping(content, folder)
     except ConfigError as error:
-        raise ConfigError(f"{source}: {error}") from error
+        raise ConfigError(f"{name}: {error}") from error
 
 
 def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
+    """Configuration of a team file's content."""
     if not isinstance(content, Mapping):
-        raise ConfigError("a team file is a YAML mapping with the key 'robots'")
+        raise ConfigError("expects a YAML mapping with the key 'robots'")
     if "robots" not in content or not isinstance(content["robots"], list):
         raise ConfigError("robots: expects a list of robots, each with 'id' and 'log'")
     for key in content:
@@ -61,7 +61,7 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
         one_way=_pairs("one_way", content.get("one_way") or ()),
         schedule=schedule(content.get("schedule") or ()),
     )
-    # All at once: what one parameter may be depends on others.
+    # In one call, because the ranges of some parameters depend on others.
     return RunConfig(
         robots=robots,
         **class_settings(content, folder),
@@ -71,6 +71,7 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
 
 
 def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
+    """Configuration of one entry of 'robots'."""
     if not isinstance(entry, Mapping):
         raise ConfigError("robots: every robot is a mapping with 'id' and 'log'")
     robot_id = str(entry.get("id", ""))
@@ -133,16 +134,13 @@ def load_schedule(path: str | Path) -> tuple[ScheduleEntry, ...]:
 
 
 def schedule(entries: Any) -> tuple[ScheduleEntry, ...]:
-    """A schedule from the list that a file holds: mappings with from, to and what is up or down.
-
-    Raises ConfigError for an unknown key or a wrong type.
-    """
+    """Return the schedule of a file's list of entries. Raises ConfigError for an unknown key or a wrong type."""
     if not isinstance(entries, list | tuple):
-        raise ConfigError("schedule: expects a list of entries, each with 'from' and what is up or down")
+        raise ConfigError("schedule: expects a list of entries, each with 'from' and the robots or links affected")
     found = []
     for entry in entries:
         if not isinstance(entry, Mapping) or "from" not in entry:
-            raise ConfigError("schedule: every entry is a mapping with 'from' [s] and what is up or down")
+            raise ConfigError("schedule: every entry is a mapping with 'from' [s] and the robots or links affected")
         values: dict[str, Any] = {}
         for key, value in entry.items():
             if key not in _SCHEDULE_KEYS:
@@ -171,14 +169,14 @@ def schedule(entries: Any) -> tuple[ScheduleEntry, ...]:
 
 
 def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...]:
-    """Links that differ, from mappings with 'from' and 'to', or 'between' for both directions, and link parameters."""
+    """Link overrides (sender, receiver, values) from mappings; 'between' stands for both directions."""
     if not isinstance(entries, list | tuple):
-        raise ConfigError("links: expects a list of links, each with 'from' and 'to' or 'between', and what differs")
+        raise ConfigError("links: expects a list of links, each with 'from' and 'to' or 'between', and link parameters")
     found = []
     for entry in entries:
         named = {"between", "from", "to"}.intersection(entry) if isinstance(entry, Mapping) else set()
         if named not in ({"between"}, {"from", "to"}):
-            raise ConfigError("links: every link names 'from' and 'to', or 'between' two robots for both directions")
+            raise ConfigError("links: every link needs 'from' and 'to', or 'between' for both directions")
         changes = {key: value for key, value in entry.items() if key not in ("between", "from", "to")}
         for key in changes:
             if key not in _LINK_KEYS:
@@ -199,25 +197,25 @@ def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any]
 
 
 def dump_team(config: RunConfig, folder: Path | None = None) -> str:
-    """The team file's text of a configuration: everything that differs from the defaults, and every robot.
+    """Return the text of a team file: the robots, and every parameter that differs from its default.
 
-    Log paths are written relative to ``folder`` where they lie below it. ``parse_team`` gives the same configuration.
+    Log paths below ``folder`` are written relative to it. ``parse_team`` returns the same configuration.
     """
     from ruamel.yaml import YAML
 
     buffer = io.StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
-    # The library knows this attribute as None only.
+    # The library's type annotation allows only None.
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.width = 110
-    yaml.dump(_content(config, folder), buffer)
+    yaml.dump(team_to_mapping(config, folder), buffer)
     return buffer.getvalue()
 
 
-def _content(config: RunConfig, folder: Path | None) -> dict[str, Any]:
-    """What a team file of a configuration holds."""
-    content: dict[str, Any] = {"robots": [_robot_to_mapping(robot, folder) for robot in config.robots]}
+def team_to_mapping(config: RunConfig, folder: Path | None) -> dict[str, Any]:
+    """Return the content of a configuration's team file, by key."""
+    content: dict[str, Any] = {"robots": [robot_to_mapping(robot, folder) for robot in config.robots]}
     if config.classes is not None:
         content["classes"] = [class_to_mapping(item) for item in config.classes.classes]
         if config.classes.ignored_raw_labels:
@@ -244,7 +242,7 @@ def _content(config: RunConfig, folder: Path | None) -> dict[str, Any]:
 
 
 def _entry_to_mapping(entry: ScheduleEntry) -> dict[str, Any]:
-    """One entry of a schedule as a file holds it."""
+    """Content of one schedule entry in a file."""
 
     def plain(value: Any) -> Any:
         return [plain(part) for part in value] if isinstance(value, tuple) else value
@@ -258,8 +256,8 @@ def _entry_to_mapping(entry: ScheduleEntry) -> dict[str, Any]:
     }
 
 
-def _robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
-    """One robot as a team file holds it."""
+def robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
+    """Return the content of one robot's entry in a team file, by key."""
 
     def text(path: Path) -> str:
         return str(path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path)
@@ -275,109 +273,3 @@ def _robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]
         if value != item.default:
             entry[item.name] = list(value) if isinstance(value, tuple) else value
     return entry
-
-
-# --- a file to begin with --------------------------------------------------------------------------------------------
-
-_HEAD = """\
-# A team of robots for octoreplay: octoreplay run TEAM.yaml -o OUT.mcap
-# Lines with a # before their key hold the default, or an example where there is none: take the # away to change it.
-# What everything means is in docs/logs.md, docs/classes.md and docs/communication.md.
-"""
-
-_COMMENT_COLUMN = 56
-
-
-# Keys that are no parameters, by the section that they stand in front of ('': all): an example, and what they say.
-_EXAMPLES: Mapping[str, Mapping[str, tuple[Any, str]]] = {
-    "": {
-        "classes": ("semantickitti", "what labels mean: a list, a file, or a table that octoreplay brings"),
-        "ignored_raw_labels": ([0, 255], "labels that mean nothing"),
-        "ignored_raw_colors": ([[0, 0, 0]], "colours that mean nothing"),
-        "merge_classes": ({"vehicle": ["car", "truck"]}, "new name: the classes that become it"),
-        "ignore_hits": (["person"], "classes that free their rays and are not mapped"),
-    },
-    "network": {
-        "edges": ([["a", "b"], ["b", "c"]], "links of topology edges, with a weight each or without"),
-        "one_way": ([["a", "b"]], "links that carry from the first robot to the second only"),
-        "schedule": ([{"from": 10, "to": 20, "robots_off": ["a"]}], "what is up or down from when to when [s]"),
-    },
-    "link": {"links": ([{"between": ["a", "b"], "loss": 0.2}], "links that differ from the others")},
-}  # fmt: skip
-
-
-def team_template(config: RunConfig, missing: Mapping[str, Sequence[str]], folder: Path | None = None) -> str:
-    """A team file with every key there is: what ``config`` sets, and as comments everything else, with its default.
-
-    ``missing`` are sentences that say what a robot still lacks, by robot_id ('': the team); they become comments too.
-    ``parse_team`` gives ``config``. Log paths are as for ``dump_team``.
-    """
-    content = _content(config, folder)
-    lines = [_HEAD, "robots:"]
-    for robot in config.robots:
-        lines += _robot_lines(robot, missing.get(robot.robot_id, ()), folder)
-    section = ""
-    lines += ["", "# Labels", *_missing_lines(missing.get("", ())), *_example_lines(content, section)]
-    for name, parameter in PARAMETERS.items():
-        if parameter.section != section:
-            section = parameter.section
-            lines += ["", f"# {SECTIONS[section].title}", *_example_lines(content, section)]
-        comment = parameter.help + (f": {', '.join(parameter.choices)}" if parameter.choices else "")
-        value = getattr(getattr(config, section), name)
-        lines.append(_line(name, value, comment, is_set=name in content))
-    return "\n".join(lines) + "\n"
-
-
-def _example_lines(content: Mapping[str, Any], section: str) -> Iterator[str]:
-    """The keys that are no parameters and stand in front of a section."""
-    for key, (example, comment) in _EXAMPLES.get(section, {}).items():
-        yield from _entry_lines(key, content.get(key), example, comment)
-
-
-def _entry_lines(key: str, value: Any, example: Any, comment: str) -> list[str]:
-    """A key that is no parameter: a list one entry a line, or an example behind a #."""
-    if value is None:
-        return [_line(key, example, comment, is_set=False)]
-    if isinstance(value, list) and value and isinstance(value[0], dict | list):
-        return [f"{key}:".ljust(_COMMENT_COLUMN) + f" # {comment}", *(f"  - {_flow(entry)}" for entry in value)]
-    return [_line(key, value, comment, is_set=True)]
-
-
-def _robot_lines(robot: RobotConfig, missing: Sequence[str], folder: Path | None) -> list[str]:
-    """One robot's keys."""
-    entry = _robot_to_mapping(robot, folder)
-    lines = [f"  - id: {_flow(entry['id'])}", f"    log: {_flow(entry['log'])}"]
-    lines += (f"    {line}" for line in _missing_lines(missing))
-    for item in dataclasses.fields(RobotConfig):
-        if item.metadata:
-            value = entry.get(item.name, item.default)
-            lines.append(_line(item.name, value, item.metadata["help"], is_set=item.name in entry, indent=4))
-    return lines
-
-
-def _missing_lines(missing: Sequence[str]) -> Iterator[str]:
-    """Sentences as comments."""
-    for sentence in missing:
-        first, *rest = sentence.splitlines()
-        yield f"# missing: {first}"
-        yield from (f"# {line.strip()}" for line in rest)
-
-
-def _line(name: str, value: Any, comment: str, *, is_set: bool, indent: int = 0) -> str:
-    """One key with its value and what it is for; behind a # where it is not set."""
-    shown = f"{name}:" if value is None else f"{name}: {_flow(value)}"
-    return f"{' ' * indent}{'' if is_set else '# '}{shown}".ljust(_COMMENT_COLUMN) + f" # {comment}"
-
-
-def _flow(value: Any) -> str:
-    """A value in YAML's flow style, on one line."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_flow(part)}" for key, part in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_flow(part) for part in value) + "]"
-    if isinstance(value, float) and not math.isfinite(value):
-        return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
-    if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS_OF_YAML:
-        return value
-    # JSON's strings, numbers and truth values are YAML's too.
-    return json.dumps(value)

@@ -9,24 +9,24 @@ from octoreplay.config.fields import check_ranges, parameter
 
 @dataclass(frozen=True)
 class TimeConfig:
-    """How stamps are read and streams are paired."""
+    """Configuration of the clock, of pairing, and of the part of the logs that is replayed."""
 
-    clock: str = parameter("header", "stamps: the messages' headers or the log's", choices=("header", "log"))
-    reorder_window: float = parameter(1.0, "messages may be this much out of order [s]", minimum=0.0, maximum=1e6)
-    pair_tolerance: float = parameter(0.02, "depth and label may be this far apart [s]", minimum=0.0, maximum=1e6)
-    pose_gap: float = parameter(
-        0.5, "poses further apart than this are not interpolated between [s]", above=0.0, maximum=1e6
+    clock: str = parameter("header", "source of stamps: message header, or log time", choices=("header", "log"))
+    reorder_window: float = parameter(1.0, "largest delay of out-of-order messages [s]", minimum=0.0, maximum=1e6)
+    pair_tolerance: float = parameter(
+        0.02, "largest time difference between a depth image and its label image [s]", minimum=0.0, maximum=1e6
     )
-    strict_labels: bool = parameter(False, "refuse raw labels that the class table does not know")
+    pose_gap: float = parameter(0.5, "largest gap between two poses that are interpolated [s]", above=0.0, maximum=1e6)
+    strict_labels: bool = parameter(False, "stop at a raw label that the class table does not contain")
     start: float = parameter(
-        0.0, "frames before this much after the team's first are left out [s]", minimum=0.0, maximum=1e9
+        0.0, "start of the replayed span, after the team's first stamp [s]", minimum=0.0, maximum=1e9
     )
     duration: float | None = parameter(
-        None, "frames later than this after start are left out [s]", above=0.0, maximum=1e9
+        None, "length of the replayed span [s] (default: to the end)", above=0.0, maximum=1e9
     )
-    every: int = parameter(1, "take one image or cloud of so many of each robot", minimum=1)
+    every: int = parameter(1, "use every n-th image or cloud of each robot", minimum=1)
     rate_limit: float | None = parameter(
-        None, "take at most so many images or clouds a second of each robot [Hz]", minimum=1e-6
+        None, "maximum rate of images or clouds used of each robot [Hz] (default: no limit)", minimum=1e-6
     )
 
     def __post_init__(self) -> None:

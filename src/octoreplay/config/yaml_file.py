@@ -1,4 +1,4 @@
-"""Reading YAML files, with errors of one sentence."""
+"""Reading of YAML files, with errors of one sentence."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from octoreplay.errors import ConfigError
 
 
 def read_text(path: Path, kind: str) -> str:
-    """A configuration file's text."""
+    """Return the text of a configuration file. Raises ConfigError if it is unreadable or not UTF-8."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a {kind} file (no UTF-8 text)") from error
+        raise ConfigError(f"{path}: not a {kind} file: its text is not UTF-8") from error
 
 
-def load_yaml(text: str, source: str) -> Any:
-    """What a YAML text holds."""
+def load_yaml(text: str, name: str) -> Any:
+    """Return the content of a YAML text. Raises ConfigError that starts with ``name``."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -28,4 +28,4 @@ def load_yaml(text: str, source: str) -> Any:
     except YAMLError as error:
         line = getattr(getattr(error, "problem_mark", None), "line", None)
         where = "" if line is None else f" (line {line + 1})"
-        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
+        raise ConfigError(f"{name}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error

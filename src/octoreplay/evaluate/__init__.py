@@ -1,1 +1,1 @@
-"""How good a stored result is: against the truth, against the centralised map, against another result."""
+"""Quality of a stored result: against the truth, the centralised map, limits or another result."""

@@ -1,6 +1,6 @@
-"""Two results side by side: whether their maps are the same, and where and by how much they differ.
+"""Comparison of two results: whether their maps are equal, where and by how much they differ.
 
-All numbers are over finest cells, whatever leaves they are stored in (docs/cli.md).
+All numbers count finest cells, independent of the leaves that store them (docs/cli.md).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.evaluate.runs import CommonRuns, bounding_box, common_runs
+from octoreplay.evaluate.morton_intervals import MortonIntervals, bounding_box, common_intervals
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys
 from octoreplay.records import CENTRAL, BoolArray, Float64Array, Int64Array
@@ -28,19 +28,18 @@ from octoreplay.result import Result, StoredMap, open_result
 Point: TypeAlias = tuple[float, float, float]
 
 UNKNOWN = "unknown"
-"""What a cell is called that a map does not know."""
+"""Label of a cell that a map does not know."""
 
 _LATEST = 1e9
-"""No run is longer [s]."""
-
+"""Upper limit of the length of a run [s]."""
 
 _PATHS = ("logs", "pose_file", "pose_times")
-"""What of a robot's settings says where its data are; whether these are the same, their fingerprints tell."""
+"""A robot's settings that are paths; the inputs are compared by their fingerprints instead."""
 
 
 @dataclass(frozen=True)
 class LabelChange:
-    """So many cells that one result gives one label and the other another, 'free' and 'unknown' included."""
+    """Number of cells with one label in A and another in B; labels include 'free' and 'unknown'."""
 
     label_a: str
     label_b: str
@@ -49,14 +48,34 @@ class LabelChange:
 
 @dataclass(frozen=True)
 class MapDifference:
-    """One robot's maps in two results, or the two centralised ones; all counts are of finest cells.
+    """Difference of one robot's maps, or of the centralised maps, in two results.
 
-    ``tick_a`` and ``seconds_a`` say which stored map was taken. ``num_relabelled`` of the cells known to both have
-    different labels; ``label_changes`` are all pairs of different labels, the most frequent first.
-    ``largest_difference`` is the largest |h_A - h_B| of any class, where an unknown cell counts as the prior, and
-    ``largest_at`` the centre of the first cell that has it, None where it is 0. ``num_over_tolerance`` cells differ by
-    more than the tolerance; ``num_differing`` are these and the cells that only one map knows, and ``lower`` and
-    ``upper`` the corners of the box that holds them, None where there are none. Metres, in the team's frame.
+    Counts are of finest cells; points are in metres, in the team's frame.
+
+    Attributes
+    ----------
+    robot_id : str
+        Robot of the maps, or 'central'.
+    tick_a, tick_b : int
+        Ticks of the compared maps.
+    seconds_a, seconds_b : float
+        Times of the compared maps since the start of their runs.
+    num_cells_a_only, num_cells_b_only, num_cells_both : int
+        Cells that only A, only B and both maps know.
+    num_relabelled : int
+        Cells that both maps know and label differently.
+    label_changes : tuple of LabelChange
+        Pairs of different labels, the most frequent first.
+    largest_difference : float
+        Largest |h_A - h_B| of any class; an unknown cell counts as the prior.
+    largest_at : tuple of float, optional
+        Centre of the first cell with the largest difference, None where that is 0.
+    num_over_tolerance : int
+        Cells that differ by more than the tolerance.
+    num_differing : int
+        The same cells and those that only one map knows.
+    lower, upper : tuple of float, optional
+        Corners of the box around the differing cells, None without any.
     """
 
     robot_id: str
@@ -79,9 +98,9 @@ class MapDifference:
 
 @dataclass(frozen=True)
 class SettingDifference:
-    """A setting that is not the same in both results; None stands for the default that follows from other settings.
+    """Setting with different values in two results; None is a default that follows from other settings.
 
-    ``name`` is a parameter's name; what belongs to a robot, a class or a link has ``<it>.`` before it.
+    ``name`` is the name of a parameter. Settings of one robot, class or link have its name and a dot in front.
     """
 
     name: str
@@ -91,11 +110,28 @@ class SettingDifference:
 
 @dataclass(frozen=True)
 class ResultComparison:
-    """Two results ``a`` and ``b``, compared at ``at`` seconds after their starts (None: at their ends).
+    """Comparison of two results.
 
-    ``is_same`` is True where no map differs by more than ``tolerance`` and neither result has a map that the other
-    lacks; ``only_a`` and ``only_b`` name these. ``is_complete_a`` is False for what an interrupted run left, and
-    ``same_inputs`` None where the fingerprints of the inputs were taken in different ways.
+    Attributes
+    ----------
+    a, b : str
+        Paths of the results.
+    at : float, optional
+        Time since the start of each run in seconds, None for the end.
+    tolerance : float
+        Largest difference of log-odds that counts as equal.
+    is_same : bool
+        True where no map differs by more than ``tolerance`` and both results have maps of the same robots.
+    maps : tuple of MapDifference
+        Maps that both results have.
+    only_a, only_b : tuple of str
+        Robots with a map in only one of the results.
+    is_complete_a, is_complete_b : bool
+        False for the result of an interrupted run.
+    same_inputs : bool, optional
+        True where both were made from the same files, None where their fingerprints have different methods.
+    settings : tuple of SettingDifference
+        Settings with different values.
     """
 
     a: str
@@ -115,26 +151,36 @@ class ResultComparison:
 def compare_results(
     a: str | Path, b: str | Path, *, robot: str | None = None, at: float | None = None, tolerance: float = 0.0
 ) -> ResultComparison:
-    """Compare the maps of two results, each robot's and the centralised one.
+    """Compare the robots' maps and the centralised maps of two results.
 
-    ``robot``: only this robot's, or 'central'. ``at``: the last maps stored up to so many seconds after each run's
-    start, None for the last of all. ``tolerance``: log-odds that differ by no more than this count as the same.
+    Parameters
+    ----------
+    a, b : path
+        Result files.
+    robot : str, optional
+        Compare the maps of this robot only, or of 'central'.
+    at : float, optional
+        Compare the last maps stored up to this time since the start of each run, in seconds; None for the end.
+    tolerance : float
+        Largest difference of log-odds that counts as equal.
 
-    Raises ConfigError for a tolerance or a time that is no number, and InputError for a result that cannot be read, a
-    robot that neither has, and results of different resolutions or classes.
+    Raises
+    ------
+    ConfigError
+        ``tolerance`` is negative or not finite, or ``at`` is not finite or above 1e9.
+    InputError
+        A result cannot be read, neither has maps of ``robot``, or their resolutions or classes differ.
     """
     if not 0 <= tolerance < math.inf:
-        raise ConfigError(f"tolerance: {tolerance:g} is not a number from 0 on")
+        raise ConfigError(f"tolerance: {tolerance:g} is not a finite number of at least 0")
     if at is not None and not abs(at) <= _LATEST:
         raise ConfigError(f"at: {at:g} is not a number of seconds up to {_LATEST:g}")
     with ExitStack() as stack:
         result_a, result_b = (stack.enter_context(open_result(path)) for path in (a, b))
         _check_comparable(result_a, result_b)
-        names_a, names_b = (_chosen(result, robot) for result in (result_a, result_b))
+        names_a, names_b = (_map_names(result, robot) for result in (result_a, result_b))
         if not names_a and not names_b:
-            raise InputError(
-                f"{b}: neither it nor {a} has a map of robot '{robot}'; robots: {', '.join(result_a.robots)}"
-            )
+            raise InputError(f"{a}, {b}: neither has a map of robot '{robot}'; robots: {', '.join(result_a.robots)}")
         maps = tuple(_map_difference(result_a, result_b, name, at, tolerance) for name in names_a if name in names_b)
         only_a = tuple(name for name in names_a if name not in names_b)
         only_b = tuple(name for name in names_b if name not in names_a)
@@ -151,24 +197,24 @@ def compare_results(
 def _map_difference(
     result_a: Result, result_b: Result, robot_id: str, at: float | None, tolerance: float
 ) -> MapDifference:
-    """One map of both results, compared."""
+    """Compare one robot's maps."""
     a, b = (result.map(robot_id, at_ns=None if at is None else result.time_ns(at)) for result in (result_a, result_b))
     spans_a, spans_b = a.octree.spans(), b.octree.spans()
-    runs = common_runs(spans_a, spans_b)
-    known_a, known_b = runs.leaves_a >= 0, runs.leaves_b >= 0
-    labels_a, labels_b = _labels(a, spans_a, runs.leaves_a), _labels(b, spans_b, runs.leaves_b)
-    differences = _differences(spans_a, spans_b, runs, a.prior - b.prior)
+    intervals = common_intervals(spans_a, spans_b)
+    known_a, known_b = intervals.leaves_a >= 0, intervals.leaves_b >= 0
+    labels_a, labels_b = _labels(a, spans_a, intervals.leaves_a), _labels(b, spans_b, intervals.leaves_b)
+    differences = _differences(spans_a, spans_b, intervals, a.prior - b.prior)
     is_over = differences > tolerance
     is_differing = is_over | (known_a != known_b)
     largest = int(np.argmax(differences)) if differences.size else -1
     has_largest = largest >= 0 and bool(differences[largest] > 0)
     corners = None
     if is_differing.any():
-        low, high = bounding_box(runs.codes[is_differing], runs.num_cells[is_differing])
+        low, high = bounding_box(intervals.codes[is_differing], intervals.num_cells[is_differing])
         corners = _point(low, a.resolution), _point(high + 1, a.resolution)
 
     def count(chosen: BoolArray) -> int:
-        return int(runs.num_cells[chosen].sum())
+        return int(intervals.num_cells[chosen].sum())
 
     return MapDifference(
         robot_id=robot_id,
@@ -180,9 +226,9 @@ def _map_difference(
         num_cells_b_only=count(~known_a & known_b),
         num_cells_both=count(known_a & known_b),
         num_relabelled=count(known_a & known_b & (labels_a != labels_b)),
-        label_changes=_label_changes(result_a.class_table.names, labels_a, labels_b, runs.num_cells),
+        label_changes=_label_changes(result_a.class_table.names, labels_a, labels_b, intervals.num_cells),
         largest_difference=float(differences[largest]) if has_largest else 0.0,
-        largest_at=_point(codes_to_keys(runs.codes[[largest]])[0] + 0.5, a.resolution) if has_largest else None,
+        largest_at=_point(codes_to_keys(intervals.codes[[largest]])[0] + 0.5, a.resolution) if has_largest else None,
         num_over_tolerance=count(is_over),
         num_differing=count(is_differing),
         lower=corners[0] if corners else None,
@@ -190,25 +236,27 @@ def _map_difference(
     )
 
 
-def _differences(a: LeafSpans, b: LeafSpans, runs: CommonRuns, prior_difference: float) -> Float64Array:
-    """The largest |h_A - h_B| of any class in each run (S,); infinite where a value is no number."""
-    largest = np.zeros(runs.codes.size)
+def _differences(a: LeafSpans, b: LeafSpans, intervals: MortonIntervals, prior_difference: float) -> Float64Array:
+    """Largest |h_A - h_B| of any class in each interval (S,); infinite where a value is NaN."""
+    largest = np.zeros(intervals.codes.size)
     for values_a, values_b in zip(a.deviations.T, b.deviations.T, strict=True):
-        # Deviations, because h = deviation + prior would round small differences away.
-        difference = np.abs(_taken(values_a, runs.leaves_a) - _taken(values_b, runs.leaves_b) + prior_difference)
+        # Deviations from the prior are compared, since float32 sums with the prior would lose small differences.
+        difference = np.abs(
+            _values_in(values_a, intervals.leaves_a) - _values_in(values_b, intervals.leaves_b) + prior_difference
+        )
         np.maximum(largest, np.where(np.isnan(difference), np.inf, difference), out=largest)
     return largest
 
 
-def _taken(values: Any, leaves: Int64Array) -> Float64Array:
-    """A class's deviations (S,) in the leaves (S,); 0, the prior's, where there is no leaf."""
+def _values_in(values: Any, leaves: Int64Array) -> Float64Array:
+    """Deviations (S,) of a class in the leaves (S,); 0, that of the prior, without a leaf."""
     taken = np.zeros(leaves.size)
     taken[leaves >= 0] = values[leaves[leaves >= 0]]
     return taken
 
 
 def _labels(stored: StoredMap, spans: LeafSpans, leaves: Int64Array) -> Int64Array:
-    """Each run's label (S,) in a map: class_id + 1, 1 for free, 0 for unknown."""
+    """Label of each interval (S,) in a map: class_id + 1, so 1 for free, and 0 for unknown."""
     of_leaf = best_labels(spans.deviations + np.float32(stored.prior)).astype(np.int64) + 1
     labels = np.zeros(leaves.size, np.int64)
     labels[leaves >= 0] = of_leaf[leaves[leaves >= 0]]
@@ -218,7 +266,7 @@ def _labels(stored: StoredMap, spans: LeafSpans, leaves: Int64Array) -> Int64Arr
 def _label_changes(
     class_names: tuple[str, ...], labels_a: Int64Array, labels_b: Int64Array, num_cells: Int64Array
 ) -> tuple[LabelChange, ...]:
-    """The pairs of different labels with their numbers of cells, the most frequent first, ties in order of class."""
+    """Pairs of different labels, the most frequent first, ties in the order of the classes."""
     names = (UNKNOWN, "free", *class_names)
     changed = labels_a != labels_b
     pairs, index = np.unique(labels_a[changed] * len(names) + labels_b[changed], return_inverse=True)
@@ -232,37 +280,37 @@ def _label_changes(
 
 
 def _point(keys: Any, resolution: float) -> Point:
-    """A place in metres, rounded to what is more than a millionth of a cell."""
+    """Point in metres from keys, rounded to about a millionth of a cell."""
     decimals = 6 - math.floor(math.log10(resolution))
     x, y, z = (round(float(key) * resolution, decimals) for key in keys)
     return x, y, z
 
 
 def _check_comparable(a: Result, b: Result) -> None:
-    """Refuse results whose cells or classes are not the same."""
+    """Refuse results with different resolutions or classes."""
     resolutions = a.config.map.resolution, b.config.map.resolution
     if resolutions[0] != resolutions[1]:
         raise InputError(
-            f"{b.path}: has the resolution {resolutions[1]} m, and {a.path} {resolutions[0]} m; run one of them"
-            " again with the other's"
+            f"{b.path}: the resolution is {resolutions[1]} m, and {resolutions[0]} m in {a.path}; replay one of them"
+            " again with the other's resolution"
         )
     classes = itertools.zip_longest(a.class_table.names, b.class_table.names, fillvalue="(none)")
     for class_id, (name_a, name_b) in enumerate(classes, start=1):
         if name_a != name_b:
             raise InputError(
-                f"{b.path}: has other classes than {a.path}: class {class_id} is '{name_b}', and there '{name_a}'; run"
-                " one of them again with the other's"
+                f"{b.path}: class {class_id} is '{name_b}', and '{name_a}' in {a.path}; replay one of them again with"
+                " the other's classes"
             )
 
 
-def _chosen(result: Result, robot: str | None) -> tuple[str, ...]:
-    """The maps of a result to compare: of the robots, and the centralised one where it is stored."""
+def _map_names(result: Result, robot: str | None) -> tuple[str, ...]:
+    """Names of a result's maps to compare: of the robots, and the centralised one if it is stored."""
     central = (CENTRAL,) if result.stored_ticks(CENTRAL) else ()
     return tuple(name for name in (*result.robots, *central) if robot in (None, name))
 
 
 def _same_inputs(a: Result, b: Result) -> bool | None:
-    """Whether two results were made from the same files, by their fingerprints; None where these are of two kinds."""
+    """True where the inputs of two results have equal sizes and fingerprints; None for different methods."""
     inputs_a, inputs_b = list(a.inputs.values()), list(b.inputs.values())
     if len(inputs_a) != len(inputs_b) or any(x[0] != y[0] for x, y in zip(inputs_a, inputs_b, strict=True)):
         return False
@@ -272,7 +320,7 @@ def _same_inputs(a: Result, b: Result) -> bool | None:
 
 
 def _setting_differences(a: RunConfig, b: RunConfig) -> Iterator[SettingDifference]:
-    """The settings that are not the same in two configurations, in their order."""
+    """Yield the settings that differ between two configurations, in their order."""
     shared = {robot.robot_id for robot in a.robots} & {robot.robot_id for robot in b.robots}
     values_a, values_b = dict(_settings(a, shared)), dict(_settings(b, shared))
     for name in dict.fromkeys((*values_a, *values_b)):
@@ -281,7 +329,7 @@ def _setting_differences(a: RunConfig, b: RunConfig) -> Iterator[SettingDifferen
 
 
 def _settings(config: RunConfig, robots: Set[str]) -> Iterator[tuple[str, Any]]:
-    """Every setting of a configuration by its name; of the robots' own, those of some ``robots``."""
+    """Yield every setting of a configuration by name; settings of a robot only for ``robots``."""
     for parameter in PARAMETERS.values():
         yield parameter.name, getattr(getattr(config, parameter.section), parameter.name)
     for name in ("edges", "one_way", "schedule"):

@@ -1,4 +1,4 @@
-"""Evaluates the maps of a stored result: against the truth, the centralised map or another result."""
+"""Evaluation of a stored result's maps against the truth, the centralised map or another result."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.errors import InputError
-from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
-from octoreplay.evaluate.runs import Region
-from octoreplay.evaluate.scores import TruthScores, agreement, no_truth_scores, truth_scores
+from octoreplay.evaluate.morton_intervals import Region
+from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
+from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import WORLD_FILE, Truth, load_truth
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
@@ -29,12 +29,28 @@ def evaluate_result(
     over_time: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
-    """The scores of all maps of a result at every stored tick, or with ``over_time`` False at the last one alone.
+    """Return the scores of all maps of a result.
 
-    ``truth`` is a world.npz, a folder that holds one, or a labelled PLY file (``load_truth``). The reference of the
-    agreement is the result's own centralised map, or with a path in ``against`` the centralised map of another result
-    at the same seconds. ``progress`` is called with the share that is done. Raises InputError where one of the files
-    cannot be used or they do not fit each other, PacketError where a stored map is damaged.
+    Parameters
+    ----------
+    path : path
+        Result file.
+    truth : path, optional
+        A world.npz, a folder that holds one, or a labelled PLY file (``load_truth``).
+    against : path or 'central'
+        Reference of the agreement: the result's own centralised map, or the centralised map of another result at the
+        same time since the start.
+    over_time : bool
+        True for every stored tick, False for the last one only.
+    progress : callable, optional
+        Called with the finished share, 0..1, after each tick.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, or the files have different classes or resolutions.
+    PacketError
+        A stored map is damaged.
     """
     with contextlib.ExitStack() as files:
         result = files.enter_context(open_result(path))
@@ -55,32 +71,32 @@ def evaluate_result(
 
 
 def truth_beside_logs(path: str | Path) -> Path | None:
-    """The world.npz in the folder of a log that a result was made from, if there is one. Raises InputError."""
+    """Return the world.npz in the folder of one of a result's logs, None without one. Raises InputError."""
     with open_result(path) as result:
         folders = dict.fromkeys((result.path.parent / name).parent for name in result.inputs)
     return next((folder / WORLD_FILE for folder in folders if (folder / WORLD_FILE).is_file()), None)
 
 
 def _check_fit(result: Result, other: Result) -> None:
-    """Refuse a reference of other classes or cells, or without a centralised map."""
+    """Refuse a reference with other classes or another resolution."""
     for what, here, there in (
-        ("classes", result.class_table.names, other.class_table.names),
-        ("a resolution", result.config.map.resolution, other.config.map.resolution),
+        ("classes differ", result.class_table.names, other.class_table.names),
+        ("resolution differs", result.config.map.resolution, other.config.map.resolution),
     ):
         if here != there:
-            raise InputError(f"{other.path}: has {what} other than {result.path}; give results with the same")
+            raise InputError(f"{other.path}: {what} from {result.path}; give results with the same")
 
 
 def _first_central_ns(other: Result) -> int:
-    """When the first centralised map of another result was stored."""
+    """Time of the first stored centralised map of another result."""
     ticks = other.stored_ticks(CENTRAL)
     if not ticks:
-        raise InputError(f"{other.path}: holds no centralised map to compare with; run its logs again")
+        raise InputError(f"{other.path}: holds no centralised map to compare with; replay its logs again")
     return next((metrics.stamp_ns for metrics in other.metrics if metrics.tick >= ticks[0]), 0)
 
 
 def _last_maps(result: Result) -> dict[str, StoredMap]:
-    """The last stored map of each robot, and the centralised one where there is one."""
+    """Last stored map of each robot, and the centralised one if it is stored."""
     if not result.stored_ticks(result.robots[0]):
         raise InputError(f"{result.path}: holds no map; the run was interrupted before it stored one")
     names = (*result.robots, *([CENTRAL] if result.stored_ticks(CENTRAL) else []))
@@ -88,7 +104,7 @@ def _last_maps(result: Result) -> dict[str, StoredMap]:
 
 
 class _Counts(NamedTuple):
-    """What is known of a map without the truth: fields of MapScores."""
+    """Scores of a map that need no truth: fields of MapScores."""
 
     num_cells: int
     entropy_bits: float
@@ -97,7 +113,7 @@ class _Counts(NamedTuple):
 
 
 class _Evaluator:
-    """Scores the maps of one result, tick by tick."""
+    """Evaluates the maps of one result, tick by tick."""
 
     def __init__(self, result: Result, truth: Truth | None, other: Result | None) -> None:
         self._result = result
@@ -110,23 +126,25 @@ class _Evaluator:
         self._is_observed = np.empty(0, np.bool_) if truth is None else self._observed(truth)
 
     def evaluate(self, maps: Mapping[str, StoredMap]) -> EvaluatedTick:
-        """The scores of the maps at one stored tick."""
+        """Return the scores of the maps at one stored tick."""
         tick = max(stored.tick for stored in maps.values())
         metrics = self._metrics.get(tick)
         if metrics is None:
-            raise InputError(f"{self._result.path}: damaged: tick {tick} has maps but no metrics; run the logs again")
+            raise InputError(
+                f"{self._result.path}: damaged: tick {tick} has maps but no metrics; replay the logs again"
+            )
         seconds = self._result.seconds(metrics.stamp_ns)
         names = (*self._result.robots, *([CENTRAL] if CENTRAL in maps else []))
         octrees = [self._octree(maps, name) for name in names]
         spans = [octree.spans() for octree in octrees]
-        # What the team's evidence covers: what the centralised map knows, or else what any robot knows.
+        # The team's evidence covers the cells of the centralised map, or else the cells that any robot knows.
         region = Region(spans[-1:] if CENTRAL in names else spans)
         disagreement, counts = self._counts(names, octrees, metrics)
         if self._other is not None:
             agreements = self._agreements_with_other(self._other, spans, seconds)
             counts = [_Counts(*count[:2], *pair) for count, pair in zip(counts, agreements, strict=True)]
         if not region.num_cells:
-            # Maps that hold nothing neither agree nor differ.
+            # Empty maps neither agree nor differ.
             disagreement, counts = math.nan, [_Counts(*count[:2], math.nan, math.nan) for count in counts]
         is_active = {robot.robot_id: robot.active for robot in metrics.robots}
         return EvaluatedTick(
@@ -138,36 +156,36 @@ class _Evaluator:
                     robot_id=name,
                     is_active=is_active.get(name, True),
                     **count._asdict(),
-                    **self._against_truth(name, leaves, region)._asdict(),
+                    truth=self._truth_scores(name, leaves, region),
                 )
                 for name, count, leaves in zip(names, counts, spans, strict=True)
             ),
         )
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:
-        """A map; an empty one where nothing is stored yet."""
+        """Octree of a map, an empty one before its first stored state."""
         if name in maps:
             return maps[name].octree
         return SemanticOctree(self._result.config.map.resolution, self._result.class_table.num_classes)
 
     def _observed(self, truth: Truth) -> BoolArray:
-        """Which cells (M,) of the truth the team's evidence covers at the end of the run."""
+        """Coverage of the truth's cells by the team's evidence at the end of the run, (M,) bool."""
         central = self.last_maps.get(CENTRAL)
         covering = self.last_maps.values() if central is None else [central]
         is_observed = Region([stored.octree.spans() for stored in covering]).holds(truth.codes)
         if not (is_observed & truth.is_class).any():
             raise InputError(
-                f"{truth.path}: none of its surface lies where the maps of {self._result.path} know anything; give it"
-                " in metres, in the team's frame"
+                f"{truth.path}: no surface lies in the cells that the maps of {self._result.path} know; give it in"
+                " metres, in the team's frame"
             )
         return is_observed
 
     def _counts(
         self, names: Sequence[str], octrees: Sequence[SemanticOctree], metrics: TickMetrics
     ) -> tuple[float, list[_Counts]]:
-        """The label disagreement between the robots, and each map's counts against the run's centralised map."""
+        """Label disagreement between the robots, and the scores of each map that need no truth."""
         robots = octrees[: len(self._result.robots)]
-        # Without a stored centralised map any other stands in for it: only what the run measured is used then.
+        # Without a stored centralised map any other map takes its place; its agreements are not used below.
         compared = MapComparer(len(robots), self._prior).compare(robots, octrees[-1], [], 0)
         agreements = list(zip(compared.agreement.tolist(), compared.agreement_occupied.tolist(), strict=True))
         if CENTRAL not in names:
@@ -186,20 +204,20 @@ class _Evaluator:
     def _agreements_with_other(
         self, other: Result, spans: Sequence[LeafSpans], seconds: float
     ) -> list[tuple[float, float]]:
-        """Both agreements of each map with the other result's centralised map at the same seconds; NaN before it."""
+        """Agreements of each map with the other result's centralised map at that time; NaN before its first one."""
         at_ns = other.time_ns(seconds)
         if at_ns < self._other_start_ns:
             return [(math.nan, math.nan)] * len(spans)
         reference = other.map(CENTRAL, at_ns=at_ns)
         leaves = reference.octree.spans()
-        # Cells of the team or of the reference.
+        # The agreement counts the cells of the team and of the reference.
         num_cells = Region([*spans, leaves]).num_cells
         return [agreement(own, self._prior, leaves, reference.prior, num_cells) for own in spans]
 
-    def _against_truth(self, name: str, spans: LeafSpans, region: Region) -> TruthScores:
-        """What the truth says of one map."""
+    def _truth_scores(self, name: str, spans: LeafSpans, region: Region) -> TruthScores | None:
+        """Scores of one map against the truth, None without a truth."""
         if self._truth is None:
-            return no_truth_scores(self._result.class_table.num_classes)
-        # The centralised map is the posterior of all evidence already.
+            return None
+        # The centralised map already is the posterior of all evidence.
         num_robots = 1 if name == CENTRAL else len(self._result.robots)
         return truth_scores(spans, self._prior, num_robots, self._truth, region, self._is_observed)

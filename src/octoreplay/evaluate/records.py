@@ -1,7 +1,8 @@
-"""What an evaluation says of maps: one record for each map and stored tick (docs/evaluation.md)."""
+"""Records of an evaluation: scores of each map at each stored tick (docs/evaluation.md)."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -9,26 +10,29 @@ from octoreplay.records import CENTRAL
 
 
 @dataclass(frozen=True)
-class MapScores:
-    """One robot's map, or the centralised one, at one stored tick.
+class TruthScores:
+    """Scores of one map against the truth; NaN where a score has no cells to count.
 
-    ``agreement`` and ``agreement_occupied`` are with the reference map (docs/metrics.md); NaN where there is none.
-    What needs the truth is NaN without it: ``iou`` (C,) of each class over the cells that the team's evidence covers
-    (NaN where a class occurs neither in the truth nor in the map) and ``mean_iou``, their mean over the classes that
-    the truth has there; ``mean_iou_known``, the same over the cells that this map knows; ``occupied_accuracy`` and
-    ``free_accuracy``, the share of truly occupied and of truly free known cells that the map calls so; ``coverage``,
-    the share of the surface observed by the team in the whole run that the map calls occupied; ``world_coverage``, the
-    same of all surface; ``calibration_error``, the
-    expected calibration error over known cells, and over those that are occupied in map or truth, of h; ``team_`` the
-    same of h_0 + N (h - h_0).
+    Attributes
+    ----------
+    iou : tuple of float
+        Intersection over union of each of the C classes, over the cells that the team's evidence covers.
+    mean_iou : float
+        Mean of ``iou`` over the classes that the truth has in these cells.
+    mean_iou_known : float
+        The same mean over the cells that this map knows.
+    occupied_accuracy, free_accuracy : float
+        Share of the truly occupied and of the truly free known cells that the map calls occupied and free.
+    coverage : float
+        Share of the surface observed by the team in the whole run that the map calls occupied.
+    world_coverage : float
+        Share of all surface that the map calls occupied.
+    calibration_error, calibration_error_occupied : float
+        Expected calibration error of h, over known cells and over those that are occupied in the map or in truth.
+    team_calibration_error, team_calibration_error_occupied : float
+        The same of the team posterior h_0 + N (h - h_0).
     """
 
-    robot_id: str
-    is_active: bool
-    num_cells: int
-    entropy_bits: float
-    agreement: float
-    agreement_occupied: float
     iou: tuple[float, ...]
     mean_iou: float
     mean_iou_known: float
@@ -43,9 +47,40 @@ class MapScores:
 
 
 @dataclass(frozen=True)
+class MapScores:
+    """Scores of one robot's map, or of the centralised one, at one stored tick.
+
+    ``agreement`` and ``agreement_occupied`` are with the reference map (docs/metrics.md), NaN without one. ``truth`` is
+    None where the evaluation has no truth.
+    """
+
+    robot_id: str
+    is_active: bool
+    num_cells: int
+    entropy_bits: float
+    agreement: float
+    agreement_occupied: float
+    truth: TruthScores | None
+
+    def score(self, name: str) -> float:
+        """Return the score called ``name``, one of ``SCORES``; NaN for a score against the truth without a truth."""
+        record = self if name in MAP_SCORES else self.truth
+        value: float = math.nan if record is None else getattr(record, name)
+        return value
+
+
+MAP_SCORES = ("num_cells", "entropy_bits", "agreement", "agreement_occupied")
+"""Scores of a map that need no truth: fields of MapScores."""
+
+SCORES = (*MAP_SCORES, *(item.name for item in dataclasses.fields(TruthScores) if item.name != "iou"))
+"""All scores of a map that are one number."""
+
+
+@dataclass(frozen=True)
 class EvaluatedTick:
-    """All maps at one stored tick; ``seconds`` since the run's start, ``label_disagreement`` between the robots, NaN
-    where no map holds anything.
+    """Scores of all maps at one stored tick.
+
+    ``seconds`` counts from the run's start. ``label_disagreement`` is between the robots, NaN where all maps are empty.
     """
 
     tick: int
@@ -55,29 +90,29 @@ class EvaluatedTick:
 
     @property
     def robots(self) -> tuple[MapScores, ...]:
-        """The robots' maps, the centralised one left out; only the active robots' where there are any."""
+        """Scores of the active robots' maps; of all robots' maps where no robot is active."""
         robots = tuple(scores for scores in self.maps if scores.robot_id != CENTRAL)
         return tuple(scores for scores in robots if scores.is_active) or robots
 
     @property
     def central(self) -> MapScores | None:
-        """The centralised map's scores, where the result holds it."""
+        """Scores of the centralised map, None where the result does not hold it."""
         return next((scores for scores in self.maps if scores.robot_id == CENTRAL), None)
 
     def mean(self, name: str) -> float:
-        """The mean over the robots of one of the scores; NaN where it is NaN for a robot."""
-        values = [float(getattr(scores, name)) for scores in self.robots]
+        """Mean of one score over the robots; NaN where it is NaN for a robot."""
+        values = [scores.score(name) for scores in self.robots]
         return sum(values) / len(values) if values else math.nan
 
     def least(self, name: str) -> float:
-        """The smallest of one of the scores over the robots; NaN where it is NaN for a robot."""
-        values = [float(getattr(scores, name)) for scores in self.robots]
-        return min(values) if values and not any(map(math.isnan, values)) else math.nan
+        """Smallest value of one score over the robots; NaN where it is NaN for a robot."""
+        values = [scores.score(name) for scores in self.robots]
+        return float(min(values)) if values and not any(map(math.isnan, values)) else math.nan
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A result's maps over time; the last of ``ticks`` is the end. ``class_names`` (C,) without free."""
+    """Scores of a result's maps over time; the last of ``ticks`` is the end. ``class_names`` (C,) without free."""
 
     result: str
     truth: str | None
@@ -87,5 +122,9 @@ class Evaluation:
 
     @property
     def final(self) -> EvaluatedTick:
-        """The maps at the end of the run."""
+        """Scores at the end of the run."""
         return self.ticks[-1]
+
+    def iou(self, scores: MapScores) -> tuple[float, ...]:
+        """Return the intersection over union (C,) of each class in one of the maps; NaN without a truth."""
+        return (math.nan,) * len(self.class_names) if scores.truth is None else scores.truth.iou

@@ -1,4 +1,4 @@
-"""What an exchange of maps did to a robot's own labels: which it put right, and which it made wrong."""
+"""Labels of a robot's own map that an exchange of maps corrected or made wrong."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ from octoreplay.result import StoredMap
 
 
 class Repairs(NamedTuple):
-    """Counts of cells that a robot knows by itself.
+    """Counts of cells that a robot knows from its own evidence.
 
-    ``num_cells`` are those that hold surface in truth or that its own map calls occupied, and ``num_wrong`` of these
-    have a wrong label in it. ``num_repaired`` are wrong in its own map and right after the exchange; ``num_spread`` are
-    right in its own map and wrong afterwards, free cells that became occupied among them.
+    Attributes
+    ----------
+    num_cells : int
+        Cells that hold surface in truth or that the robot's own map calls occupied.
+    num_wrong : int
+        Cells of these with a wrong label in its own map.
+    num_repaired : int
+        Cells that are wrong in its own map and right after the exchange.
+    num_spread : int
+        Cells that are right in its own map and wrong after the exchange, including free cells that became occupied.
     """
 
     num_cells: int
@@ -27,16 +34,16 @@ class Repairs(NamedTuple):
 
 
 def repairs(own: StoredMap, after: StoredMap, truth: Truth) -> Repairs:
-    """Compare a robot's own map with its map after an exchange, both of the same resolution as the truth.
+    """Compare a robot's own map with its map after an exchange, both with the truth's resolution.
 
-    A cell without surface is truly free; cells whose true class the maps do not have count for nothing.
+    A cell without surface is truly free. Cells of a true class that the maps do not have are not counted.
     """
     own_spans, after_spans = own.octree.spans(), after.octree.spans()
     own_labels, after_labels = (
         best_labels(spans.deviations + np.float32(stored.prior))
         for spans, stored in ((own_spans, own), (after_spans, after))
     )
-    # Everywhere else all three say free.
+    # All other cells are free in both maps and in truth.
     codes = np.unique(
         np.concatenate([truth.codes, own_spans.cells_in(own_labels > 0), after_spans.cells_in(after_labels > 0)])
     )

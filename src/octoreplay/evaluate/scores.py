@@ -1,4 +1,4 @@
-"""Scores of one map, counted exactly over finest cells without opening its larger leaves (docs/evaluation.md)."""
+"""Scores of one map, counted exactly over finest cells without expanding larger leaves (docs/evaluation.md)."""
 
 from __future__ import annotations
 
@@ -8,60 +8,37 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.evaluate.runs import Region, common_runs
+from octoreplay.evaluate.morton_intervals import Region, common_intervals
+from octoreplay.evaluate.records import TruthScores
 from octoreplay.evaluate.truth import Truth
-from octoreplay.log_odds import best_labels, team_log_odds
+from octoreplay.log_odds import TIE_TOLERANCE, best_labels, shifted_exp_sum, team_log_odds
 from octoreplay.mapping.octree import LeafSpans
 from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 
 NUM_BINS = 15
-"""Bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
-
-TIE = 1e-3
-"""A label agrees when the reference's log-odds of it are this close to its largest."""
-
-
-class TruthScores(NamedTuple):
-    """What the truth says of a map: fields of MapScores."""
-
-    iou: tuple[float, ...]
-    mean_iou: float
-    mean_iou_known: float
-    occupied_accuracy: float
-    free_accuracy: float
-    coverage: float
-    world_coverage: float
-    calibration_error: float
-    calibration_error_occupied: float
-    team_calibration_error: float
-    team_calibration_error_occupied: float
-
-
-def no_truth_scores(num_classes: int) -> TruthScores:
-    """All NaN."""
-    return TruthScores((math.nan,) * num_classes, *(math.nan,) * (len(TruthScores._fields) - 1))
+"""Number of bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
 
 
 def truth_scores(
     spans: LeafSpans, prior: float, num_robots: int, truth: Truth, region: Region, is_observed: BoolArray
 ) -> TruthScores:
-    """The scores of a map with prior h_0 against the truth.
+    """Return the scores of a map with prior h_0 against the truth.
 
-    ``region`` is what the team's evidence covers; ``is_observed`` (M,) says which of the truth's cells it covers at the
-    end of the run.
+    ``region`` holds the cells that the team's evidence covers at this tick. ``is_observed`` (M,) bool is True for the
+    truth's cells that it covers at the end of the run.
     """
     num_classes = spans.deviations.shape[1]
     surface = _surface_in_leaves(spans, truth)
     log_odds = spans.deviations + np.float32(prior)
     labels = best_labels(log_odds)
     confusion = of_team = _confusion(labels, surface, truth.class_ids, spans.num_cells, num_classes)
-    # At the end of a run it often is the same.
+    # At the end of a run the map often knows all of the region.
     if not region.is_same(Region([spans])):
         of_team = _confusion_of_region(labels, surface, spans, truth, region)
     iou = _intersections_over_unions(of_team)
     is_seen = np.zeros(truth.codes.size, np.bool_)
     is_seen[surface.is_known] = labels[surface.leaves] > 0
-    # Classes first: sums along the short axis would take several times as long.
+    # Classes come first: sums along the short axis would take several times as long.
     by_class = np.ascontiguousarray(log_odds.T)
     errors = team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
     if num_robots > 1:
@@ -84,20 +61,21 @@ def truth_scores(
 def agreement(
     spans: LeafSpans, prior: float, reference: LeafSpans, reference_prior: float, num_cells: int
 ) -> tuple[float, float]:
-    """Share of ``num_cells`` cells, and of those the reference calls occupied, where a map's label is the reference's.
+    """Return the shares of cells in which a map has the reference's label.
 
-    A cell that one of them does not know is a disagreement. 1 where there is nothing to count.
+    The first is of ``num_cells`` cells, the second of the cells that the reference calls occupied. A cell that only one
+    of the maps knows is a disagreement. A share of no cells is 1.
     """
-    runs = common_runs(spans, reference)
-    both = (runs.leaves_a >= 0) & (runs.leaves_b >= 0)
-    leaf, other = runs.leaves_a[both], runs.leaves_b[both]
+    intervals = common_intervals(spans, reference)
+    both = (intervals.leaves_a >= 0) & (intervals.leaves_b >= 0)
+    leaf, other = intervals.leaves_a[both], intervals.leaves_b[both]
     labels = best_labels(spans.deviations + np.float32(prior))[leaf]
     values = reference.deviations + np.float32(reference_prior)
     best = np.maximum(values.max(axis=1, initial=0.0), 0.0)[other]
     of_label = np.where(labels > 0, values[other, np.maximum(labels, 1) - 1], 0.0)
-    agrees = of_label >= best - np.float32(TIE)
+    agrees = of_label >= best - np.float32(TIE_TOLERANCE)
     is_occupied = best_labels(values) > 0
-    weights = runs.num_cells[both] * agrees
+    weights = intervals.num_cells[both] * agrees
     parts = weights.sum(), weights[is_occupied[other]].sum()
     wholes = num_cells, reference.num_cells[is_occupied].sum()
     shares = [float(part / whole) if whole else 1.0 for part, whole in zip(parts, wholes, strict=True)]
@@ -105,9 +83,16 @@ def agreement(
 
 
 class _Surface(NamedTuple):
-    """The truth's cells that a map knows: which they are (M,), the leaf around each (k,), and their number in leaves.
+    """The truth's cells that a map knows.
 
-    ``num_cells`` (L,) counts all of them, ``num_void`` (L,) those of no class.
+    Attributes
+    ----------
+    is_known : (M,) bool
+        True for the truth's cells that the map knows.
+    leaves : (k,) int64
+        Leaf of each known cell.
+    num_cells, num_void : (L,) int64
+        Number of the truth's cells in each leaf, and of those without a class of the result.
     """
 
     is_known: BoolArray
@@ -117,7 +102,7 @@ class _Surface(NamedTuple):
 
 
 def _surface_in_leaves(spans: LeafSpans, truth: Truth) -> _Surface:
-    """Where the truth's cells are in a map."""
+    """Locate the truth's cells in a map."""
     leaves = spans.leaves_at(truth.codes)
     is_known = leaves >= 0
     leaves, size = leaves[is_known], spans.codes.size
@@ -128,11 +113,11 @@ def _surface_in_leaves(spans: LeafSpans, truth: Truth) -> _Surface:
 def _confusion(
     labels: UInt8Array, surface: _Surface, class_ids: UInt8Array, num_cells: Int64Array, num_classes: int
 ) -> Int64Array:
-    """Cells by truth and label, (C + 1, C + 1), of leaves (L,) with so many cells."""
+    """Cells by truth and label, (C + 1, C + 1), of leaves with ``labels`` and ``num_cells`` (L,)."""
     size = num_classes + 1
     pairs = class_ids[surface.is_known].astype(np.int64) * size + labels[surface.leaves]
     confusion = np.bincount(pairs, minlength=size * size).reshape(size, size)
-    # Row 0 held what is of no class.
+    # Row 0 held the surface cells without a class; it becomes the row of truly free cells.
     confusion[NO_CLASS] = _sums(labels, num_cells - surface.num_cells, size)
     return confusion
 
@@ -140,7 +125,7 @@ def _confusion(
 def _confusion_of_region(
     labels: UInt8Array, surface: _Surface, spans: LeafSpans, truth: Truth, region: Region
 ) -> Int64Array:
-    """Cells by truth and label, (C + 1, C + 2), of the team's region; the last column is what the map does not know."""
+    """Cells by truth and label, (C + 1, C + 2), of the team's region; the last column counts unknown cells."""
     num_classes = spans.deviations.shape[1]
     is_inside = region.holds(truth.codes)
     leaves = surface.leaves[is_inside[surface.is_known]]
@@ -153,7 +138,7 @@ def _confusion_of_region(
 
 
 def _intersections_over_unions(confusion: Int64Array) -> Float64Array:
-    """The IoU (C,) of each class from cells by truth (C + 1 rows) and label; NaN where there is neither."""
+    """IoU (C,) of each class from cells by truth (C + 1 rows) and label; NaN for a class in neither."""
     hits = np.diagonal(confusion)[1:].astype(np.float64)
     unions = confusion.sum(axis=1)[1:] + confusion.sum(axis=0)[1 : len(confusion)] - hits
     iou: Float64Array = np.divide(hits, unions, out=np.full(hits.size, np.nan), where=unions > 0)
@@ -163,15 +148,15 @@ def _intersections_over_unions(confusion: Int64Array) -> Float64Array:
 def _calibration_errors(
     by_class: Float32Array, labels: UInt8Array, surface: _Surface, class_ids: UInt8Array, num_cells: Int64Array
 ) -> tuple[float, float]:
-    """The expected calibration error over all cells of leaves (C, L), and over those occupied in map or truth."""
+    """Expected calibration errors of log-odds (C, L): over all cells, and over those occupied in map or truth."""
     is_hit = class_ids[surface.is_known] == labels[surface.leaves]
     num_hits = np.bincount(surface.leaves[is_hit & (labels[surface.leaves] > 0)], minlength=labels.size)
     is_occupied = labels > 0
     num_correct = np.where(is_occupied, num_hits, num_cells - surface.num_cells)
     num_judged = num_cells - surface.num_void
-    # A leaf that the map calls free counts with the surface in it, all of it wrong.
+    # Of a leaf that the map calls free, only the surface in it counts as occupied, and all of it is wrong.
     num_surface = surface.num_cells - surface.num_void
-    confidence = _confidence(by_class)
+    confidence = 1.0 / shifted_exp_sum(by_class, class_axis=0).astype(np.float64)
     bins = np.clip(np.ceil(confidence * NUM_BINS).astype(np.int64) - 1, 0, NUM_BINS - 1)
     return (
         _calibration_error(bins, confidence, num_correct, num_judged),
@@ -182,31 +167,24 @@ def _calibration_errors(
 def _calibration_error(
     bins: Int64Array, confidence: Float64Array, num_correct: Int64Array, num_cells: Int64Array
 ) -> float:
-    """Sum over bins of |correct cells - their summed confidence|, over all cells: Guo et al., equation 3."""
+    """Sum over bins of |correct cells - summed confidence|, divided by the number of cells: Guo et al., equation 3."""
     correct = _sums(bins, num_correct, NUM_BINS)
     expected = np.bincount(bins, confidence * num_cells, NUM_BINS)
     return _ratio(np.abs(correct - expected).sum(), num_cells.sum())
 
 
-def _confidence(by_class: Float32Array) -> Float64Array:
-    """The probability (L,) of the most probable class from log-odds (C, L)."""
-    largest = np.maximum(by_class.max(axis=0, initial=-np.inf), np.float32(0.0))
-    total: Float64Array = (np.exp(-largest) + np.exp(by_class - largest).sum(axis=0)).astype(np.float64)
-    return 1.0 / total
-
-
 def _sums(places: npt.NDArray[np.integer], weights: Int64Array, size: int) -> Int64Array:
-    """The sum of the weights (n,) at each place; exact below 2^53."""
+    """Sum of the weights (n,) at each place; exact below 2^53."""
     sums: Int64Array = np.bincount(places, weights, size).astype(np.int64)
     return sums
 
 
 def _mean(iou: Float64Array, confusion: Int64Array) -> float:
-    """The mean of the IoU (C,) over the classes that the truth has; NaN where it has none."""
+    """Mean of the IoU (C,) over the classes that occur in truth; NaN where none does."""
     of_truth = iou[confusion.sum(axis=1)[1:] > 0]
     return float(of_truth.mean()) if of_truth.size else math.nan
 
 
 def _ratio(part: float | np.number, whole: float | np.number) -> float:
-    """A part over its whole, NaN where the whole is nothing."""
+    """Quotient of a part and its whole; NaN where the whole is 0."""
     return float(part) / float(whole) if whole else math.nan

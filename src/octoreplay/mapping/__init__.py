@@ -1,1 +1,1 @@
-"""Arrays only, no files and no clock: sensor model, octree, packet codec, consensus rules and map metrics."""
+"""Sensor model, octree, packet codec, consensus rules and map metrics: arrays only, no files and no clock."""

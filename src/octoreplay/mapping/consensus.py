@@ -1,4 +1,4 @@
-"""One iteration of a consensus rule at one robot (Alg. 1 of Asgharivaskasi and Atanasov, and its relatives)."""
+"""One iteration of a consensus rule at one or several robots (Alg. 1 of Asgharivaskasi and Atanasov, and variants)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -17,18 +18,20 @@ from octoreplay.mapping.kernels.storage import BrickTable
 from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
-_RULES = {
-    "gradient": consensus_kernels.GRADIENT,
-    "natural": consensus_kernels.NATURAL,
-    "bayes": consensus_kernels.BAYES,
-    "merge": consensus_kernels.MERGE,
-    "local": consensus_kernels.LOCAL,
-}
+
+class Update(IntEnum):
+    """Update of a map from the mixed map h~ and the evidence log q; ``team_step`` gives the equations."""
+
+    GRADIENT = consensus_kernels.GRADIENT
+    NATURAL = consensus_kernels.NATURAL
+    BAYES = consensus_kernels.BAYES
+    MERGE = consensus_kernels.MERGE
+    COPY = consensus_kernels.COPY
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a robot's own scans say: log q_i = ``octree`` x ``scale``, or divided by each cell's ``scan_counts``."""
+    """Evidence of a robot's own scans: log q_i = ``octree`` x ``scale``, divided by ``scan_counts`` cell by cell."""
 
     octree: SemanticOctree
     scale: float = 1.0
@@ -36,21 +39,24 @@ class Evidence:
 
 
 def gamma_at(consensus: ConsensusConfig, iteration: int) -> float:
-    """gamma_k = gamma / (1 + k / gamma_decay)^gamma_power of a robot's own iteration k, counted from 0."""
+    """Return gamma_k = gamma / (1 + k / gamma_decay)^gamma_power of a robot's ``iteration`` k, counted from 0."""
     return float(consensus.gamma / (1.0 + iteration / consensus.gamma_decay) ** consensus.gamma_power)
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One robot's iteration: its map, which is changed in place, and what it is changed by.
+    """Inputs of one robot's iteration.
 
-    ``neighbours`` are the published maps h_j that arrived, ``step_weights`` their w_ij = 2 epsilon A_ij; ``base`` b_i
-    is the robot's own published map (default: ``own`` itself), ``log_likelihood`` log q_i, and ``last_log_likelihood``
-    the same at the last iteration.
-
-    With ``since``, the revision of an earlier step with the same rule, gamma, weights and neighbours, the bricks at
-    rest are skipped: those that no map has given a revision from ``since`` on. That step changed nothing in them, so
-    this one would not either. All maps' revisions must then be right, the decoded ones' included.
+    - ``own``: the robot's map h_i, changed in place.
+    - ``neighbours``: published maps h_j that arrived.
+    - ``step_weights``: their w_ij = 2 epsilon A_ij.
+    - ``log_likelihood``: log q_i.
+    - ``gamma``: gradient step size.
+    - ``base``: the robot's own published map b_i (default: ``own``).
+    - ``last_log_likelihood``: log q_i at the last iteration (default: ``log_likelihood``).
+    - ``since``: revision of an earlier step with the same update, gamma, weights and neighbours. Bricks of which all
+      revisions are below ``since`` are skipped: the earlier step did not change them, so this one would not either.
+      The revisions of all maps must then be correct, including those of decoded maps.
     """
 
     own: SemanticOctree
@@ -64,52 +70,45 @@ class Step:
 
 
 NUM_PARTS = 16
-"""Parts that a step in threads is cut into."""
+"""Number of parts of a step in threads."""
 
 
 def team_step(
     steps: Sequence[Step],
     *,
-    rule: str,
+    update: Update,
     revision: int,
     clamp: tuple[float, float] = (-math.inf, math.inf),
     threads: Executor | None = None,
 ) -> list[float]:
-    """One iteration at each of several robots, in place; returns each one's largest change of a log-odds.
+    """Run one iteration at each of several robots, in place; return each robot's largest change of a log-odds.
 
-    h~ = h_i + sum_j w_ij (h_j - b_i) over the neighbours. Then
+    The mixed map is h~ = h_i + sum_j w_ij (h_j - b_i), summed over the neighbours. The new map is
 
-    - ``gradient`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
+    - ``GRADIENT`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
       sigma = softmax(h~);
-    - ``natural``: h_i = h~ + gamma (log q_i - h~);
-    - ``bayes``: h_i = h~ + log q_i - log q_i at the last iteration;
-    - ``merge``: as ``bayes``, then clamped; with an empty ``base`` it adds w_ij h_j, again at every arrival;
-    - ``local``: h_i = log q_i.
+    - ``NATURAL``: h_i = h~ + gamma (log q_i - h~);
+    - ``BAYES``: h_i = h~ + log q_i - log q_i at the last iteration;
+    - ``MERGE``: as ``BAYES``, then clamped to ``clamp``; with an empty ``base`` it adds w_ij h_j at every arrival;
+    - ``COPY``: h_i = log q_i.
 
-    h_i[0] stays 0. Bricks that changed get ``revision``. The result is that of the same steps done cell by cell, robot
-    by robot, and does not depend on ``threads``; no robot's ``own`` may be a neighbour's map of another.
+    h_i[0] stays 0. Changed bricks get ``revision``. The result equals that of the same steps done cell by cell and
+    robot by robot, and does not depend on ``threads``. No robot's ``own`` may be among another robot's neighbours.
     """
     if not steps:
         return []
     run: Run = map if threads is None else threads.map
-    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
-    column_of = {id(octree): column for column, octree in enumerate(octrees)}
-    all_since = [step.since for step in steps if step.since is not None]
-    since = min(all_since, default=0)
-    codes = union_codes(octrees, since if len(all_since) == len(steps) else None)
-    table = brick_table(octrees, codes, since, run)
-    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
-    shape = (len(steps), codes.size)
-    is_awake, known_changed, is_even = np.zeros((3, *shape), np.bool_)
-    changes = np.zeros(shape, np.float32)
-    indices = np.empty(shape, np.int64)
+    since, codes, table, columns = _locate_bricks(steps, run)
+    shape, num_classes = (len(steps), codes.size), steps[0].own.num_classes
+    needs_update, known_changed, is_even = np.zeros((3, *shape), np.bool_)
+    changes, indices = np.zeros(shape, np.float32), np.empty(shape, np.int64)
     layouts, known = np.empty((*shape, table.masks.shape[2]), np.uint64), np.empty(shape, np.uint64)
 
     def prepare(n: int) -> None:
         own = steps[n].own
-        is_awake[n] = steps[n].since is None
-        raised = raise_to_columns(own, codes, table, columns[n], is_awake[n])
-        indices[n], layouts[n], known[n], known_changed[n] = raised
+        needs_update[n] = steps[n].since is None
+        expanded = expand_to_columns(own, codes, table, columns[n], needs_update[n])
+        indices[n], layouts[n], known[n], known_changed[n] = expanded
         storage.fill_table(own.bricks, indices[n], since, table, columns[n][OWN])
 
     list(run(prepare, range(len(steps))))
@@ -117,64 +116,78 @@ def team_step(
     first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
     weights = np.concatenate([[0.0] * FIRST_NEIGHBOUR + list(step.step_weights) for step in steps]).astype(np.float32)
     gammas = np.array([step.gamma for step in steps], np.float32)
-    num_classes = steps[0].own.num_classes
 
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
-            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, _RULES[rule], num_classes,
-            np.float32(clamp[0]), np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(), is_awake,
-            *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
+            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, int(update), num_classes,
+            np.float32(clamp[0]), np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(),
+            needs_update, *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
-    parts = np.array_split(np.arange(codes.size), 1 if threads is None else NUM_PARTS)
-    list(run(work, [part for part in parts if part.size]))
+    list(run(work, parts_of(codes.size, threads)))
 
     def finish(n: int) -> float:
-        return float(
-            consensus_kernels.finish_step(
-                steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n],
-                revision,
-            )
-        )  # fmt: skip
+        largest = consensus_kernels.finish_step(
+            steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n], revision
+        )
+        return float(largest)
 
     return list(run(finish, range(len(steps))))
 
 
+def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, BrickTable, list[Int64Array]]:
+    """Return the lowest ``since``, the codes (n,) of the bricks to update, their table, and each step's columns."""
+    since = min((step.since for step in steps if step.since is not None), default=0)
+    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
+    column_of = {id(octree): column for column, octree in enumerate(octrees)}
+    codes = union_codes(octrees, None if any(step.since is None for step in steps) else since)
+    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
+    return since, codes, brick_table(octrees, codes, since, run), columns
+
+
+def parts_of(num_bricks: int, threads: Executor | None) -> list[Int64Array]:
+    """Return the positions 0 to ``num_bricks`` - 1 in non-empty parts of consecutive ones: one part without threads."""
+    parts = np.array_split(np.arange(num_bricks), 1 if threads is None else NUM_PARTS)
+    return [part for part in parts if part.size]
+
+
 def _octrees(step: Step) -> list[SemanticOctree]:
-    """The octrees of a step in the order of the kernel's columns."""
+    """Return the octrees of a step in the order of the kernel's columns."""
     base = step.own if step.base is None else step.base
     last = step.log_likelihood if step.last_log_likelihood is None else step.last_log_likelihood
     return [step.own, base, step.log_likelihood, last, *step.neighbours]
 
 
 def union_codes(octrees: Sequence[SemanticOctree], since: int | None) -> Int64Array:
-    """Sorted codes (n,) of the bricks of any of the octrees; with ``since`` of those that changed from there on."""
+    """Return the sorted codes (n,) of all octrees' bricks; with ``since``, of bricks with at least this revision."""
     union = SemanticOctree(1.0, 1)
     for octree in octrees:
         union.find_or_add(octree.codes if since is None else octree.codes[octree.revisions >= since])
     return np.sort(union.codes)
 
 
-def raise_to_columns(
-    octree: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array, is_awake: BoolArray
+def expand_to_columns(
+    octree: SemanticOctree, codes: Int64Array, table: BrickTable, columns: Int64Array, needs_update: BoolArray
 ) -> tuple[Int64Array, UInt64Array, UInt64Array, BoolArray]:
-    """Give an octree the cells, blocks and rows that it takes to hold the awake bricks ``codes`` (n,) of the columns.
+    """Expand an octree's bricks ``codes`` (n,) by the known cells and class rows of some columns of a table.
 
-    Bricks that changed are awake, those without a known cell are not. Returns the indices (n,), -1 for the others, the
-    masks (n, W) and known cells (n,), and where known cells were added (n,).
+    ``needs_update`` (n,) is changed in place: True is added where a brick changed, and removed where no cell is known.
+    The other bricks are skipped. Returns the brick indices (n,), -1 for skipped bricks, the class rows (n, W), the
+    known cells (n,), and where known cells were added (n,).
     """
     known, has_block = np.zeros(codes.size, np.uint64), np.zeros(codes.size, np.bool_)
     masks = np.zeros((codes.size, table.masks.shape[2]), np.uint64)
-    consensus_kernels.join_columns(table, columns, is_awake, known, has_block, masks)
+    consensus_kernels.join_columns(table, columns, needs_update, known, has_block, masks)
     indices = np.full(codes.size, -1)
-    indices[is_awake] = octree.find_or_add(codes[is_awake])
-    known_changed = octree.raise_bricks(indices, masks, known, has_block)
-    masks[is_awake], known[is_awake] = octree.bricks.masks[indices[is_awake]], octree.known[indices[is_awake]]
+    indices[needs_update] = octree.find_or_add(codes[needs_update])
+    known_changed = octree.expand_bricks(indices, masks, known, has_block)
+    updated = indices[needs_update]
+    masks[needs_update], known[needs_update] = octree.bricks.masks[updated], octree.known[updated]
     return indices, masks, known, known_changed
 
 
 def _scratch(num_classes: int, num_columns: int) -> tuple[Float32Array, Int64Array]:
-    """What the kernels work in: blocks with a row for every class in every octet, and numbers for rows and columns."""
+    """Return scratch memory of the kernels: blocks with all rows, and integers for rows and columns."""
     blocks = (consensus_kernels.NUM_SCRATCH_BLOCKS + num_columns) * (num_classes + 1) + 3
     return (
         cache_aligned((blocks, storage.BRICK_CELLS), np.float32),
@@ -185,14 +198,14 @@ def _scratch(num_classes: int, num_columns: int) -> tuple[Float32Array, Int64Arr
 def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes: Int64Array, revision: int) -> None:
     """Write sum_i log q_i of the bricks ``codes`` (n,) into ``target``: the oracle, or one robot's log q_i.
 
-    All robots read their evidence the same way. Bricks that are written get ``revision``.
+    Either all entries of ``evidence`` have scan counts, or none has. Written bricks get ``revision``.
     """
     octrees = [entry.octree for entry in evidence]
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     table, count_table = brick_table(octrees, codes), brick_table(counts, codes)
     columns = np.arange(len(octrees))
-    indices, masks, known, _ = raise_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
-    target.raise_bricks(indices, masks, known, (count_table.addresses != 0).any(axis=0))
+    indices, masks, known, _ = expand_to_columns(target, codes, table, columns, np.ones(codes.size, np.bool_))
+    target.expand_bricks(indices, masks, known, (count_table.addresses != 0).any(axis=0))
     scales: Float32Array = np.array([entry.scale for entry in evidence], np.float32)
     scratch, int_scratch = _scratch(target.num_classes, 0)
     consensus_kernels.sum_evidence(

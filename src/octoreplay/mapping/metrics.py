@@ -1,4 +1,4 @@
-"""How far a team's maps are from each other and from the oracle, kept brick by brick (docs/metrics.md)."""
+"""Distances and agreement of a team's maps, stored brick by brick; docs/metrics.md defines the metrics."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from octoreplay.log_odds import TIE_TOLERANCE
 from octoreplay.mapping.kernels import metrics as metrics_kernels
 from octoreplay.mapping.kernels.storage import BRICK_CELLS
 from octoreplay.mapping.octree import SemanticOctree, brick_table, cache_aligned
@@ -17,7 +18,7 @@ from octoreplay.records import Float64Array, Int32Array, Int64Array
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """The team's maps compared cell by cell; arrays are (N,) over the robots."""
+    """Result of a comparison, cell by cell; arrays are (N,) over the robots. Distances are squared log-odds."""
 
     total_distance: float
     total_distance_all: float
@@ -31,18 +32,18 @@ class MapComparison:
 
 
 NUM_PARTS = 16
-"""Parts that a comparison in threads is cut into."""
+"""Number of parts of a comparison in threads."""
 
 
 class MapComparer:
-    """Compares N maps and the oracle, and again only where one of them has changed since.
+    """Incremental comparison of N maps and the oracle: only changed bricks are compared again.
 
-    ``prior`` is h_0. The maps' ``revisions`` must grow with every change.
+    ``prior`` is h_0 [log-odds]. The maps' ``revisions`` must increase with every change.
     """
 
     def __init__(self, num_robots: int, prior: float) -> None:
         self._prior = prior
-        # A brick's place in this octree is its row in the tables below.
+        # A brick's index in this octree is its row in the arrays below.
         self._bricks = SemanticOctree(1.0, 1)
         self._links: Int64Array | None = None
         self._distances: Float64Array = np.empty((0, 2))
@@ -57,9 +58,9 @@ class MapComparer:
         since: int,
         threads: Executor | None = None,
     ) -> MapComparison:
-        """The comparison; bricks whose revisions are all below ``since`` keep what was found before.
+        """Return the comparison; bricks with all revisions below ``since`` are not compared again.
 
-        ``links`` names each linked pair of robots once. The result does not depend on ``threads``.
+        ``links`` are robot indices, each linked pair once. The result does not depend on ``threads``.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
         rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]
@@ -81,24 +82,25 @@ class MapComparer:
         return self._result()
 
     def forget(self) -> None:
-        """Compare all bricks anew the next time: a map was replaced by another."""
+        """Compare all bricks at the next call. Needed after a map is replaced by another one."""
         self._links = None
 
     @property
     def brick_distances(self) -> tuple[Int64Array, Float64Array]:
-        """Of the last comparison: the bricks' codes (n,), and each one's part of ``total_distance`` (n,)."""
+        """Codes (n,) of the bricks, and each brick's part (n,) of ``total_distance`` in the last comparison."""
         return self._bricks.codes, self._distances[: self._bricks.num_bricks, 0]
 
     def _refresh(
         self, maps: Sequence[SemanticOctree], oracle: SemanticOctree, rows: Int64Array, link_ends: Int64Array
     ) -> None:
-        """Compare the bricks ``rows`` (n,) anew."""
+        """Compare the bricks at the ``rows`` (n,) of the arrays."""
         codes = self._bricks.codes[rows]
         table = brick_table([*maps, oracle], codes)
         metrics_kernels.compare_maps(
             table,
             link_ends,
             np.float32(self._prior),
+            np.float32(TIE_TOLERANCE),
             maps[0].num_classes,
             cache_aligned(((len(maps) + 1) * maps[0].num_classes + 5, BRICK_CELLS), np.float32),
             cache_aligned((5, BRICK_CELLS), np.int32),
@@ -109,7 +111,7 @@ class MapComparer:
         )
 
     def _result(self) -> MapComparison:
-        """The sums over all bricks."""
+        """Sum over all bricks."""
         distances = self._distances.sum(axis=0)
         counts = self._counts.sum(axis=0, dtype=np.int64)
         per_robot = counts[4:].reshape(-1, 3)
@@ -129,5 +131,5 @@ class MapComparer:
 
 
 def _share(parts: Int64Array, whole: int) -> Float64Array:
-    """Parts / whole, where a share of nothing is 1."""
+    """Return parts / whole; 1 where the whole is 0."""
     return parts / whole if whole else np.ones(len(parts))

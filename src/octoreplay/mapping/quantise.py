@@ -1,4 +1,4 @@
-"""What is left of a map in a lossy packet: coarser numbers, and the likeliest classes only."""
+"""Lossy reduction of maps for packets: coarser numbers, and the most probable classes only."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, leaf_list, leaf_values, octree_from_streams
+from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
+from octoreplay.mapping.streams import TreeStreams, leaf_list, leaf_values
 from octoreplay.records import Float32Array
 
 CONTENTS = ("float32", "float16", "int8")
-"""The numbers that a packet may hold, in the order of their number in its header."""
+"""Number formats of packets, in the order of their codes in the header."""
 FLOAT16_MAX = 65504.0
 INT8_MAX = 127
 
 
 def is_step(step: float) -> bool:
-    """True for a step of int8 with which all its values are float32 numbers."""
+    """Return True where all multiples of an int8's ``step`` are finite float32 numbers."""
     with np.errstate(all="ignore"):
         return bool(np.float32(step) > 0 and np.isfinite(np.float32(INT8_MAX) * np.float32(step)))
 
 
 def content_numbers(values: Float32Array, content: str, step: float) -> npt.NDArray[Any]:
-    """The numbers, of the dtype ``content``, that stand for ``values`` (n,) float32 in a packet.
+    """Return the numbers (n,) of dtype ``content`` that represent ``values`` (n,) float32 in a packet.
 
-    ``float32`` keeps the values as they are. Of ``float16`` and ``int8`` (a value's nearest multiple of the float32
-    ``step``, ties to the even one) each is the nearest there is, so values beyond their range are at its ends; what is
-    no number is 0, and 0 has no sign. Raises ValueError for an unknown content and a step that ``is_step`` refuses.
+    ``float32`` keeps the values. ``float16`` is the nearest number, ``int8`` the nearest multiple of the float32
+    ``step``, ties to even. Values beyond the range become its ends, NaN becomes 0, and -0 becomes 0. Raises ValueError
+    for an unknown content and for a step that ``is_step`` refuses.
     """
     if content == "float32":
         return values
@@ -41,13 +42,13 @@ def content_numbers(values: Float32Array, content: str, step: float) -> npt.NDAr
 
 
 def _clipped(values: Float32Array, limit: float) -> Float32Array:
-    """Values (n,) from -limit to limit; 0 for what is no number."""
+    """Clip values (n,) to [-limit, limit]; NaN becomes 0."""
     clipped: Float32Array = np.nan_to_num(np.clip(values, -limit, limit))
     return clipped
 
 
 def content_values(numbers: npt.NDArray[Any], content: str, step: float) -> Float32Array:
-    """The values (n,) float32 that ``content_numbers`` (n,) stand for."""
+    """Return the values (n,) float32 that ``content_numbers`` (n,) represent."""
     if content == "int8":
         _check_int8(content, step)
         return numbers.astype(np.float32) * np.float32(step)
@@ -55,22 +56,22 @@ def content_values(numbers: npt.NDArray[Any], content: str, step: float) -> Floa
 
 
 def _check_int8(content: str, step: float) -> None:
-    """Refuse an unknown content, and a step that int8 cannot have."""
+    """Raise ValueError for an unknown content and for an invalid step of int8."""
     if content not in CONTENTS:
-        raise ValueError(f"content '{content}': a packet holds {', '.join(CONTENTS)}")
+        raise ValueError(f"content '{content}' is unknown; choose one of {', '.join(CONTENTS)}")
     if not is_step(step):
-        raise ValueError(f"step {step:g}: {INT8_MAX} steps of int8 must be positive float32 numbers")
+        raise ValueError(
+            f"step {step:g}: multiples 1 to {INT8_MAX} of the step of int8 must be positive float32 numbers"
+        )
 
 
 def quantised(octree: SemanticOctree, content: str, step: float) -> SemanticOctree:
-    """A copy in which every value is one that ``content`` can hold: what a receiver of such a packet has.
+    """Return a copy with the values that a receiver of packets with this ``content`` gets.
 
-    The number of a value is that of ``content_numbers``; the layout and the revisions stay, and equal leaves are merged
-    by the encoder.
-
-    Raises ValueError as ``content_numbers`` does.
+    Values are those of ``content_numbers``. Layout and revisions do not change; the encoder merges equal leaves. Raises
+    ValueError like ``content_numbers``.
     """
-    # A plain copy would keep unused blocks, whose rows hold no values but the list of them.
+    # octree.copy() would copy unused blocks, and the list of unused blocks in their rows must not be quantised.
     copy = SemanticOctree(octree.resolution, octree.num_classes)
     copy.overwrite(octree, np.arange(octree.num_bricks))
     copy.revisions[:] = octree.revisions
@@ -81,10 +82,10 @@ def quantised(octree: SemanticOctree, content: str, step: float) -> SemanticOctr
 
 
 def top_classes(octree: SemanticOctree, num_kept: int) -> SemanticOctree:
-    """A copy in which every cell keeps its ``num_kept`` >= 1 largest log-odds, the lower class where they tie.
+    """Return a copy in which every cell keeps its ``num_kept`` >= 1 largest log-odds; ties go to the lower class.
 
-    All other classes get one value, log(mean(exp(h_c))) over them, which keeps their probability together. A cell
-    whose classes are all equal stays as it is, and so does every cell that has no more classes than are kept.
+    All other classes get one value, log(mean(exp(h_c))) over them, which keeps the sum of their probabilities. Cells in
+    which all classes are equal do not change; nothing changes with ``num_kept`` >= the number of classes.
     """
     if num_kept >= octree.num_classes:
         return octree.copy()
@@ -94,7 +95,7 @@ def top_classes(octree: SemanticOctree, num_kept: int) -> SemanticOctree:
     order = np.argsort(-vectors, axis=1, kind="stable")
     others = np.take_along_axis(vectors, order[:, num_kept:], axis=1).astype(np.float64)
     with np.errstate(all="ignore"):
-        # Shifted by the largest one, so that nothing overflows; an infinite one is the mean.
+        # Shifted by the largest value, so that nothing overflows; an infinite value is the result itself.
         largest = others.max(axis=1)
         spread = np.log(np.exp(others - largest[:, None]).mean(axis=1))
         shared = np.where(np.isinf(largest), largest, largest + spread).astype(np.float32)
@@ -111,5 +112,5 @@ def top_classes(octree: SemanticOctree, num_kept: int) -> SemanticOctree:
 
 
 def _vector_leaves(streams: TreeStreams, is_vector: npt.NDArray[np.bool_]) -> TreeStreams:
-    """The leaves whose classes differ, without their words."""
+    """Return the vector leaves of a stream, without words."""
     return streams._replace(words=streams.words[:0], values=streams.values[is_vector])

@@ -1,4 +1,4 @@
-"""The inverse sensor model: one scan into the octrees of one robot."""
+"""Inverse sensor model: insertion of one scan into an octree."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from octoreplay.records import (
     Int32Array,
     Int64Array,
     UInt8Array,
+    read_only,
 )
 
 MAX_GRID_CELLS = 1 << 32
-"""Largest scratch grid of one scan, in cells."""
+"""Maximum size of the scratch grid of one scan [cell]."""
 
 
 @dataclass(frozen=True)
 class Increments:
-    """What one scan adds to an octree's cells: log-odds for a hit, a pass and the classes not hit, and the limits.
+    """Log-odds that one scan adds to a cell: ``hit`` to the class hit, ``hit_other`` to the others, ``miss`` if passed.
 
-    ``is_count`` says that a hit counts in full however sure its label is.
+    Sums are clamped to [``least``, ``most``]. With ``is_count``, hits ignore the labels' confidences.
     """
 
     hit: float
@@ -43,28 +44,30 @@ class Increments:
 
 
 def clamped_increments(sensor: SensorConfig) -> Increments:
-    """The evidence s of a robot: the sensor model's increments, clamped."""
+    """Return the sensor model's increments with its clamping limits: evidence s of a robot."""
     hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
     return Increments(sensor.hit, sensor.miss, hit_other, sensor.clamp_min, sensor.clamp_max)
 
 
 def unclamped_increments(sensor: SensorConfig) -> Increments:
-    """The running sum behind the average readings of the evidence."""
+    """Return the sensor model's increments without limits: the sum behind the averages of the evidence."""
     hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
     return Increments(sensor.hit, sensor.miss, hit_other, -np.inf, np.inf)
 
 
 COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf, is_count=True)
-"""Increments that count the scans which touched a cell, in an octree with one class."""
+"""Increments that count the scans that touched a cell, in an octree with one class."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchedCells:
-    """The cells that one scan touches: brick codes (n,), and the marks (64 each, Morton order) of those bricks.
+    """Cells that one scan touches. ``marks`` and ``strengths`` are the caster's memory, valid until its next cast.
 
-    A mark is 0 untouched, 1 passed, 1 + class_id hit. ``strengths``, parallel to the marks, are how sure the class of
-    each hit is, in 255ths; empty where all are sure. Both are the caster's scratch memory, and are valid until it casts
-    again.
+    - ``codes`` (n,): Morton codes of the bricks with a touched cell.
+    - ``marks``: one byte for each cell of the scratch grid, 64 for each brick in Morton order: 0 untouched, 1 passed,
+      1 + class_id hit.
+    - ``touched`` (n,): position of each brick in the scratch grid.
+    - ``strengths``: label confidence of each hit in 1 / 255, parallel to ``marks``; size 0 for full confidence.
     """
 
     codes: Int64Array
@@ -74,16 +77,16 @@ class TouchedCells:
 
 
 def sensor_reach(sensor: SensorConfig, map_config: MapConfig) -> float:
-    """How far from the map's origin along an axis a sensor may be, so that all its rays stay in the key space [m].
+    """Return the largest coordinate of a sensor with which all its rays stay in the key space [m].
 
-    Half of the key space at least, where rays are as long as that.
+    It is at least half of the key space's reach, however large ``max_range`` is.
     """
     reach = storage.KEY_OFFSET * map_config.resolution
     return reach - min(sensor.max_range + 2 * map_config.resolution, reach / 2)
 
 
 class ScanCaster:
-    """Finds the cells that scans touch; keeps scratch memory between them, so one per thread."""
+    """Ray caster: finds the cells that a scan touches. It reuses scratch memory, so each thread needs its own."""
 
     def __init__(self, sensor: SensorConfig, map_config: MapConfig, num_classes: int) -> None:
         self._sensor = sensor
@@ -99,26 +102,26 @@ class ScanCaster:
         self._runs = _Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
-        """The cells that a scan touches: each once, hit before passed.
+        """Return the cells that a scan touches. A cell that is hit is not also passed.
 
-        Rays follow ``sensor.rays``: one per distinct end cell to its centre, or one per point. Labels vote with their
-        confidences, and points in robots' bodies hit nothing. Raises InputError where the scan leaves the key space,
-        and ConfigError where max_range is too long for the resolution.
+        ``sensor.rays`` selects one ray for each distinct end cell, to its centre, or one for each point. Labels are
+        weighted by their confidences; points in robots' bodies hit nothing. Raises InputError where the scan leaves the
+        key space, and ConfigError where max_range is too long for the resolution.
         """
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
         self._find_runs(frame)
         runs = self._runs
         low, high = self._box(frame, origin)
-        is_sure = _confidences(frame).size == 0
-        num_ends = runs.reduce(low, high, self._num_classes, is_sure=is_sure)
+        has_full_confidence = _confidences(frame).size == 0
+        num_ends = runs.reduce(low, high, self._num_classes, has_full_confidence=has_full_confidence)
         end_keys, end_marks = runs.end_keys[:num_ends], runs.end_marks[:num_ends]
         corner, num_blocks, marks, flags = self._grid(low, high)
-        strengths = self._strength_plane(0 if is_sure else marks.size)
+        strengths = self._strength_plane(0 if has_full_confidence else marks.size)
         start = self._start(origin, corner)
         tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
         casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
         casting.mark_hits(end_keys, end_marks, corner, tables, marks, flags)
-        if not is_sure:
+        if not has_full_confidence:
             casting.mark_strengths(end_keys, end_marks, runs.end_strengths, corner, tables, strengths)
         if self._is_bounded:
             casting.clear_outside(*self._mapped(corner, num_blocks), num_blocks, marks, flags)
@@ -128,7 +131,7 @@ class ScanCaster:
         return TouchedCells(codes[:count], marks, touched[:count], strengths)
 
     def _find_runs(self, frame: Frame) -> None:
-        """Put the ends of the scan's rays into the runs."""
+        """Write the ends of the scan's rays into the runs."""
         size = frame.depth_image.size if isinstance(frame, DepthFrame) else len(frame.points)
         if size > self._runs.capacity:
             self._runs = _Runs(size, self._num_classes, self._sensor.rays)
@@ -145,7 +148,7 @@ class ScanCaster:
             self._find_cloud_runs(frame, self._lens_points(frame, frame.camera.slopes), classes, pose)
 
     def _find_depth_runs(self, frame: DepthFrame, pose: Float64Array) -> None:
-        """Runs of a depth image's rays."""
+        """Find the runs of a depth image without lens distortion."""
         camera = frame.camera
         depth, *values = self._depths(frame)
         classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
@@ -156,19 +159,19 @@ class ScanCaster:
         )  # fmt: skip
 
     def _lens_points(self, frame: DepthFrame, slopes: Float32Array) -> Float64Array:
-        """The points (P, 3) of a depth image in the sensor's frame; those beyond max_range have their direction."""
+        """Return the points (P, 3) of a depth image in the sensor's frame [m], at most 2 x max_range deep."""
         depth, *values = self._depths(frame)
         points = np.empty((depth.size, 3))
         farthest = 2.0 * self._sensor.max_range
-        ends.depth_to_points(depth, frame.depth_unit, _read_only(slopes), farthest, *values, points)
+        ends.depth_to_points(depth, frame.depth_unit, read_only(slopes), farthest, *values, points)
         return points
 
     def _depths(self, frame: DepthFrame) -> tuple[npt.NDArray[Any], float, Float64Array, Float64Array]:
-        """A depth image as kernels take it, the largest value of its type, and special values with their meanings."""
+        """Return a depth image as kernel arguments: image, largest value of its dtype, special values, meanings."""
         depth = frame.depth_image
         kind = np.uint16 if depth.dtype.kind in "ui" and depth.dtype.itemsize <= 2 else np.float32
         largest = float(np.iinfo(depth.dtype).max) if depth.dtype.kind in "ui" else np.inf
-        # A float image stores a value such as 2.1 as its nearest float32, and that is what it is to be compared with.
+        # A float image stores a value such as 2.1 as the nearest float32, so that is what pixels are compared with.
         stored = np.float32 if kind is np.float32 else np.float64
         special = self._special.astype(stored).astype(np.float64)
         return np.ascontiguousarray(depth, kind), largest, special, self._meanings
@@ -176,7 +179,7 @@ class ScanCaster:
     def _find_cloud_runs(
         self, frame: Frame, points: npt.NDArray[Any], class_ids: UInt8Array | None, pose: Float64Array
     ) -> None:
-        """Runs of the rays to a frame's points (P, 3), which have the classes (P,)."""
+        """Find the runs of points (P, 3) with the classes (P,)."""
         kind = np.float32 if points.dtype == np.float32 else np.float64
         classes = np.empty(0, np.uint8) if class_ids is None else class_ids
         ends.points_to_runs(
@@ -185,12 +188,12 @@ class ScanCaster:
         )  # fmt: skip
 
     def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
-        """Least and greatest key (3,) of the origin and all ends."""
+        """Return the lowest and highest key (3,) of the origin and all ends."""
         start = np.floor(origin / self._resolution)
         if np.any(np.abs(start) >= storage.KEY_OFFSET):
             raise self._outside(frame)
         low, high = start.astype(np.int64), start.astype(np.int64)
-        ends.widen_to_keys(self._runs.keys[: self._runs.num_runs], low, high)
+        ends.extend_bounds(self._runs.keys[: self._runs.num_runs], low, high)
         if np.any(low <= -storage.KEY_OFFSET) or np.any(high >= storage.KEY_OFFSET):
             raise self._outside(frame)
         if float(np.prod(high - low + 2.0 * casting.BLOCK_EDGE)) > MAX_GRID_CELLS:
@@ -201,7 +204,7 @@ class ScanCaster:
         return low, high
 
     def _outside(self, frame: Frame) -> InputError:
-        """The error of a scan that leaves the key space."""
+        """Return the error of a scan that leaves the key space."""
         reach = storage.KEY_OFFSET * self._resolution
         return InputError(
             f"robot '{frame.robot_id}', {frame.stamp_ns} ns: the scan lies outside the map, which reaches "
@@ -210,33 +213,33 @@ class ScanCaster:
         )
 
     def _grid(self, low: Int64Array, high: Int64Array) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
-        """An empty scratch grid around the cells low..high: lowest cell, size in blocks, marks, flags of blocks."""
+        """Return an empty scratch grid around the cells low..high: lowest cell, size in blocks, marks, flags."""
         casting.clear_marks(self._marks, self._flags)
         first = low >> casting.BLOCK_BITS
         num_blocks = (high >> casting.BLOCK_BITS) - first + 1
         size = int(np.prod(num_blocks))
         if size > self._flags.size:
-            # Fresh memory is zero and takes no room until it is touched.
+            # np.zeros maps fresh memory, which takes no physical memory until it is written.
             self._marks = np.zeros(size * casting.BLOCK_CELLS, np.uint8)
             self._flags = np.zeros(size, np.uint8)
         marks = self._marks[: size * casting.BLOCK_CELLS]
         return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
 
     def _strength_plane(self, size: int) -> UInt8Array:
-        """Memory for the strengths of the hits in a scratch grid of ``size`` cells; what is not hit is not read."""
+        """Return memory for the strengths in a scratch grid of ``size`` cells; only those of hit cells are read."""
         if size > self._strengths.size:
             self._strengths = np.zeros(size, np.uint8)
         return self._strengths[:size]
 
     def _start(self, origin: Float64Array, corner: Int64Array) -> Float64Array:
-        """Where rays begin, in cells of a scratch grid and without what is finer than casting.FRACTION."""
+        """Return the start of the rays in cells of the scratch grid, rounded to a multiple of casting.FRACTION."""
         coords = origin / self._resolution
         keys = np.floor(coords)
         inside = np.minimum(np.rint((coords - keys) / casting.FRACTION) * casting.FRACTION, 1.0 - casting.FRACTION)
         return np.asarray(keys - corner + inside)
 
     def _mapped(self, corner: Int64Array, num_blocks: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """The cells [low, high) (3,) of a scratch grid whose centres lie within the bounds."""
+        """Return the box [low, high) (3,) of the scratch grid's cells with centres within the configured bounds."""
         low, high = np.empty(3, np.int64), np.empty(3, np.int64)
         for axis in range(3):
             local = np.arange(num_blocks[axis] * casting.BLOCK_EDGE)
@@ -247,12 +250,12 @@ class ScanCaster:
 
 
 class _Runs:
-    """Memory for the ends of a scan's rays: of neighbouring points with one end cell, then of distinct cells."""
+    """Memory for the ends of a scan's rays: first as runs of neighbouring points, then as distinct end cells."""
 
     def __init__(self, capacity: int, num_classes: int, rays: str) -> None:
         self.capacity = capacity
         self.counters = np.zeros(2, np.int64)
-        # One place more than there are points: what carries no information is written and then written over.
+        # One more than the points: kernels write points without information too, and overwrite them with the next.
         places = capacity + 1
         self.keys = np.empty((places, 3), np.int32)
         self.kinds = np.empty(places, np.uint8)
@@ -274,13 +277,13 @@ class _Runs:
 
     @property
     def outputs(self) -> tuple[npt.NDArray[Any], ...]:
-        """What the kernels that find runs write to."""
+        """Output arrays of the kernels that find runs."""
         return self.keys, self.kinds, self.lengths, self._sums, self._points, self._point_keys, self.counters
 
-    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int, *, is_sure: bool) -> int:
-        """Reduce the runs, all within low..high, to distinct end cells; returns their number.
+    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int, *, has_full_confidence: bool) -> int:
+        """Reduce the runs, all within low..high, to distinct end cells; return their number.
 
-        Cells get strengths unless ``is_sure`` says that the points have no confidences.
+        Without ``has_full_confidence``, the cells get strengths from the points' confidences.
         """
         num_runs = self.num_runs
         keys, edges = self.keys[:num_runs], high - low + 1
@@ -289,7 +292,7 @@ class _Runs:
             keys, self.kinds, self.lengths, low, edges, num_classes, table, self._votes, self._end_cells, self.end_keys,
             self.end_marks,
         )  # fmt: skip
-        if not is_sure:
+        if not has_full_confidence:
             self.end_strengths = np.empty(num_ends, np.uint8)
             ends.weigh_ends(
                 keys, self.kinds, self._sums, low, edges, num_classes, table, self._votes,
@@ -299,7 +302,7 @@ class _Runs:
         return int(num_ends)
 
     def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
-        """End points [m] (n, 3) and end cells (n, 3) of the rays; no end points where rays go to cells' centres."""
+        """Return end points (n, 3) [m] and end cells (n, 3) of the rays; no end points if rays go to cell centres."""
         if not self._every:
             return self._points, self.end_keys[:num_ends]
         num_points = int(self.counters[ends.NUM_POINTS])
@@ -307,13 +310,14 @@ class _Runs:
 
 
 def _confidences(frame: Frame) -> UInt8Array:
-    """How sure the label of each point is (P,), in 255ths; empty where all are sure."""
+    """Return the label confidences (P,) in 1 / 255; size 0 for full confidence."""
     given = frame.confidence_image if isinstance(frame, DepthFrame) else frame.confidences
-    return _read_only(np.empty(0, np.uint8) if given is None else given.ravel())
+    # Read-only like frames from logs, so that kernels are compiled for one signature.
+    return read_only(np.empty(0, np.uint8) if given is None else given.ravel())
 
 
 def _boxes(frame: Frame) -> Float64Array:
-    """The boxes (b, 4, 6) of robots' bodies as kernels take them."""
+    """Return the boxes (b, 4, 6) of robots' bodies in the kernels' format."""
     boxes = np.zeros((len(frame.boxes), 4, 6))
     for rows, box in zip(boxes, frame.boxes, strict=True):
         rows[:3, :4], rows[:3, 4], rows[:3, 5] = box.T_box_team[:3], box.low, box.high
@@ -321,15 +325,8 @@ def _boxes(frame: Frame) -> Float64Array:
     return boxes
 
 
-def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """An array in C order that cannot be written, whichever it is: kernels are compiled once."""
-    view = np.ascontiguousarray(array).view()
-    view.flags.writeable = False
-    return view
-
-
 def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
-    """Add one scan's increments to an octree; changed bricks get ``revision``."""
+    """Add the increments of one scan to an octree, in place; changed bricks get ``revision``."""
     indices = octree.find_or_add(cells.codes)
     words = cells.marks.view(np.uint64)
     miss, least, most = np.float32(increments.miss), np.float32(increments.least), np.float32(increments.most)
@@ -338,7 +335,7 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
     evidence.wanted_rows(
         octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
     )
-    octree.raise_bricks(indices, wanted, known, changes)
+    octree.expand_bricks(indices, wanted, known, changes)
     brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
     steps = np.float32(increments.hit), miss, np.float32(increments.hit_other), least, most
     num_words = storage.OCTETS * (octree.num_classes + 1) + 1

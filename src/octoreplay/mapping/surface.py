@@ -1,4 +1,4 @@
-"""Labelled surfaces as cells: points on triangles, and the class that most of a cell's points carry."""
+"""Conversion of labelled surfaces to cells: points on triangles, and the majority class of each cell."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from octoreplay.records import Float64Array, Int64Array, UInt8Array
 
 BATCH = 1_000_000
-"""About so many points are made at once."""
+"""Approximate number of points in a batch."""
 
 
 def num_cuts(corners: Float64Array, spacing: float) -> Int64Array:
-    """Into how many parts each edge of triangles (T, 3, 3) is cut, so that no part is longer than ``spacing``: (T,)."""
+    """Return into how many parts (T,) the edges of triangles (T, 3, 3) are cut, each at most ``spacing`` long [m]."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     cuts: Int64Array = np.maximum(1, np.ceil(edges.max(axis=1) / spacing)).astype(np.int64)
     return cuts
 
 
 def points_on_triangles(corners: Float64Array, spacing: float) -> Iterator[tuple[Float64Array, Int64Array]]:
-    """Batches of points (P, 3) at most ``spacing`` apart on triangles (T, 3, 3), and whose they are: (P,).
+    """Yield batches of points (P, 3) at most ``spacing`` apart on triangles (T, 3, 3), and their triangles (P,) [m].
 
-    Every triangle is cut into n x n equal ones, and their centroids are given; n follows from its longest edge.
+    Each triangle is cut into n x n equal ones, n = ``num_cuts``; the points are their centroids.
     """
     cuts = num_cuts(corners, spacing)
     for n in np.unique(cuts).tolist():
@@ -39,7 +39,7 @@ def points_on_triangles(corners: Float64Array, spacing: float) -> Iterator[tuple
 
 
 def _centroid_weights(n: int, first: int, end: int) -> Float64Array:
-    """Barycentric weights (P, 3) of the centroids in the rows from ``first`` to ``end`` of a triangle cut n x n."""
+    """Return barycentric weights (P, 3) of the centroids in rows ``first`` to ``end`` of a triangle cut into n x n."""
     i, j = np.meshgrid(np.arange(first, end), np.arange(n), indexing="ij")
     upright = np.stack([i, j], axis=-1)[i + j < n] + 1 / 3
     inverted = np.stack([i, j], axis=-1)[i + j < n - 1] + 2 / 3
@@ -49,20 +49,20 @@ def _centroid_weights(n: int, first: int, end: int) -> Float64Array:
 
 
 class CellVotes:
-    """Counts the points of each class in each cell, batch by batch."""
+    """Number of points of each class in each cell, counted batch by batch."""
 
     def __init__(self) -> None:
         self._votes = _Votes(np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.int64))
         self._waiting: list[_Votes] = []
 
     def add(self, cells: Int64Array, class_ids: UInt8Array) -> None:
-        """One vote for the class (P,) in the cell (P,) of each point; any numbers may name the cells."""
+        """Count points: their cells (P,), as any integer ids, and their classes (P,)."""
         self._waiting.append(_counted(cells, class_ids))
         if sum(len(votes.cells) for votes in self._waiting) > max(BATCH, len(self._votes.cells)):
             self._merge()
 
     def winners(self) -> tuple[Int64Array, UInt8Array]:
-        """The cells (M,) with any vote, ascending, and the class (M,) with the most in each; ties to the lower id."""
+        """Return the cells (M,) in ascending order and their majority classes (M,); ties go to the lower class_id."""
         self._merge()
         cells, class_ids, counts = self._votes
         order = np.lexsort((class_ids, -counts, cells))
@@ -70,14 +70,14 @@ class CellVotes:
         return winners, class_ids[order[first]]
 
     def _merge(self) -> None:
-        """Add what waits to the counts."""
+        """Add the waiting batches to the counts."""
         cells, class_ids, counts = zip(self._votes, *self._waiting, strict=True)
         self._votes = _counted(np.concatenate(cells), np.concatenate(class_ids), np.concatenate(counts))
         self._waiting = []
 
 
 class _Votes(NamedTuple):
-    """Each cell (V,) with each class (V,) that has votes in it, and their number (V,)."""
+    """Number of points (V,) of each pair of cell (V,) and class (V,) that occurs."""
 
     cells: Int64Array
     class_ids: UInt8Array
@@ -85,7 +85,7 @@ class _Votes(NamedTuple):
 
 
 def _counted(cells: Int64Array, class_ids: UInt8Array, weights: Int64Array | None = None) -> _Votes:
-    """The votes of points (P,), each for one or for ``weights`` (P,)."""
+    """Count points (P,) by cell and class, each once or ``weights`` (P,) times."""
     found, place = np.unique(cells, return_inverse=True)
     pairs, place = np.unique(place << 8 | class_ids, return_inverse=True)
     counts = np.bincount(place, weights, len(pairs)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Ctrl-C that waits until a tick is done and its file is whole."""
+"""Deferred signals: Ctrl-C takes effect between two ticks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[[], None]]:
-    """Hold SIGINT and SIGTERM back while the body runs, except where it calls the function that it is given.
+    """Defer SIGINT and SIGTERM while the body runs; the yielded function delivers a pending signal.
 
-    An exception in the middle of a write would leave a chunk half in the file; inside a lock or a callback it could
-    stop the threads for ever, or get lost. What came is delivered at the end of the body at the latest. In other
-    threads than the main one, where signals never arrive, the body just runs.
+    An exception during a write would leave an incomplete chunk in the file; inside a lock or a callback it could block
+    the threads or get lost. A pending signal is delivered at the end of the body at the latest. Outside the main
+    thread, where no signals arrive, nothing is deferred.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None

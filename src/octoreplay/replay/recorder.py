@@ -1,4 +1,4 @@
-"""What of a run goes into the result: metrics and poses every tick, maps every few seconds, the summary at the end."""
+"""Recording of a run: metrics and poses in every tick, maps every few seconds, the summary at the end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
@@ -15,15 +15,16 @@ from octoreplay.records import CENTRAL, FrameCounts, LeafTable, LinkTotals, MapS
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
-"""Every so many stored states of a robot, the first included, is a key frame."""
+"""Number of stored states of a robot from one key frame to the next."""
 
 
 class Recorder:
-    """Writes ticks to a result (or nowhere) and sums them up; robots' maps are encoded in parallel ``threads``."""
+    """Writer of ticks to a result (None: no result) and of their summary; maps are encoded in parallel ``threads``."""
 
-    def __init__(self, config: RunConfig, writer: ResultWriter | None, threads: Executor) -> None:
+    def __init__(self, config: ResolvedRun, writer: ResultWriter | None, threads: Executor) -> None:
         self.start_ns = 0
         self.last: Tick | None = None
+        self.num_known_cells = 0
         self._config = config
         self._writer = writer
         self._threads = threads
@@ -40,7 +41,7 @@ class Recorder:
         self._links = LinkTotals()
 
     def record(self, tick: Tick) -> None:
-        """Take one tick in."""
+        """Record one tick."""
         if self.last is None:
             self.start_ns = tick.stamp_ns
         self.last = tick
@@ -64,7 +65,7 @@ class Recorder:
     def finish(
         self, stop_reason: str, counts: Mapping[str, FrameCounts], warnings: tuple[str, ...], wall_seconds: float
     ) -> RunSummary:
-        """Store the last maps and sum the run up; at least one tick was recorded."""
+        """Store the last maps and return the summary; at least one tick was recorded."""
         tick = self.last
         assert tick is not None
         if self._writer is not None:
@@ -93,7 +94,8 @@ class Recorder:
         )
 
     def _add_up(self, metrics: TickMetrics) -> None:
-        """Sums and peaks over the ticks."""
+        """Update the sums and peaks over the ticks."""
+        self.num_known_cells = metrics.num_known_cells
         self._num_settling += metrics.settling
         self._peak = max(self._peak, metrics.total_distance)
         self._peak_all = max(self._peak_all, metrics.total_distance_all)
@@ -105,19 +107,19 @@ class Recorder:
         self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
 
     def _is_due(self, tick: Tick, every: float) -> bool:
-        """True when a multiple of ``every`` seconds of log time fell into the period that ends with this tick."""
+        """True when a multiple of ``every`` seconds of log time lies in the period that ends with this tick."""
         period_ns = round(self._config.network.publish_period * 1e9)
         return falls_due(tick.stamp_ns - self.start_ns, period_ns, every)
 
     def _write_states(self, tick: Tick) -> None:
-        """Store all maps, the centralised one too: key frames now and then, in between the bricks that changed."""
+        """Store all maps, the centralised map included, as key frames or as the bricks that changed."""
         if self._writer is None:
             return
         names, maps = (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle)
 
         def encode(robot_id: str, octree: SemanticOctree) -> MapState:
             sequence = self._num_states[robot_id]
-            # A robot that forgot has another octree, and a delta takes no bricks away.
+            # A robot that restarted has another octree, and a delta cannot remove bricks.
             is_key_frame = sequence % STATES_PER_KEY_FRAME == 0 or self._stored.get(robot_id) is not octree
             if is_key_frame:
                 data = codec.encode_packet(octree)

@@ -1,44 +1,80 @@
-"""How long a team may take to settle: more ticks where packets are lost or late."""
+"""Settling: ticks after the last scan in which gamma ramps to 0, until no log-odds changes.
+
+Losses, delays and budgets make it take longer; the functions here bound by how much.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import LinkConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.replay.network.graph import STEP_SIZE_RULES, CommunicationGraph, settle_ticks_max, step_size
+from octoreplay.config.resolved import ResolvedRun
+from octoreplay.config.rules import Exchanged
+from octoreplay.records import CONVERGED
+from octoreplay.replay.network.graph import CommunicationGraph, step_size
+
+SETTLE_MAX = "settle_max reached"
+NO_SETTLING = "settling is off"
 
 QUIET_PROB = 1e-3
-"""A link may be silent by chance for as long as settling has to be quiet with this probability."""
+"""Probability that losses alone keep a link silent for as long as settling has to be without change."""
 
 BUDGET_TICKS = 100
-"""Ticks that a change may wait for the budget while a team settles."""
+"""Largest number of ticks that a change waits for the budget while a team settles."""
 
 FLOOD_TICKS = 10_000
-"""Most ticks that settling waits for evidence that a budget holds back."""
+"""Largest number of ticks that settling waits for evidence that a budget holds back."""
 
 
-def num_quiet_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
-    """Ticks without any change after which a team has settled: 1 unless packets are lost or late.
+class Settling:
+    """Settling of one team over its last graph.
 
-    So many that a link on which every packet was lost in all of them is one in a thousand. ``transmission`` is the
+    Iterate over ``gamma_factors()`` and call ``note()`` after every tick. ``stop_reason`` is set at the end.
+    ``longest_transmission`` is the longest time that a packet kept a link busy [s].
+    """
+
+    def __init__(self, graph: CommunicationGraph, config: ResolvedRun, longest_transmission: float) -> None:
+        self.stop_reason = SETTLE_MAX
+        self._consensus = config.consensus
+        self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
+        self._most = num_settle_ticks(graph, config, longest_transmission)
+        self._num_quiet = 0
+
+    def gamma_factors(self) -> Iterator[float]:
+        """Factor of gamma in each settling tick: 1 - n / settle in tick n, and 0 after the ramp."""
+        for n in range(1, self._most + 1):
+            yield max(0.0, 1.0 - n / self._consensus.settle)
+            if self._num_quiet >= self._quiet_ticks:
+                self.stop_reason = CONVERGED
+                return
+
+    def note(self, max_change: float) -> None:
+        """Note the largest change of a log-odds in the last tick."""
+        self._num_quiet = self._num_quiet + 1 if max_change < self._consensus.settle_tolerance else 0
+
+
+def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
+    """Number of ticks without any change after which a team has settled: 1 without losses and delays.
+
+    A link on which every packet was lost in all of these ticks has probability QUIET_PROB. ``transmission`` is the
     longest time that a packet keeps a link busy [s].
     """
     links = [link for link in _link_configs(graph, config).values() if link.mean_loss < 1.0]
     num_losses = max((_num_losses(link.repeated_loss) for link in links), default=1)
-    slower = _repeats(config, links) * _sources_in_turn(config) * _slowest(config)
-    # A packet that found a link busy waits for one transmission, and takes another.
+    slower = _repeats(config, links) * _sources_in_turn(config) * _slowest_period(config)
+    # A packet that finds a link busy waits for one transmission, and takes another.
     return num_losses * slower + _delay(links, config, 2.0 * transmission)
 
 
-def num_settle_ticks(graph: CommunicationGraph, config: RunConfig, transmission: float = 0.0) -> int:
-    """The most settling ticks: those of the graph with each weight times its link's share of packets that arrive."""
+def num_settle_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
+    """Largest number of settling ticks, with each weight reduced to its link's share of packets that arrive."""
     consensus = config.consensus
-    if consensus.rule not in STEP_SIZE_RULES:
+    if not consensus.traits.has_step_size:
         consensus = dataclasses.replace(consensus, epsilon=None)
     epsilon = step_size(graph, consensus)
     links = _link_configs(graph, config)
@@ -50,45 +86,60 @@ def num_settle_ticks(graph: CommunicationGraph, config: RunConfig, transmission:
         return most
     ramp, has_budget = consensus.settle, config.packet.budget is not None
     all_links = list(links.values())
-    slower = _repeats(config, all_links) * _slowest(config) * (1 + _delay(all_links, config, 2.0 * transmission))
-    if has_budget and consensus.rule == "flood":
-        # How long what waits takes is not known; it ends, since nothing new comes.
+    slower = _repeats(config, all_links) * _slowest_period(config)
+    slower *= 1 + _delay(all_links, config, 2.0 * transmission)
+    if has_budget and consensus.traits.exchanges is Exchanged.EVIDENCE:
+        # The time until all waiting evidence is sent is unknown, but finite, since no new evidence comes.
         return max(most, FLOOD_TICKS)
     slower *= BUDGET_TICKS if has_budget else 1
     return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1
 
 
-def _link_configs(graph: CommunicationGraph, config: RunConfig) -> dict[tuple[int, int], LinkConfig]:
-    """What happens to packets on each directed link."""
+def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsilon: float) -> int:
+    """Largest number of settling ticks on a graph without losses and delays; 0 without settling.
+
+    It is ``settle_max``, or ``settle`` + 12 / -log10 lambda_2 rounded up: so many ticks after gamma's ramp shrink the
+    disagreement by 1e12.
+    """
+    if consensus.settle == 0:
+        return 0
+    if consensus.settle_max is not None:
+        return consensus.settle_max
+    rate = min(max(graph.lambda_2(epsilon), 1e-12), 1.0 - 1e-9)  # keeps the number of ticks above 0 and finite
+    return consensus.settle + math.ceil(12.0 / -math.log10(rate))
+
+
+def _link_configs(graph: CommunicationGraph, config: ResolvedRun) -> dict[tuple[int, int], LinkConfig]:
+    """Link configuration of each directed link."""
     ids = graph.robot_ids
     return {(a, b): config.link_config(ids[a], ids[b]) for a, b in graph.links}
 
 
 def _num_losses(loss: float) -> int:
-    """Losses in a row, each so likely after the one before, that are as rare as QUIET_PROB."""
+    """Number of losses in a row whose probability falls below QUIET_PROB."""
     return 1 if loss <= 0.0 else max(1, math.ceil(math.log(QUIET_PROB) / math.log(loss)))
 
 
-def _slowest(config: RunConfig) -> int:
-    """Ticks between two maps of the robot that publishes least often."""
+def _slowest_period(config: ResolvedRun) -> int:
+    """Ticks between two maps of the robot with the longest publish period."""
     period = config.network.publish_period
     return max(round((robot.publish_period or period) / period) for robot in config.robots)
 
 
-def _repeats(config: RunConfig, links: Sequence[LinkConfig]) -> int:
-    """Packets to a robot until one makes up for a loss: the next, or the next whole map."""
+def _repeats(config: ResolvedRun, links: Sequence[LinkConfig]) -> int:
+    """Number of packets until one makes up for a lost packet: the next one, or the next key frame."""
     packet = config.packet
     waits = packet.packets == "delta" and not packet.acknowledge and any(link.mean_loss > 0.0 for link in links)
     return packet.key_frame_every if waits else 1
 
 
-def _sources_in_turn(config: RunConfig) -> int:
-    """Ticks in which every robot's evidence has its turn, where a budget leaves room for some only."""
-    takes_turns = config.consensus.rule == "flood" and config.packet.budget is not None
+def _sources_in_turn(config: ResolvedRun) -> int:
+    """Number of ticks in which each robot's evidence is first in a budget once; 1 where evidence does not share one."""
+    takes_turns = config.consensus.traits.exchanges is Exchanged.EVIDENCE and config.packet.budget is not None
     return len(config.robots) if takes_turns else 1
 
 
-def _delay(links: Sequence[LinkConfig], config: RunConfig, waiting: float) -> int:
-    """The most ticks that a packet comes late, with so many seconds of ``waiting``."""
+def _delay(links: Sequence[LinkConfig], config: ResolvedRun, waiting: float) -> int:
+    """Largest delay of a packet in ticks, with ``waiting`` seconds in queues."""
     delays = np.array([link.latency + link.jitter for link in links])
     return math.ceil((float(delays.max(initial=0.0)) + waiting) / config.network.publish_period)

@@ -1,4 +1,4 @@
-"""What one consensus tick leaves behind."""
+"""State of the team after a tick."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from octoreplay.replay.robots.robot import Publication
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """The team after one tick. ``maps`` are the robots' octrees h_i - h_0 themselves: valid until the next tick."""
+    """The team after one tick. ``maps`` are the robots' octrees h_i - h_0, which the next tick changes."""
 
     number: int
     stamp_ns: int
@@ -26,6 +26,6 @@ class Tick:
 
 
 def falls_due(elapsed_ns: int, period_ns: int, every: float) -> bool:
-    """True when a multiple of ``every`` seconds fell into the period that ends ``elapsed_ns`` after the start."""
+    """True when a multiple of ``every`` seconds lies in the period that ends ``elapsed_ns`` after the start."""
     interval = max(round(every * 1e9), 1)
     return elapsed_ns // interval > (elapsed_ns - period_ns) // interval

@@ -1,34 +1,34 @@
-"""The frames of a team on one clock: every robot's stream, read as it is asked for."""
+"""Frames of a team on the shared clock, read lazily."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
-from octoreplay.records import BodyBox, Frame
+from octoreplay.records import Frame
 
 
 class FrameSource(Protocol):
-    """A robot's frames in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
+    """Frames of one robot in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
 
     def frames(self) -> Iterator[Frame]:
-        """The frames from the beginning."""
+        """Iterate over the frames from the beginning."""
 
 
 class Bodies(Protocol):
-    """Where the robots' bodies are (``io.robots.team_bodies.TeamBodies``)."""
+    """Boxes of the robots' bodies over time (``io.robots.team_bodies.TeamBodies``)."""
 
     def advance(self, start_ns: int, end_ns: int) -> None:
-        """Make the boxes between two stamps known."""
+        """Read the boxes between two stamps."""
 
-    def seen_by(self, index: int, stamp_ns: int) -> tuple[BodyBox, ...]:
-        """The boxes at a stamp of all robots but one."""
+    def add_to(self, index: int, frame: Frame) -> Frame:
+        """Return a robot's frame with the boxes of all other robots at its stamp added."""
 
 
 class Timeline:
-    """Gives robots' frames up to a common time; holds one frame of each robot ahead.
+    """Frames of all robots up to a common time. It holds one frame of each robot ahead.
 
-    Different robots' frames may be taken in parallel threads.
+    Frames of different robots may be taken in parallel threads.
     """
 
     def __init__(self, logs: Sequence[FrameSource]) -> None:
@@ -37,28 +37,31 @@ class Timeline:
         self._last_ns: list[int | None] = [None] * len(self._streams)
         stamps = [frame.stamp_ns for frame in self._next if frame is not None]
         self.first_stamp_ns = min(stamps, default=None)
-        """Stamp of the team's first frame; None where no robot has one."""
+        """Stamp of the team's first frame; None without frames."""
 
     @property
     def exhausted(self) -> bool:
-        """True when every frame of every robot has been given."""
+        """True when all frames of all robots have been taken."""
         return all(frame is None for frame in self._next)
 
     @property
     def next_stamp_ns(self) -> int | None:
-        """Stamp of the earliest frame that has not been given; None when every frame has."""
+        """Stamp of the earliest frame that has not been taken; None at the end."""
         return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
 
-    def has_ended(self, robot_index: int) -> bool:
-        """True when a robot's last frame has been given (at once for a robot without any)."""
-        return self._next[robot_index] is None
+    def active(self, leave_ns: int | None) -> list[bool]:
+        """Whether each robot takes part (N,): from its first frame on.
 
-    def last_stamp_ns(self, robot_index: int) -> int | None:
-        """Stamp of the latest frame that a robot has given; None before its first."""
-        return self._last_ns[robot_index]
+        With ``leave_ns`` robots whose last frame is before that stamp have left.
+        """
+        pairs = zip(self._next, self._last_ns, strict=True)
+        return [
+            last_ns is not None and (leave_ns is None or following is not None or last_ns >= leave_ns)
+            for following, last_ns in pairs
+        ]
 
     def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
-        """A robot's frames not given yet with stamps below ``stamp_ns``."""
+        """Remaining frames of a robot with stamps below ``stamp_ns``."""
         while (frame := self._next[robot_index]) is not None and frame.stamp_ns < stamp_ns:
             self._last_ns[robot_index] = frame.stamp_ns
             self._next[robot_index] = next(self._streams[robot_index], None)

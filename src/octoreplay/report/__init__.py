@@ -1,1 +1,1 @@
-"""What people look at: tables, plots and exports of a result."""
+"""Presentation of results: tables, figures and exports."""

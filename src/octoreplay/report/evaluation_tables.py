@@ -9,16 +9,16 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores
+from octoreplay.evaluate.records import EvaluatedTick, Evaluation
 from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import OVER_ROBOTS
 from octoreplay.report.tables import number, share, styled_table
 
 MAX_ROBOT_COLUMNS = 6
-"""A table of classes has a column for each robot of a team of at most so many."""
+"""Largest team with one column per robot in the table of classes."""
 
 MAX_TIMES = 12
-"""A table over time has at most so many rows."""
+"""Largest number of rows of a table over time."""
 
 _TRUTH_COLUMNS = {
     "mean IoU": "mean_iou", "of known": "mean_iou_known", "occupied\nfound": "occupied_accuracy",
@@ -31,30 +31,30 @@ _CALIBRATION_COLUMNS = {
 
 
 def evaluation_tables(evaluation: Evaluation) -> RenderableType:
-    """An evaluation as tables: the maps at the end, its classes, and how it came about."""
+    """Return an evaluation as tables: the maps at the end, the classes, and the scores over time."""
     final = evaluation.final
-    # Titles stand above the tables: within one they would be folded to its width.
+    # Titles are lines of their own, since a table folds its title to its width.
     parts: list[RenderableType] = [
         _title(f"Maps {final.seconds:.1f} s after the start, agreement with {_reference(evaluation)}"),
         _maps_table(final),
-        f"cells whose label differs between robots: {share(final.label_disagreement)}",
+        f"cells with different labels: {share(final.label_disagreement)}",
     ]
     if evaluation.truth is not None:
         parts += ["", _title(f"Against {evaluation.truth}"), _truth_table(final)]
-        parts += ["h: the map itself; N h: h_0 + N (h - h_0), the team's posterior (docs/evaluation.md)"]
-        parts += ["", _title("IoU of the classes"), _classes_table(evaluation.class_names, final)]
+        parts += ["h: the map; N h: the team posterior h_0 + N (h - h_0) (docs/evaluation.md)"]
+        parts += ["", _title("IoU of the classes"), _classes_table(evaluation)]
     if len(evaluation.ticks) > 1:
         parts += ["", _title("Over time, mean over the robots"), _times_table(evaluation)]
     return Group(*parts)
 
 
 def _title(text: str) -> Text:
-    """A line above a table."""
+    """Title of a table, as a line above it."""
     return Text(text, style="bold")
 
 
 def _maps_table(final: EvaluatedTick) -> Table:
-    """One row for each map at the end: what can be said without the truth."""
+    """Table of the maps at the end: scores that need no truth."""
     table = styled_table("")
     table.add_column("map", no_wrap=True)
     for heading in ("known cells", "entropy", "agreement\nall cells", "\noccupied"):
@@ -71,7 +71,7 @@ def _maps_table(final: EvaluatedTick) -> Table:
 
 
 def _truth_table(final: EvaluatedTick) -> Table:
-    """One row for each map at the end: its scores against the truth."""
+    """Table of the maps at the end: scores against the truth."""
     table = styled_table("")
     columns = {**_TRUTH_COLUMNS, **_CALIBRATION_COLUMNS}
     table.add_column("map", no_wrap=True)
@@ -81,27 +81,30 @@ def _truth_table(final: EvaluatedTick) -> Table:
     return table
 
 
-def _classes_table(class_names: Sequence[str], final: EvaluatedTick) -> Table:
-    """One row for each class: the IoU in each map, or in the mean, least and largest where the team is large."""
+def _classes_table(evaluation: Evaluation) -> Table:
+    """Table of the classes: IoU in each map, or its mean, least and largest over the robots of a large team."""
     table = styled_table("")
     table.add_column("class", no_wrap=True)
+    final = evaluation.final
     robots = final.robots
     is_large = len(robots) > MAX_ROBOT_COLUMNS
-    columns: dict[str, Sequence[float]] = {} if is_large else {scores.robot_id: scores.iou for scores in robots}
+    columns: dict[str, Sequence[float]] = (
+        {} if is_large else {scores.robot_id: evaluation.iou(scores) for scores in robots}
+    )
     for kind, over_robots in OVER_ROBOTS.items():
         if kind == "mean" or is_large:
-            columns[kind] = [over_robots(values) for values in zip(*(scores.iou for scores in robots), strict=True)]
+            columns[kind] = [over_robots(values) for values in zip(*map(evaluation.iou, robots), strict=True)]
     if final.central is not None:
-        columns[CENTRAL] = final.central.iou
+        columns[CENTRAL] = evaluation.iou(final.central)
     for heading in columns:
         table.add_column(heading, justify="right", overflow="fold")
-    for name, *values in zip(class_names, *columns.values(), strict=True):
+    for name, *values in zip(evaluation.class_names, *columns.values(), strict=True):
         table.add_row(name, *map(_ratio, values))
     return table
 
 
 def _times_table(evaluation: Evaluation) -> Table:
-    """One row for each of some stored ticks: means over the robots, and the centralised map."""
+    """Table over time: means over the robots, and the centralised map, at some of the stored ticks."""
     table = styled_table("")
     columns = {"agreement\nall cells": "agreement", "\noccupied": "agreement_occupied"}
     if evaluation.truth is not None:
@@ -111,41 +114,37 @@ def _times_table(evaluation: Evaluation) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     if evaluation.truth is not None:
         table.add_column("central:\nmean IoU", justify="right", no_wrap=True)
-    for tick in _chosen(evaluation.ticks):
+    for tick in _shown_ticks(evaluation.ticks):
         shares = (tick.label_disagreement, tick.mean("agreement"), tick.mean("agreement_occupied"))
         ratios = [tick.mean(name) for name in list(columns.values())[2:]]
         if evaluation.truth is not None:
-            ratios.append(math.nan if tick.central is None else tick.central.mean_iou)
+            ratios.append(math.nan if tick.central is None else tick.central.score("mean_iou"))
         table.add_row(f"{tick.seconds:.1f} s", *map(share, shares), *map(_ratio, ratios))
     return table
 
 
-def _chosen(ticks: Sequence[EvaluatedTick]) -> list[EvaluatedTick]:
-    """At most MAX_TIMES ticks, evenly over the run, the last one among them."""
+def _shown_ticks(ticks: Sequence[EvaluatedTick]) -> list[EvaluatedTick]:
+    """At most MAX_TIMES ticks, evenly over the run, including the last one."""
     count = min(MAX_TIMES, len(ticks))
     return [ticks[-1 - (len(ticks) - 1) * index // max(count - 1, 1)] for index in reversed(range(count))]
 
 
 def _add_maps(final: EvaluatedTick, add: Callable[[str, Callable[[str], float]], object]) -> None:
-    """One row for each robot's map, for their mean and for the centralised map."""
-
-    def of(scores: MapScores) -> Callable[[str], float]:
-        return lambda name: float(getattr(scores, name))
-
+    """Add one row for each robot's map, one for their mean and one for the centralised map."""
     for scores in final.maps:
         if scores.robot_id != CENTRAL:
-            add(scores.robot_id + ("" if scores.is_active else " (off)"), of(scores))
+            add(scores.robot_id + ("" if scores.is_active else " (off)"), scores.score)
     add("mean", final.mean)
     if final.central is not None:
-        add(CENTRAL, of(final.central))
+        add(CENTRAL, final.central.score)
 
 
 def _reference(evaluation: Evaluation) -> str:
-    """What agreement is with."""
+    """Name of the reference of the agreement."""
     own = evaluation.against == CENTRAL
     return "the centralised map" if own else f"the centralised map of {evaluation.against}"
 
 
 def _ratio(value: float) -> str:
-    """A share 0..1 with three digits."""
+    """Share 0..1 with three digits, a dash for NaN."""
     return f"{value:.3f}" if math.isfinite(value) else "-"

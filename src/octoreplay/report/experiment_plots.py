@@ -1,4 +1,4 @@
-"""The experiments' answers as figures, from the rows of their sweeps (docs/experiments.md)."""
+"""Results of the experiments as figures, from the rows of their sweeps (docs/experiments.md)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from octoreplay.report.experiment_tables import SITUATIONS, Key, Row, Tables, groups, mean, of_noise, variant
+from octoreplay.config.rules import RULES, Exchanged
+from octoreplay.report.experiment_tables import (
+    SITUATIONS,
+    Key,
+    Row,
+    Tables,
+    groups,
+    mean,
+    of_noise,
+    variant,
+    with_summed_evidence,
+)
 from octoreplay.report.figures import (
     BLUE,
     COLORS,
@@ -29,23 +40,23 @@ _RULE_COLORS = {"local": GREY, "gradient": BLUE, "bayes": ORANGE, "central": GRE
 
 
 def figures(name: str, found: Tables) -> dict[str, Figure]:
-    """An experiment's figures by their file names."""
+    """Return the figures of an experiment by file name."""
     makers = {"rules": _rules, "steps": _steps, "scale": _scale, "noise": _noise, "choose": _choose}
     return makers[name](found)
 
 
 def _rules(found: Tables) -> dict[str, Figure]:
-    """Each rule a line, each graph a mark: disagreement, agreement, truth, bytes."""
+    """Disagreement, agreement, IoU and bytes: one line per rule, one marker per graph."""
     rows = found["rules"]
     labels = list(dict.fromkeys(variant(row) for row in rows))
     figure = new_figure(13.0, 5.2)
     panels = figure.subplots(1, 4, sharey=True)
     for axes, (column, title, scale) in zip(
         panels,
-        (("total_distance_all_log_end", "Φ, all pairs, at the log's end", 1.0),
-         ("agreement_occupied_mean", "agreement over the log, occupied", 1.0),
+        (("total_distance_all_log_end", "Φ over all pairs, end of the logs", 1.0),
+         ("agreement_occupied_mean", "agreement over the logs, occupied", 1.0),
          ("mean_iou", "mean IoU, settled", 1.0),
-         ("sent_bytes_per_second", "kB a robot and second", 1e-3)),
+         ("sent_bytes_per_second", "kB per robot and second", 1e-3)),
         strict=True,
     ):  # fmt: skip
         style(axes, title)
@@ -60,8 +71,7 @@ def _rules(found: Tables) -> dict[str, Figure]:
             axes.set_xscale("log")
             label_plainly(axes.xaxis)
     panels[0].set_xscale("log")
-    oracle = [row for row in rows if row["rule"] == "flood"]
-    panels[2].axvline(mean(oracle, "central_mean_iou"), color="black", linewidth=1, linestyle="--")
+    panels[2].axvline(mean(with_summed_evidence(rows), "central_mean_iou"), color="black", linewidth=1, linestyle="--")
     panels[0].set_yticks(range(len(labels)), labels, fontsize=9)
     panels[0].invert_yaxis()
     legend_below(figure, panels[0])
@@ -69,15 +79,16 @@ def _rules(found: Tables) -> dict[str, Figure]:
 
 
 def _steps(found: Tables) -> dict[str, Figure]:
+    """Step sizes against each other, and the bound of epsilon."""
     return {"steps.png": _trade_off(found["steps"]), "bound.png": _bound(found["bound"])}
 
 
 def _trade_off(rows: Sequence[Row]) -> Figure:
-    """Every pair of steps as a square, for both rules that have two of them."""
+    """Every pair of step sizes as a square, for the rules with both."""
     columns = (
-        ("total_distance_all_log_end", "Φ, all pairs, at the log's end", "{:.1e}"),
-        ("agreement_occupied_mean", "agreement over the log, occupied", "{:.3f}"),
-        ("agreement_occupied", "agreement settled, occupied", "{:.4f}"),
+        ("total_distance_all_log_end", "Φ over all pairs, end of the logs", "{:.1e}"),
+        ("agreement_occupied_mean", "agreement over the logs, occupied", "{:.3f}"),
+        ("agreement_occupied", "agreement, settled, occupied", "{:.4f}"),
     )
     by_rule = groups(rows, "rule")
     figure = new_figure(13.0, 3.4 * len(by_rule))
@@ -90,7 +101,7 @@ def _trade_off(rows: Sequence[Row]) -> Figure:
 
 
 def _squares(axes: Axes, rows: Sequence[Row], column: str, form: str) -> None:
-    """The mean of a column for every epsilon and gamma, written into squares; darker is worse."""
+    """Draw the mean of a column for every epsilon and gamma into squares; darker is worse."""
     epsilons, gammas = ([key for (key,) in groups(rows, name)] for name in ("epsilon", "gamma"))
     cells = groups(rows, "epsilon", "gamma")
     values = np.array([[mean(cells.get((e, g), []), column) for g in gammas] for e in epsilons])
@@ -107,9 +118,9 @@ def _squares(axes: Axes, rows: Sequence[Row], column: str, form: str) -> None:
 
 
 def _bound(rows: Sequence[Row]) -> Figure:
-    """How Phi shrinks while a team settles: what theory says as lines, what was measured as marks."""
+    """Factor of Phi per settling tick: theory as lines, measurements as markers."""
     figure = new_figure(7.0, 4.2)
-    axes = style(figure.add_subplot(), "Mixing alone (bayes, settling)", "epsilon / bound", "Φ shrinks in a tick by")
+    axes = style(figure.add_subplot(), "Mixing (bayes, settling)", "epsilon / bound", "factor of Φ per tick")
     for index, ((topology,), part) in enumerate(groups(rows, "topology").items()):
         shares = [row["epsilon_share"] for row in part]
         for name, form, label in (("contraction_theory", "-", f"{topology}, theory"), ("contraction", "", topology)):
@@ -129,9 +140,9 @@ def _scale(found: Tables) -> dict[str, Figure]:
     figure = new_figure(12.0, 8.0)
     panels = figure.subplots(3, 3, sharex="col", sharey="row")
     quantities = (
-        ("realtime_factor", "times real time", 1.0),
+        ("realtime_factor", "real-time factor", 1.0),
         ("peak_rss_bytes", "peak memory [MB]", 1e-6),
-        ("sent_bytes_per_second", "kB a robot and second", 1e-3),
+        ("sent_bytes_per_second", "kB per robot and second", 1e-3),
     )
     for column, (plan, name, x_label, series) in enumerate((
         ("robots", "num_robots", "robots", ("topology", "resolution")),
@@ -156,23 +167,23 @@ def _scale(found: Tables) -> dict[str, Figure]:
 
 
 def _line(axes: Axes, rows: Sequence[Row], x: str, y: str, factor: float, color: str, label: str) -> None:
-    """The means of a column over another one."""
+    """Draw the means of a column over another one."""
     points = {float(key): mean(part, y) * factor for (key,), part in groups(rows, x).items()}
     axes.plot(list(points), list(points.values()), "o-", color=color, markersize=4, linewidth=1.5, label=label)
 
 
 _NOISES = {
-    "label_noise": "labels that are wrong, share",
+    "label_noise": "share of wrong labels",
     "pose_noise": "pose noise [m]",
-    "depth_noise": "depth noise, times the camera's",
+    "depth_noise": "depth noise, multiple of the camera's",
 }
 
 
 def _noise(found: Tables) -> dict[str, Figure]:
-    """Truth, calibration, and what consensus changes, over each kind of noise."""
+    """IoU, calibration error, and labels corrected and made wrong, over each kind of noise."""
     figure = new_figure(12.0, 8.5)
     panels = figure.subplots(3, 3, sharex="col", sharey="row")
-    titles = ("mean IoU", "calibration error, occupied cells", "put right, made wrong (share)")
+    titles = ("mean IoU", "calibration error, occupied cells", "corrected, made wrong (share)")
     for column, (kind, x_label) in enumerate(_NOISES.items()):
         rows = of_noise(found["noise"], kind)
         iou, calibration, change = panels[:, column]
@@ -183,12 +194,12 @@ def _noise(found: Tables) -> dict[str, Figure]:
             calibration, rows, kind, "central_calibration_error_occupied", 1.0, _RULE_COLORS["central"], "centralised"
         )
         for (rule,), part in groups(rows, "rule").items():
-            color, exchanges = _RULE_COLORS[rule], rule != "local"
+            color, exchanges = _RULE_COLORS[rule], RULES[rule].exchanges is not Exchanged.NOTHING
             _line(iou, part, kind, "mean_iou", 1.0, color, rule)
             quantity = "team_calibration_error_occupied" if exchanges else "calibration_error_occupied"
             _line(calibration, part, kind, quantity, 1.0, color, f"{rule}, N h" if exchanges else rule)
             if exchanges:
-                _line(change, part, kind, "repaired", 1.0, color, f"{rule}: put right")
+                _line(change, part, kind, "repaired", 1.0, color, f"{rule}: corrected")
                 _line(change, part, kind, "spread", 1.0, color, f"{rule}: made wrong")
                 change.lines[-1].set_linestyle("--")
     for axes in panels[:, 0]:
@@ -197,13 +208,13 @@ def _noise(found: Tables) -> dict[str, Figure]:
 
 
 def _choose(found: Tables) -> dict[str, Figure]:
-    """What each choice costs in radio, and how well the worst robot's map agrees while the logs last."""
+    """Agreement of the worst robot over the logs against the bytes sent, for each choice."""
     figure = new_figure(13.0, 4.6)
     panels = figure.subplots(1, len(SITUATIONS), sharey=True)
     rules = list(dict.fromkeys(str(row["rule"]) for rows in found.values() for row in rows))
     forms: list[Key] = list(dict.fromkeys(key for rows in found.values() for key in groups(rows, "packets", "content")))
     for axes, plan in zip(panels, SITUATIONS, strict=True):
-        style(axes, plan.replace("_", " "), "kB a robot and second")
+        style(axes, plan.replace("_", " "), "kB per robot and second")
         for (rule, *sent), part in groups(found[plan], "rule", "packets", "content").items():
             axes.plot(
                 mean(part, "sent_bytes_per_second") / 1e3, mean(part, "agreement_occupied_mean"),
@@ -211,7 +222,7 @@ def _choose(found: Tables) -> dict[str, Figure]:
             )  # fmt: skip
         axes.set_xscale("log")
         label_plainly(axes.xaxis)
-    panels[0].set_ylabel("agreement over the log, occupied, worst robot")
+    panels[0].set_ylabel("agreement over the logs, occupied, worst robot")
     for rule, color in zip(rules, COLORS, strict=False):
         panels[0].plot([], [], "o", color=color, label=rule)
     for form, marker in zip(forms, MARKERS, strict=False):

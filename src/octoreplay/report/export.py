@@ -1,4 +1,4 @@
-"""Exports of a stored result."""
+"""Export of a stored map as a PLY file."""
 
 from __future__ import annotations
 
@@ -20,27 +20,46 @@ _RAMP = np.array(
     [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142], [31, 158, 137], [53, 183, 121],
      [109, 205, 89], [180, 222, 44], [253, 231, 37]], dtype=np.float64,
 )  # fmt: skip
-"""Matplotlib's viridis at ten even steps: dark is low, yellow is high."""
+"""Matplotlib's viridis at ten even steps, from dark (low) to yellow (high)."""
 
 
 def export_ply(
     result_path: Path, output: Path, robot: str | None = None, at: float | None = None, what: str = "points",
     color: str = "label", *, free: bool = False, team_posterior: bool = False,
 ) -> int:  # fmt: skip
-    """Write a map of a result as a PLY file; the number of leaves written.
+    """Write a map of a result as a PLY file and return the number of leaves in it.
 
-    ``robot``: whose map; None for the first robot's, and with color 'robot' for all of them laid over each other.
-    ``at``: seconds after the run's start, None for the end. ``what``: 'points' (leaf centres) or 'voxels' (cubes).
-    ``color``:
+    The comments of the file name the options.
 
-    - 'label': the most probable class's colour; free leaves are grey
-    - 'robot': the mean of the colours of the robots whose own map knows the leaf's centre
-    - 'probability': of the label, from 1 / (C + 1), dark, to 1, yellow
-    - 'disagreement': the largest ||h_j - h|| over the other robots at the leaf's centre, from 0, dark, to the largest
-      in the file, yellow (an unknown cell counts as the prior)
+    Parameters
+    ----------
+    result_path, output : Path
+        Result file and PLY file.
+    robot : str, optional
+        Robot of the map. None is the first robot; with color 'robot' it is the overlay of all robots' maps.
+    at : float, optional
+        Time since the run's start in seconds, None for the end.
+    what : str
+        'points' (leaf centres) or 'voxels' (cubes).
+    color : str
+        - 'label': colour of the most probable class; free leaves are grey
+        - 'robot': mean colour of the robots whose map knows the leaf's centre
+        - 'probability': probability of the label, from 1 / (C + 1), dark, to 1, yellow
+        - 'disagreement': largest ||h_j - h|| over the other robots at the leaf's centre, from 0, dark, to the largest
+          in the file, yellow (an unknown cell counts as the prior)
+    free : bool
+        True to write free leaves too.
+    team_posterior : bool
+        True for labels and probabilities of h_0 + N (h - h_0).
 
-    ``free`` writes free leaves too. ``team_posterior`` takes h_0 + N (h - h_0) for labels and probabilities. The file's
-    comments say what was chosen. Raises InputError, ConfigError or OutputError.
+    Raises
+    ------
+    ConfigError
+        ``what`` or ``color`` is unknown.
+    InputError
+        The result cannot be read, or has no such map.
+    OutputError
+        The PLY file cannot be written.
     """
     if what not in ("points", "voxels"):
         raise ConfigError(f"what: '{what}' is not one of points, voxels")
@@ -60,14 +79,14 @@ def export_ply(
 
 
 def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTable:
-    """The leaves of some maps; a leaf that several have is taken from the first."""
+    """Leaves of some maps; a leaf of several maps is taken from the first one."""
     tables = [stored.leaves(team_posterior=team_posterior) for stored in maps]
     centers = np.concatenate([table.centers for table in tables])
     sizes = np.concatenate([table.sizes for table in tables])
     log_odds = np.concatenate([table.log_odds for table in tables])
     keep = np.ones(len(sizes), dtype=np.bool_)
     if len(tables) > 1:
-        # Centres lie on multiples of half the resolution, so that rounding makes equal leaves equal keys.
+        # Centres lie on multiples of half the resolution, so that rounding gives equal leaves equal keys.
         keys = np.column_stack([np.rint(centers / (maps[0].resolution / 2)), np.rint(sizes / maps[0].resolution)])
         _, first = np.unique(keys.astype(np.int64), axis=0, return_index=True)
         keep[:] = False
@@ -80,7 +99,7 @@ def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTabl
 def _colors(
     result: Result, shown: list[StoredMap], leaves: LeafTable, color: str, at_ns: int | None
 ) -> tuple[UInt8Array, str]:
-    """Colours (L, 3) of the leaves, and what their ends mean."""
+    """Colours (L, 3) of the leaves, and the meaning of the scale."""
     if color == "label":
         return _label_colors(result.class_table, leaves), "the classes' own"
     if color == "probability":
@@ -98,16 +117,18 @@ def _colors(
 
 
 def _label_colors(class_table: ClassTable, leaves: LeafTable) -> UInt8Array:
+    """Colours (L, 3) of the labels; free is grey."""
     palette = np.concatenate([np.array([FREE_COLOR], dtype=np.uint8), class_table.colors])
     return palette.take(best_labels(leaves.log_odds), axis=0)
 
 
 def _robot_color(index: int) -> tuple[int, int, int]:
+    """Colour of a robot by its index."""
     return PALETTE[index % len(PALETTE)]
 
 
 def _robot_colors(known: BoolArray) -> UInt8Array:
-    """The mean colour of the robots that know a leaf, from (L, N)."""
+    """Mean colour (L, 3) of the robots that know a leaf, from (L, N)."""
     palette = np.array([_robot_color(index) for index in range(known.shape[1])], dtype=np.float64)
     count = np.maximum(known.sum(axis=1, keepdims=True), 1)
     mean: Float64Array = known.astype(np.float64) @ palette / count
@@ -115,7 +136,7 @@ def _robot_colors(known: BoolArray) -> UInt8Array:
 
 
 def _disagreement(own: StoredMap, maps: list[StoredMap], points: Float64Array) -> FloatArray:
-    """The largest distance between one robot's log-odds and another's at points: (P,) float64."""
+    """Largest distance (P,) float64 between one robot's log-odds and another's at points."""
     h = own.query(points).log_odds.astype(np.float64)
     largest = np.zeros(len(points))
     for other in maps:
@@ -125,14 +146,14 @@ def _disagreement(own: StoredMap, maps: list[StoredMap], points: Float64Array) -
 
 
 def _ramp(values: FloatArray) -> UInt8Array:
-    """Colours (L, 3) of values 0..1."""
+    """Colours (L, 3) of values (L,) in 0..1."""
     place = np.clip(values, 0.0, 1.0) * (len(_RAMP) - 1)
     steps = np.arange(len(_RAMP))
     return np.rint(np.column_stack([np.interp(place, steps, _RAMP[:, k]) for k in range(3)])).astype(np.uint8)
 
 
 def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, team_posterior: bool) -> list[str]:
-    """What the file's reader has to know."""
+    """Comments of the file: map, time, classes and colours."""
     last = shown[0]
     names = ", ".join(f"{c.class_id} {c.name}" for c in result.class_table.classes)
     evidence = "team posterior h_0 + N (h - h_0)" if team_posterior else "the robot's own h"

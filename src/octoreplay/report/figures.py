@@ -1,4 +1,4 @@
-"""The one style of all figures, drawn without a display."""
+"""Common style of all figures, drawn without a display."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
 COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#E69F00", "#222222", GREY)
-"""Colours that colour-blind readers tell apart (Okabe and Ito)."""
+"""Colours that colour-blind readers can distinguish (Okabe and Ito)."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def new_figure(width: float = 7.0, height: float = 3.6) -> Figure:
-    """An empty figure of so many inches."""
+    """Return an empty figure of this size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ def new_figure(width: float = 7.0, height: float = 3.6) -> Figure:
 
 
 def style(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> Axes:
-    """Axes with a title, labels and a grid."""
+    """Give axes a title, labels and a grid, and return them."""
     axes.set_title(title, loc="left", fontsize=11)
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
@@ -43,7 +43,7 @@ def style(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> 
 
 
 def over_log_time(title: str, y_labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """A figure and its axes over log time, one below the other, the first the highest."""
+    """Return a figure and its axes over log time, one below the other; the first is the highest."""
     figure = new_figure(height=1.8 * (len(y_labels) + 1))
     ratios = [2] + [1] * (len(y_labels) - 1)
     stack = figure.subplots(len(y_labels), sharex=True, squeeze=False, height_ratios=ratios)[:, 0].tolist()
@@ -55,13 +55,13 @@ def over_log_time(title: str, y_labels: Sequence[str]) -> tuple[Figure, list[Axe
 
 
 def legend_below(figure: Figure, axes: Axes | None = None, columns: int = 4) -> None:
-    """A legend under the figure, of these axes' entries or of all."""
+    """Add a legend below the figure with the entries of ``axes``, or of all axes."""
     handles: dict[str, Any] = {"handles": axes.get_legend_handles_labels()[0]} if axes is not None else {}
     figure.legend(**handles, frameon=False, fontsize=9, loc="outside lower center", ncols=columns)
 
 
 def label_in_bytes(axes: Axes) -> None:
-    """Ticks on a logarithmic axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
+    """Label a logarithmic y axis in B, kB, MB: every decade, and 2 and 5 between where there is room."""
     from matplotlib.ticker import EngFormatter
 
     _decades(axes.yaxis)
@@ -69,13 +69,13 @@ def label_in_bytes(axes: Axes) -> None:
 
 
 def label_plainly(axis: Axis) -> None:
-    """Ticks of a logarithmic axis as plain numbers, as far apart as those of ``label_in_bytes``."""
+    """Label a logarithmic axis with plain numbers, at the same places as ``label_in_bytes``."""
     _decades(axis)
     axis.set_major_formatter("{x:,g}")
 
 
 def _decades(axis: Axis) -> None:
-    """A tick at every decade, and at 2 and 5 between where there is room."""
+    """Put a tick at every decade, and at 2 and 5 between where there is room."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     low, high = axis.get_view_interval()
@@ -84,14 +84,14 @@ def _decades(axis: Axis) -> None:
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write figures by their file names into a folder, made if need be; the files written. Raises OutputError."""
+    """Write figures by file name into a folder, made if missing, and return the paths. Raises OutputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     for name, figure in figures.items():
         picture = io.BytesIO()
-        # Software would name matplotlib's version: left out, so that equal results give equal files.
+        # The metadata would name matplotlib's version; without it equal results give equal files.
         figure.savefig(picture, metadata={"Software": None})
         write_whole(folder / name, picture.getvalue())
     return [folder / name for name in figures]

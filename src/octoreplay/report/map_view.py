@@ -1,8 +1,8 @@
-"""Oblique bird's-eye pictures of maps: shaded cubes or triangles with real transparency, drawn with NumPy alone.
+"""Oblique bird's-eye pictures of maps: shaded cubes or triangles with transparency, drawn with NumPy only.
 
-The camera is orthographic. Every face is cut into pixels row by row, the pieces of a pixel are sorted by depth and
-blended front to back, so that any number of transparent cells may lie behind each other. The sun is drawn the same way
-from its own side: what reaches a face is its light. The same input gives the same picture.
+The camera is orthographic. Every face is cut into pixels row by row. The pieces of a pixel are sorted by depth and
+blended front to back, so that any number of transparent cells may lie behind each other. The same drawing from the
+direction of the sun gives the light that reaches each face. The same input gives the same picture.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from octoreplay.records import Float64Array, Int64Array, UInt8Array, UInt64Array
 from octoreplay.result import StoredMap
 
 BACKGROUND = (236, 239, 243)
-"""Not white, so that pale and transparent differ."""
+"""Colour of the background; not white, so that pale and transparent cells differ."""
 
 _SUN = (0.6, 0.45, 0.75)
-"""Where the sun stands, for somebody who looks along the view: to the right, behind him, above."""
+"""Direction to the sun relative to the view: right, back, up."""
 _AMBIENT, _SKY, _SUNLIGHT = 0.56, 0.06, 0.56
 _SUN_PIXELS = 8192
-"""Widest and highest picture from the sun's side."""
+"""Largest width and height of the picture from the sun in pixels."""
 _BAND_PIXELS = 1 << 20
 _FACE_BITS, _DEPTH_BITS = 22, 20
 _MAX_FACES = 1 << _FACE_BITS
@@ -37,11 +37,20 @@ _DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1],
 
 @dataclass(frozen=True)
 class View:
-    """An orthographic camera that looks obliquely down.
+    """Orthographic camera that looks obliquely down.
 
-    ``azimuth`` is where it looks, counter-clockwise from x, ``elevation`` how far down, both in radians; ``target``
-    (x, y, z) in metres is in the picture's middle; ``pixel`` is a pixel's edge in metres; ``width`` and ``height`` are
-    in pixels.
+    Attributes
+    ----------
+    azimuth : float
+        Direction of view in radians, counter-clockwise from x.
+    elevation : float
+        Angle of the direction of view below the horizon in radians.
+    target : tuple of float
+        Point (x, y, z) in the middle of the picture in metres.
+    pixel : float
+        Edge of a pixel in metres.
+    width, height : int
+        Size of the picture in pixels.
     """
 
     azimuth: float
@@ -53,7 +62,7 @@ class View:
 
     @property
     def axes(self) -> Float64Array:
-        """(3, 3): rows are the picture's right, its up, and the direction of view."""
+        """Rows (3, 3): right and up in the picture, and the direction of view."""
         cos_a, sin_a = math.cos(self.azimuth), math.sin(self.azimuth)
         cos_e, sin_e = math.cos(self.elevation), math.sin(self.elevation)
         return np.array(
@@ -61,7 +70,7 @@ class View:
         )
 
     def project(self, points: npt.ArrayLike) -> Float64Array:
-        """Columns and rows in pixels from the upper left corner, and depths in metres: (..., 3) of (..., 3)."""
+        """Return column and row in pixels from the upper left and depth in metres, (..., 3), of points (..., 3)."""
         seen = (np.asarray(points, np.float64) - self.target) @ self.axes.T
         half = (self.width / 2, self.height / 2)
         return np.stack(
@@ -69,14 +78,14 @@ class View:
         )
 
     def scaled(self, factor: int) -> View:
-        """The same view in pixels so many times finer."""
+        """Return the same view with pixels ``factor`` times finer."""
         return View(
             self.azimuth, self.elevation, self.target, self.pixel / factor, self.width * factor, self.height * factor
         )
 
 
 def view_of(points: npt.ArrayLike, azimuth: float, elevation: float, width: int, height: int) -> View:
-    """The view that just holds points (P, 3) in metres, in the middle of the picture."""
+    """Return the closest view of points (P, 3) in metres that contains all of them, centred in the picture."""
     points = np.asarray(points, np.float64)
     turned = View(azimuth, elevation, (0.0, 0.0, 0.0), 1.0, 0, 0)
     seen = points @ turned.axes.T
@@ -87,10 +96,20 @@ def view_of(points: npt.ArrayLike, azimuth: float, elevation: float, width: int,
 
 
 class Faces(NamedTuple):
-    """Flat faces in space: a corner (F, 3) and two edges from it (F, 3) each, in metres.
+    """Parallelograms or triangles in space.
 
-    They are parallelograms, or with ``is_triangle`` the halves of them at the corner. ``normals`` (F, 3) are unit
-    vectors; zero where a face is seen from both sides. ``colors`` (F, 3) from 0 to 255, ``opacities`` (F,) from 0 to 1.
+    Attributes
+    ----------
+    corners, edges_a, edges_b : (F, 3) float64
+        A corner and the two edges from it in metres.
+    normals : (F, 3) float64
+        Unit vectors. Parallelograms are visible from their front only, triangles from both sides.
+    colors : (F, 3) float64
+        Colours from 0 to 255.
+    opacities : (F,) float64
+        Opacities from 0 to 1.
+    is_triangle : bool
+        True where the faces are triangles of the corner and the ends of the two edges.
     """
 
     corners: Float64Array
@@ -102,7 +121,7 @@ class Faces(NamedTuple):
     is_triangle: bool
 
     def taken(self, rows: Int64Array) -> Faces:
-        """Some of the faces."""
+        """Return the faces with these indices."""
         return Faces(
             self.corners[rows], self.edges_a[rows], self.edges_b[rows], self.normals[rows], self.colors[rows],
             self.opacities[rows], self.is_triangle,
@@ -110,10 +129,18 @@ class Faces(NamedTuple):
 
 
 class Overlay(NamedTuple):
-    """Several robots' maps in one: the finest cells that the mean of their log-odds calls occupied, in Morton order.
+    """Overlay of several robots' maps: finest cells that the mean of the log-odds calls occupied, in Morton order.
 
-    ``centers`` (M, 3) float64 in metres; ``labels`` (M,) uint8, the most probable class of the mean; ``deviations``
-    (M,) float64, the largest ||h_i - h_j|| over the pairs of robots, where an unknown cell counts as the prior.
+    Attributes
+    ----------
+    centers : (M, 3) float64
+        Centres in metres.
+    labels : (M,) uint8
+        Most probable class of the mean.
+    deviations : (M,) float64
+        Largest ||h_i - h_j|| over the pairs of robots; an unknown cell counts as the prior.
+    resolution : float
+        Edge of a cell in metres.
     """
 
     centers: Float64Array
@@ -123,10 +150,10 @@ class Overlay(NamedTuple):
 
 
 def overlay(maps: Sequence[StoredMap]) -> Overlay:
-    """The maps of one team at one time, laid over each other."""
+    """Return the overlay of the maps of one team at one time."""
     spans = [stored.octree.spans() for stored in maps]
     prior = np.float32(maps[0].prior)
-    # A mean above zero needs a robot above zero: all other cells are free.
+    # A mean above zero needs a robot with a value above zero; all other cells are free.
     chosen = [np.any(span.deviations + prior > 0, axis=1) | bool(prior > 0) for span in spans]
     codes = np.unique(np.concatenate([span.cells_in(rows) for span, rows in zip(spans, chosen, strict=True)]))
     values = np.stack([span.deviations_at(codes) for span in spans])
@@ -144,15 +171,16 @@ def overlay(maps: Sequence[StoredMap]) -> Overlay:
 
 
 def opacities(deviations: Float64Array, largest: float, least: float = 0.1) -> Float64Array:
-    """1 - d / ``largest``, not below ``least``: what the team agrees on is solid, what one robot holds alone is not."""
+    """Return opacities 1 - d / ``largest``, at least ``least``, of cells with deviations d (M,)."""
     shares = deviations / largest if largest > 0 else np.zeros(len(deviations))
     return np.clip(1.0 - shares, least, 1.0)
 
 
 def cube_faces(centers: Float64Array, edge: float, colors: UInt8Array, opacities: Float64Array) -> Faces:
-    """The faces of cubes with centres (M, 3) on a grid of ``edge``, both in metres, but those between two cubes.
+    """Return the faces of cubes, without faces between two cubes.
 
-    ``colors`` (M, 3) uint8, ``opacities`` (M,) from 0 to 1.
+    The centres (M, 3) are on a grid with this edge, both in metres. ``colors`` (M, 3) are uint8, ``opacities`` (M,)
+    from 0 to 1.
     """
     keys = np.floor(centers / edge).astype(np.int64)
     packed = _packed(keys)
@@ -169,7 +197,7 @@ def cube_faces(centers: Float64Array, edge: float, colors: UInt8Array, opacities
 
 
 def mesh_faces(corners: Float64Array, colors: UInt8Array) -> Faces:
-    """Solid triangles with corners (T, 3, 3) in metres and colours (T, 3) uint8, seen from both sides."""
+    """Return opaque triangles with corners (T, 3, 3) in metres and colours (T, 3) uint8, visible from both sides."""
     edges_a, edges_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(edges_a, edges_b)
     lengths = np.linalg.norm(normals, axis=1)
@@ -181,16 +209,16 @@ def mesh_faces(corners: Float64Array, colors: UInt8Array) -> Faces:
 
 
 def draw(faces: Faces, view: View, supersampling: int = 2) -> UInt8Array:
-    """The picture (height, width, 3) uint8 of faces over the background.
+    """Return the picture (height, width, 3) uint8 of faces over the background.
 
-    Every pixel is the mean of ``supersampling`` squared finer ones. Raises ValueError for more than 4 million faces.
+    Every pixel is the mean of ``supersampling`` squared finer pixels. Raises ValueError for more than 4 million faces.
     """
     if len(faces.corners) > _MAX_FACES:
-        raise ValueError(f"faces: {len(faces.corners)} are more than can be drawn, {_MAX_FACES}")
+        raise ValueError(f"faces: {len(faces.corners)} are more than the {_MAX_FACES} that can be drawn")
     lit = faces._replace(colors=faces.colors * _light(faces, view)[:, None])
     fine = view.scaled(supersampling)
     picture = np.empty((view.height, view.width, 3), np.uint8)
-    for rows, pieces in _bands(_towards(lit, view), fine, supersampling):
+    for rows, pieces in _bands(lit.taken(_facing(lit, view.axes[2])), fine, supersampling):
         blended = _blended(pieces, (rows.stop - rows.start) * fine.width)
         blended = blended.reshape(-1, supersampling, view.width, supersampling, 3).mean(axis=(1, 3))
         picture[rows.start // supersampling : rows.stop // supersampling] = np.rint(np.clip(blended, 0, 255))
@@ -198,25 +226,20 @@ def draw(faces: Faces, view: View, supersampling: int = 2) -> UInt8Array:
 
 
 def _packed(keys: Int64Array) -> Int64Array:
-    """One integer for each key of a cell (M, 3) and of its neighbours."""
+    """One integer for each key (M, 3), distinct for cells and their neighbours."""
     packed: Int64Array = (keys + (1 << 19)) @ np.array([1 << 40, 1 << 20, 1], dtype=np.int64)
     return packed
 
 
 def _facing(faces: Faces, direction: Float64Array) -> Int64Array:
-    """The faces that somebody who looks along a direction can see; triangles are seen from both sides."""
+    """Indices of the faces that are visible in a direction of view; triangles are visible from both sides."""
     if faces.is_triangle:
         return np.arange(len(faces.corners))
     return np.flatnonzero(faces.normals @ direction < -1e-9)
 
 
-def _towards(faces: Faces, view: View) -> Faces:
-    """The faces that look towards the camera."""
-    return faces.taken(_facing(faces, view.axes[2]))
-
-
 def _light(faces: Faces, view: View) -> Float64Array:
-    """How bright each face (F,) is: what the sky gives, and what the sun does where it is not hidden."""
+    """Brightness (F,) of each face: light of the sky, and of the sun where it reaches the face."""
     right, _, ahead = view.axes
     level = np.array([ahead[0], ahead[1], 0.0]) / max(math.hypot(ahead[0], ahead[1]), 1e-9)
     sun = _SUN[0] * right - _SUN[1] * level + (0.0, 0.0, _SUN[2])
@@ -225,12 +248,12 @@ def _light(faces: Faces, view: View) -> Float64Array:
     if faces.is_triangle:
         normals = np.where((normals @ ahead > 0)[:, None], -normals, normals)
     light: Float64Array = _AMBIENT + _SKY * normals[:, 2]
-    light += _SUNLIGHT * np.maximum(normals @ sun, 0.0) * _reached(faces, sun, view.pixel)
+    light += _SUNLIGHT * np.maximum(normals @ sun, 0.0) * _sunlit_shares(faces, sun, view.pixel)
     return light
 
 
-def _reached(faces: Faces, sun: Float64Array, pixel: float) -> Float64Array:
-    """The share of the sun's light that gets to each face (F,), past all others; 1 where no sunbeam was tried."""
+def _sunlit_shares(faces: Faces, sun: Float64Array, pixel: float) -> Float64Array:
+    """Share (F,) of the sun's light that reaches each face; 1 for faces without a pixel in the picture from the sun."""
     chosen = _facing(faces, -sun)
     view = View(math.atan2(-sun[1], -sun[0]), math.asin(sun[2]), (0.0, 0.0, 0.0), pixel, 0, 0)
     ends = faces.corners + np.stack([0 * faces.edges_a, faces.edges_a, faces.edges_b, faces.edges_a + faces.edges_b])
@@ -239,19 +262,25 @@ def _reached(faces: Faces, sun: Float64Array, pixel: float) -> Float64Array:
     width, height = (max(1, min(_SUN_PIXELS, 2 * math.ceil(max(-low[k], high[k])))) for k in range(2))
     view = View(view.azimuth, view.elevation, view.target, pixel, width, height)
     shares, counts = np.zeros(len(chosen)), np.zeros(len(chosen))
-    for _, pieces in _bands(_towards(faces, view), view, 1):
+    for _, pieces in _bands(faces.taken(chosen), view, 1):
         shares += np.bincount(pieces.faces, pieces.through, minlength=len(chosen))
         counts += np.bincount(pieces.faces, minlength=len(chosen))
-    reached = np.ones(len(faces.corners))
-    reached[chosen[counts > 0]] = shares[counts > 0] / counts[counts > 0]
-    return reached
+    sunlit = np.ones(len(faces.corners))
+    sunlit[chosen[counts > 0]] = shares[counts > 0] / counts[counts > 0]
+    return sunlit
 
 
 class _Pieces(NamedTuple):
-    """What one band of a picture shows of faces, by pixel and then by depth.
+    """Pieces of faces in one band of a picture, sorted by pixel and then by depth.
 
-    ``pixels`` (P,) of the band, ``faces`` (P,), their ``colors`` (P, 3) and opacities ``alphas`` (P,), and ``through``
-    (P,): the share of light that gets past everything nearer.
+    Attributes
+    ----------
+    pixels, faces : (P,) int64
+        Pixel of the band and index of the face.
+    colors : (P, 3) float64
+        Colours of the faces.
+    alphas, through : (P,) float64
+        Opacities, and shares of the light that pass all nearer pieces of the pixel.
     """
 
     pixels: Int64Array
@@ -262,7 +291,7 @@ class _Pieces(NamedTuple):
 
 
 def _bands(faces: Faces, view: View, multiple: int) -> Iterator[tuple[slice, _Pieces]]:
-    """The picture in bands of rows, each a multiple of so many, with the pieces in it."""
+    """Yield bands of rows, each with a multiple of ``multiple`` rows, and their pieces."""
     planes = _Planes.of(faces, view)
     num_rows = max(multiple, _BAND_PIXELS // view.width // multiple * multiple)
     for first in range(0, view.height, num_rows):
@@ -275,7 +304,7 @@ def _bands(faces: Faces, view: View, multiple: int) -> Iterator[tuple[slice, _Pi
 
 
 def _through(pixels: Int64Array, alphas: Float64Array) -> Float64Array:
-    """The share of light (P,) that gets past the nearer pieces of the same pixel: the product of 1 - alpha."""
+    """Share of light (P,) that passes the nearer pieces of the same pixel: the product of 1 - alpha."""
     passed = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(1.0 - alphas, 1e-12)))])[:-1]
     starts = np.flatnonzero(np.diff(pixels, prepend=-1))
     lengths = np.diff(starts, append=len(pixels))
@@ -284,7 +313,7 @@ def _through(pixels: Int64Array, alphas: Float64Array) -> Float64Array:
 
 
 def _blended(pieces: _Pieces, num_pixels: int) -> Float64Array:
-    """The colours (num_pixels, 3) of a band over the background."""
+    """Colours (num_pixels, 3) of a band over the background."""
     weights = pieces.through * pieces.alphas
     rest = 1.0 - np.bincount(pieces.pixels, weights, minlength=num_pixels)
     colors: Float64Array = np.outer(rest, np.asarray(BACKGROUND, np.float64))
@@ -294,11 +323,18 @@ def _blended(pieces: _Pieces, num_pixels: int) -> Float64Array:
 
 
 class _Planes(NamedTuple):
-    """Faces as seen: where each is in a picture, as linear functions of column and row.
+    """Projected faces as linear functions of column and row in a picture.
 
-    ``rows`` (F, 2) are the first row and the one after the last; ``bounds`` (4, 3, F) the value at pixel (0, 0)'s
-    centre, per column and per row of functions that are positive inside; ``depths`` (3, F) the same of the depth as a
-    share 0..1 of what there is.
+    A linear function has three values: at the centre of pixel (0, 0), per column and per row.
+
+    Attributes
+    ----------
+    rows : (F, 2) int64
+        First row, and the row after the last.
+    bounds : (4, 3, F) float64
+        Functions that are positive inside the face.
+    depths : (3, F) float64
+        Depth as a share 0..1 of the range of all faces.
     """
 
     rows: Int64Array
@@ -307,7 +343,7 @@ class _Planes(NamedTuple):
 
     @classmethod
     def of(cls, faces: Faces, view: View) -> _Planes:
-        """The faces' functions; those seen edge-on have no rows."""
+        """Return the functions of faces; a face that is seen edge-on has no rows."""
         corner = view.project(faces.corners)
         axes = np.array([[1.0, -1.0, 1.0]]) / [[view.pixel, view.pixel, 1.0]]
         a, b = (faces.edges_a @ view.axes.T) * axes, (faces.edges_b @ view.axes.T) * axes
@@ -334,7 +370,7 @@ class _Planes(NamedTuple):
         return cls(rows, np.where(flat, 0.0, bounds), np.where(flat, 0.0, depth) / max(most - least, 1e-9))
 
     def pieces(self, rows: slice, width: int) -> UInt64Array:
-        """Sorted keys of all pieces in some rows: pixel of the band, depth, face."""
+        """Return the sorted keys of all pieces in some rows, packed from pixel of the band, depth and face."""
         low, high = np.clip(self.rows, rows.start, rows.stop).T
         face = np.repeat(np.arange(len(low)), high - low)
         row = np.arange(len(face)) - np.repeat(np.cumsum(high - low) - high, high - low)
@@ -353,12 +389,12 @@ class _Planes(NamedTuple):
         return keys
 
     def _columns(self, face: Int64Array, row: Int64Array, width: int) -> tuple[Int64Array, Int64Array]:
-        """The first column of each face in a row, and the one after its last."""
+        """First column of each face in a row, and the column after the last."""
         start, stop = np.zeros(len(face)), np.full(len(face), float(width))
         for value, per_column, per_row in self.bounds:
             at_zero, slope = value[face] + per_row[face] * row, per_column[face]
             with np.errstate(divide="ignore", invalid="ignore"):
-                # Half-open on both sides, so that faces that share an edge share no pixel.
+                # Half-open intervals, so that faces with a common edge have no common pixel.
                 crossing = np.ceil(-at_zero / slope)
             rising, falling = slope > 1e-12, slope < -1e-12
             np.maximum(start, crossing, out=start, where=rising)

@@ -1,4 +1,4 @@
-"""The figures of the paper's experiment: disagreement, agreement, packet sizes, and maps beside the true village."""
+"""Figures of the paper's experiment: disagreement, agreement, packet sizes, and maps beside the true village."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from octoreplay.report.map_view import BACKGROUND, opacities
 from octoreplay.report.plots import log_seconds, over_robots
 
 PAPER_RATIO = 4.0
-"""The paper's saving by octrees, 'more than four times'."""
+"""Ratio of uniform grid to octree in the paper, 'more than four times'."""
 
 _INK = "#333333"
 _COLOR_STEP = 4
 _LEGEND_HEIGHT = 0.9
-"""Inches below the pictures."""
+"""Height of the legend below the pictures in inches."""
 
 
 def distance_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Phi over time, logarithmic, with the moments [s] at which maps are shown."""
+    """Return a figure of Phi over time on a logarithmic axis, with lines at ``moments`` in seconds."""
     figure, [axes] = over_log_time("Total distance in local map estimates", ["\u03a6"])
     values = np.array([tick.total_distance for tick in metrics])
     axes.plot(log_seconds(metrics), np.where(values > 0, values, np.nan), color=BLUE, linewidth=1.6)
@@ -34,9 +34,9 @@ def distance_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) ->
 
 
 def agreement_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Shares over time: agreement with the oracle of the worst robot, and cells that robots label differently."""
+    """Return a figure over time of the worst robot's agreement with the oracle and of the label disagreement."""
     figure, [upper, lower] = over_log_time(
-        "How far the team agrees", ["agreement with the oracle,\nworst robot", "cells with\ndifferent labels"]
+        "Agreement of the team", ["agreement with the oracle,\nworst robot", "cells with\ndifferent labels"]
     )
     times = log_seconds(metrics)
     for name, label, color in (
@@ -56,7 +56,7 @@ def agreement_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -
 
 
 def packet_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Bytes of a published map as uniform grid and as octree, mean and deviation over robots, and their ratio."""
+    """Return a figure of the bytes of a published map as uniform grid and as octree, and of their ratio."""
     from matplotlib.ticker import EngFormatter
 
     figure, [upper, lower] = over_log_time(
@@ -85,14 +85,14 @@ def packet_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> A
 
 
 def maps_picture(pictures: Mapping[str, UInt8Array], classes: ClassTable, largest: float) -> bytes:
-    """Three pictures (height, width, 3) with their titles, as PNG: the first large, two beside it, a legend below.
+    """Return a PNG of three pictures (height, width, 3) by title: the first large, two beside it, a legend below.
 
-    ``largest`` is the deviation at which opacity would be 0.
+    ``largest`` is the deviation at which the opacity would be 0.
     """
     from PIL import Image
 
     drawn = np.asarray(_maps_figure(pictures, classes, largest).canvas.buffer_rgba())[..., :3]
-    # Steps that no eye sees take a third off the file.
+    # Colour steps too small to see make the file a third smaller.
     coarse = np.minimum(np.rint(drawn / _COLOR_STEP) * _COLOR_STEP, 255).astype(np.uint8)
     file = io.BytesIO()
     Image.fromarray(coarse).save(file, "PNG", optimize=True)
@@ -100,7 +100,7 @@ def maps_picture(pictures: Mapping[str, UInt8Array], classes: ClassTable, larges
 
 
 def _maps_figure(pictures: Mapping[str, UInt8Array], classes: ClassTable, largest: float) -> Any:
-    """The figure of ``maps_picture``, drawn."""
+    """Drawn figure of ``maps_picture``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -123,7 +123,7 @@ def _maps_figure(pictures: Mapping[str, UInt8Array], classes: ClassTable, larges
 
 
 def _explain_classes(axes: Any, classes: ClassTable) -> None:
-    """The classes' colours."""
+    """Draw the legend of the classes."""
     from matplotlib.patches import Patch
 
     axes.set_axis_off()
@@ -135,7 +135,7 @@ def _explain_classes(axes: Any, classes: ClassTable) -> None:
 
 
 def _explain_opacity(axes: Any, classes: ClassTable, largest: float) -> None:
-    """The scale of transparency, on the first class."""
+    """Draw the scale of opacity in the colour of the first class."""
     shares = opacities(np.linspace(0.0, largest, 200), largest)[None, :, None]
     colors = shares * np.array(_unit(classes.classes[0].color)) + (1.0 - shares) * np.array(_unit(BACKGROUND))
     axes.imshow(colors, aspect="auto", extent=(0.0, 1.0, 0.0, 1.0))
@@ -143,16 +143,16 @@ def _explain_opacity(axes: Any, classes: ClassTable, largest: float) -> None:
     axes.set_yticks([])
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    axes.set_title(r"deviation: the largest $\|h_i - h_j\|$ of two robots", fontsize=11, color=_INK)
+    axes.set_title(r"deviation: largest $\|h_i - h_j\|$ of two robots", fontsize=11, color=_INK)
 
 
 def _unit(color: Color) -> tuple[float, float, float]:
-    """A colour as matplotlib wants it."""
+    """Colour with channels 0..1, as in matplotlib."""
     red, green, blue = (value / 255.0 for value in color)
     return red, green, blue
 
 
 def _mark(axes: Any, moments: Sequence[float]) -> None:
-    """Thin lines at some moments."""
+    """Draw thin lines at some times."""
     for moment in moments:
         axes.axvline(moment, color=GREY, linewidth=0.8, linestyle=":")

@@ -1,4 +1,4 @@
-"""Metrics as CSV and as the paper's two figures: disagreement over time, packet sizes."""
+"""Metrics as CSV and as the paper's two figures: disagreement and packet sizes over time."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _LINK_COLUMNS = (
 
 
 def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
-    """All metrics as CSV text, one row per tick: the team's, then each robot's and each link's.
+    """Return all metrics as CSV text, one row per tick: of the team, then of each robot and each link.
 
-    Columns are named as the fields of the metrics; a robot's have ``<robot>.`` and a link's ``<sender>><receiver>.``
-    before them. Numbers are exact; what a tick does not have is empty.
+    Columns have the names of the metrics' fields, with the prefix ``<robot>.`` for a robot and ``<sender>><receiver>.``
+    for a link. Numbers have full precision; values that a tick does not have are empty.
     """
     robots = list(dict.fromkeys(robot.robot_id for tick in metrics for robot in tick.robots))
     links = list(dict.fromkeys((link.sender, link.receiver) for tick in metrics for link in tick.links))
@@ -73,35 +73,36 @@ def write_metrics_csv(metrics: Sequence[TickMetrics], path: Path) -> None:
 
 
 def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:
-    """Write ``disagreement.png`` and ``packet_size.png`` into a folder, made if need be; the files written.
+    """Write ``disagreement.png`` and ``packet_size.png`` into a folder, made if missing, and return the paths.
 
-    Raises OutputError, and InputError where there is no tick to draw.
+    Raises OutputError, and InputError without any tick.
     """
     if not metrics:
-        raise InputError("there is no tick to draw; the run was interrupted before its first one")
+        raise InputError("the result has no tick to draw, since the run was interrupted before its first one")
     return save_figures(
         {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}, folder
     )
 
 
 def _cells(record: Any, names: Sequence[str]) -> list[str]:
-    """The values of one record as text; empty where there is no record."""
+    """Values of one record as text, empty for None."""
     if record is None:
         return [""] * len(names)
     return [_cell(getattr(record, name)) for name in names]
 
 
 def _cell(value: Any) -> str:
+    """Value as text; truth values are 0 and 1."""
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
 
 
 def log_seconds(metrics: Sequence[TickMetrics]) -> Any:
-    """Seconds since the first tick, for each tick."""
+    """Return the time of each tick in seconds since the first one."""
     return np.array([tick.stamp_ns - metrics[0].stamp_ns for tick in metrics]) / 1e9
 
 
 def _mark_settling(axes: Axes, metrics: Sequence[TickMetrics], times: Any) -> None:
-    """A grey band over the ticks after the last log."""
+    """Draw a grey band over the settling ticks."""
     first = next((index for index, tick in enumerate(metrics) if tick.settling), None)
     if first is not None:
         start = times[first - 1] if first else times[0]
@@ -109,20 +110,20 @@ def _mark_settling(axes: Axes, metrics: Sequence[TickMetrics], times: Any) -> No
 
 
 def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
-    """Phi over time, on a logarithmic axis."""
+    """Figure of Phi over time, on a logarithmic axis."""
     figure, [axes] = over_log_time("Disagreement of the team", ["\u03a6"])
     times = log_seconds(metrics)
     links = np.array([tick.total_distance for tick in metrics])
     pairs = np.array([tick.total_distance_all for tick in metrics])
     axes.plot(times, np.where(links > 0, links, np.nan), color=BLUE, linewidth=1.6, label="\u03a6 over the links")
-    # On a complete graph the two are one line but for rounding.
+    # On a complete graph the two lines are equal except for rounding.
     if not np.allclose(links, pairs, rtol=1e-3):
         axes.plot(
             times, np.where(pairs > 0, pairs, np.nan), "--", color=ORANGE, linewidth=1.4, label="\u03a6 over all pairs"
         )
     if (pairs > 0).any():
         axes.set_yscale("log")
-        # What is below this is agreement; the axis belongs to the rise and the fall.
+        # Values below this are consensus; the axis shows the rise and the fall.
         axes.set_ylim(bottom=pairs.max() * 1e-9)
     _mark_settling(axes, metrics, times)
     legend_below(figure)
@@ -130,7 +131,7 @@ def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
 
 
 def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
-    """Bytes of a published map: as sent, as octree and as uniform grid; mean and standard deviation over robots."""
+    """Figure of the bytes of a published map: as sent, as octree and as uniform grid."""
     figure, [axes] = over_log_time("Size of a published map (mean and standard deviation over robots)", ["bytes"])
     times = log_seconds(metrics)
     least = np.inf
@@ -144,7 +145,7 @@ def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
         axes.fill_between(times, np.maximum(mean - deviation, 1), mean + deviation, color=color, alpha=0.2, linewidth=0)
         least = min([least, *mean[mean > 0]])
     if np.isfinite(least):
-        # Logarithmic: on a linear axis both octree curves lie on the floor.
+        # On a linear axis both octree curves would lie on the x axis.
         axes.set_yscale("log")
         axes.set_ylim(bottom=least / 2)
         label_in_bytes(axes)
@@ -154,7 +155,7 @@ def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
 
 
 def over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
-    """Mean and standard deviation over the robots that published in a tick; NaN where none did."""
+    """Return mean and standard deviation per tick over the robots that published; NaN where none did."""
     means, deviations = [], []
     for tick in metrics:
         values = [getattr(robot, name) for robot in tick.robots if robot.grid_bytes > 0]

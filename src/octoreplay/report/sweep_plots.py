@@ -1,4 +1,4 @@
-"""The main columns of a sweep's table as figures, over what was varied."""
+"""Main columns of a sweep's table as figures over the varied settings."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Axis = tuple[str, ...]
-"""Columns that were varied together."""
+"""Columns of settings that are varied together."""
 
 _TITLES = {
-    "total_distance_all_log_end": ("\u03a6 over all pairs when the logs end", "\u03a6"),
+    "total_distance_all_log_end": ("\u03a6 over all pairs at the end of the logs", "\u03a6"),
     "total_distance_all": ("\u03a6 over all pairs at the end", "\u03a6"),
-    "contraction": ("Change of \u03a6 per settling tick", "factor"),
-    "label_disagreement_log_end": ("Cells that robots label differently when the logs end", "share of known cells"),
-    "label_disagreement": ("Cells that robots label differently at the end", "share of known cells"),
-    "ticks_to_consensus": ("Ticks after the last evidence until the labels agree", "ticks"),
-    "agreement": ("Agreement with all evidence, worst robot at the end", "share of known cells"),
+    "contraction": ("Factor of \u03a6 per settling tick", "factor"),
+    "label_disagreement_log_end": ("Cells with different labels at the end of the logs", "share of known cells"),
+    "label_disagreement": ("Cells with different labels at the end", "share of known cells"),
+    "ticks_to_consensus": ("Settling ticks until consensus", "ticks"),
+    "agreement": ("Agreement with the centralised map, worst robot at the end", "share of known cells"),
     "agreement_occupied": ("Agreement on occupied cells, worst robot at the end", "share of occupied cells"),
     "packet_bytes": ("Size of a packet", "bytes"),
-    "sent_bytes_per_second": ("Sent by a robot while the logs last", "bytes per second"),
-    "mean_iou": ("Mean IoU, mean of the robots", "mean IoU"),
-    "coverage": ("Observed surface that is mapped, mean of the robots", "share"),
-    "calibration_error": ("Expected calibration error, mean of the robots", "error"),
+    "sent_bytes_per_second": ("Bytes sent by a robot during the logs", "bytes per second"),
+    "mean_iou": ("Mean IoU, mean over the robots", "mean IoU"),
+    "coverage": ("Share of the observed surface in the map, mean over the robots", "share"),
+    "calibration_error": ("Expected calibration error, mean over the robots", "error"),
 }
-"""The columns that are drawn, each with its title and what the vertical axis says."""
+"""Title and label of the y axis of each drawn column."""
 
 _LOGARITHMIC = ("total_distance_all_log_end", "total_distance_all", "packet_bytes", "sent_bytes_per_second")
 _HATCHES = ("", "///", "...", "xxx")
 
 
 def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis], folder: Path) -> list[Path]:
-    """Write a figure ``<column>.png`` of every main column into a folder, made if need be; the files written.
+    """Write a figure ``<column>.png`` of every main column into a folder, made if missing, and return the paths.
 
-    ``rows`` are a sweep's, ``varied`` the columns that were varied. The first of them is along the figure, the second
-    gives the colours, and every combination of the others a panel. Values are means over the seeds, with their range.
-    What has no number is not drawn, and a figure of an earlier sweep is taken away. Raises OutputError.
+    ``rows`` are the rows of a sweep and ``varied`` its varied columns: the first is the x axis, the second gives the
+    colours, and every combination of the others has a panel. Values are means over the seeds, with their range. A
+    column without numbers has no figure; a figure of an earlier sweep is removed. Raises OutputError.
     """
     good = [row for row in rows if row["status"] != "failed"]
     axes = _axes_of(good, varied)
@@ -67,7 +67,7 @@ def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis
 
 @dataclass(frozen=True)
 class _Spread:
-    """A mean over seeds with the least and the largest value; ``note`` says what a drawing of them would not."""
+    """Mean, least and largest value over seeds; ``note`` describes values that have no visible bar."""
 
     mean: float
     least: float
@@ -77,7 +77,7 @@ class _Spread:
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the figures of a sweep have along, as colours and as panels: the labels of each in the rows' order."""
+    """Columns of a sweep on the x axis, as colours and as panels."""
 
     along: Axis
     series: Axis
@@ -85,24 +85,24 @@ class _Layout:
 
 
 def _axes_of(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis]) -> _Layout:
-    """Which columns go where; the seeds go along where nothing else was varied."""
+    """Assign the varied columns; the seeds are the x axis where nothing else was varied."""
     has_teams = len({row["team"] for row in rows}) > 1
     axes = [*varied, *([("team",)] if has_teams else [])] or [("seed",)]
     return _Layout(axes[0], axes[1] if len(axes) > 1 else (), tuple(axes[2:]))
 
 
 def _label(row: Mapping[str, Any], axis: Axis) -> str:
-    """A row's values of what was varied together."""
+    """Values of a row in columns that are varied together."""
     return " ".join(str(row[name]) for name in axis)
 
 
 def _labels(rows: Sequence[Mapping[str, Any]], axis: Axis) -> list[str]:
-    """All values in the rows' order."""
+    """Distinct labels in the rows' order."""
     return list(dict.fromkeys(_label(row, axis) for row in rows))
 
 
 def _figure(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> Figure:
-    """One column over what was varied."""
+    """Figure of one column over the varied settings."""
     panels = list(itertools.product(*(_labels(rows, axis) for axis in layout.panels)))
     along, series = _labels(rows, layout.along), _labels(rows, layout.series)
     num_columns = 1 if len(panels) == 1 else 2
@@ -141,7 +141,7 @@ def _figure(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> 
 
 
 def _numbers(labels: Sequence[str]) -> list[float] | None:
-    """The labels as numbers where all of them are finite ones."""
+    """Labels as numbers, None unless all are finite numbers."""
     try:
         numbers = [float(label) for label in labels]
     except ValueError:
@@ -150,7 +150,7 @@ def _numbers(labels: Sequence[str]) -> list[float] | None:
 
 
 def _spreads(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> dict[tuple[str, str], _Spread]:
-    """The values of a column by label along the figure and label of the series."""
+    """Spreads of a column by label on the x axis and label of the series."""
     found: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         found.setdefault((_label(row, layout.along), _label(row, layout.series)), []).append(row[column])
@@ -158,7 +158,7 @@ def _spreads(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) ->
 
 
 def _spread(values: Sequence[float]) -> _Spread:
-    """The mean and range of those of the values that there are."""
+    """Mean and range of the finite values."""
     there = [value for value in values if math.isfinite(value)]
     missing = len(values) - len(there)
     if not there:
@@ -168,13 +168,13 @@ def _spread(values: Sequence[float]) -> _Spread:
 
 
 def _scale(rows: Sequence[Mapping[str, Any]], column: str) -> str:
-    """Logarithmic where the values span much more than a decade."""
+    """Scale of the y axis, logarithmic where the values span much more than a decade."""
     values = [row[column] for row in rows if row[column] > 0 and math.isfinite(row[column])]
     return "log" if column in _LOGARITHMIC and values and max(values) > 20 * min(values) else "linear"
 
 
 def _leave_room(axes: Any, rows: Sequence[Mapping[str, Any]], column: str, scale: str) -> None:
-    """A logarithmic axis whose least bar is still seen, and one that starts at 0 where nothing is above."""
+    """Set the limits of the y axis so that the least bar is visible, and 0..1 where all values are 0."""
     values = [row[column] for row in rows if math.isfinite(row[column])]
     if scale == "log":
         axes.set_ylim(bottom=min(value for value in values if value > 0) / 3, top=max(values) * 2)
@@ -186,7 +186,7 @@ def _draw_lines(
     axes: Any, numbers: Sequence[float], along: Sequence[str], series: Sequence[str],
     spreads: Mapping[tuple[str, str], _Spread],
 ) -> None:  # fmt: skip
-    """One line for each series, over numbers."""
+    """Draw one line per series over numbers."""
     order = sorted(range(len(along)), key=lambda index: numbers[index])
     for index, name in enumerate(series):
         points = [(numbers[n], spreads[along[n], name]) for n in order if (along[n], name) in spreads]
@@ -204,7 +204,7 @@ def _draw_lines(
 def _draw_bars(
     axes: Any, along: Sequence[str], series: Sequence[str], spreads: Mapping[tuple[str, str], _Spread]
 ) -> None:
-    """A group of bars for each label, one bar for each series."""
+    """Draw a group of bars per label, with one bar per series."""
     width = 0.8 / len(series)
     for index, name in enumerate(series):
         places = [(n, spreads[label, name]) for n, label in enumerate(along) if (label, name) in spreads]
@@ -223,7 +223,7 @@ def _draw_bars(
 
 
 def _write_note(axes: Axes, x: float, spread: _Spread, line: int) -> None:
-    """Say at the foot of the figure what a bar or a point cannot show: no value, or a value of 0."""
+    """Write the note of a missing value or a value of 0 at the bottom of the axes."""
     if spread.note:
         axes.text(
             x, 0.02 + 0.06 * line, spread.note, transform=axes.get_xaxis_transform(), rotation=90, fontsize=7,
@@ -232,7 +232,7 @@ def _write_note(axes: Axes, x: float, spread: _Spread, line: int) -> None:
 
 
 def _ranges(spreads: Sequence[_Spread]) -> list[list[float]] | None:
-    """How far each mean is above the least and below the largest value; None where there is no range to show."""
+    """Error bars: each mean minus the least, and the largest minus the mean; None where all are 0."""
     if all(spread.least == spread.largest or math.isnan(spread.mean) for spread in spreads):
         return None
     return [[max(s.mean - s.least, 0.0) for s in spreads], [max(s.largest - s.mean, 0.0) for s in spreads]]

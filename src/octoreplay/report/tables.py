@@ -1,4 +1,4 @@
-"""Tables for the terminal: what a run came to, what was chosen, what a query found."""
+"""Tables for the terminal: results of a run, its inputs, answers to queries and descriptions of logs."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
-    from octoreplay.io.robots.discover import LogDescription, LogSummary
+    from octoreplay.io.robots.describe import LogDescription, LogSummary
     from octoreplay.result import PointQuery
 
 _YEAR_2000_NS = 946_684_800_000_000_000
-"""Stamps before it count from some start of a clock and are no dates."""
+"""Earlier stamps are not dates but times since some start of a clock."""
 
 _CAUSES = {
     "no_label": "no label", "no_pose": "no pose", "late": "late",
     "undecodable": "unreadable",
 }  # fmt: skip
-"""Why a frame was not mapped: fields of FrameCounts and what the table calls them."""
+"""Causes of frames that were not mapped: fields of FrameCounts and their headings."""
 
 
 def number(value: float) -> str:
-    """A number for the eye: about three significant digits, thousands separated."""
+    """Format a number with about three significant digits and separated thousands; a dash if not finite."""
     if not math.isfinite(value):
         return "-"
     if value == 0 or 999.5 <= abs(value) < 1e9:
@@ -45,7 +45,7 @@ def number(value: float) -> str:
 
 
 def size(num_bytes: float) -> str:
-    """Bytes for the eye: B, kB, MB, GB (powers of 1000)."""
+    """Format a number of bytes in B, kB, MB or GB (powers of 1000); a dash if not finite."""
     if not math.isfinite(num_bytes):
         return "-"
     for unit in ("B", "kB", "MB"):
@@ -56,12 +56,12 @@ def size(num_bytes: float) -> str:
 
 
 def share(value: float) -> str:
-    """A share 0..1 as per cent; a dash where there is nothing to count."""
+    """Format a share 0..1 in per cent; a dash if not finite."""
     return f"{100 * value:.2f} %" if math.isfinite(value) else "-"
 
 
 def seconds(value: float) -> str:
-    """A duration: seconds below two minutes, else minutes and seconds."""
+    """Format a duration in seconds below two minutes, else in minutes and seconds."""
     if value < 119.95:
         return f"{value:.1f} s"
     whole = round(value)
@@ -69,14 +69,14 @@ def seconds(value: float) -> str:
 
 
 def instant(stamp_ns: int) -> str:
-    """A point in time: RFC 3339 where it is a date, else seconds."""
+    """Format a stamp as an RFC 3339 date, or in seconds where it is not a date."""
     if stamp_ns < _YEAR_2000_NS:
         return f"{stamp_ns / 1e9:.3f} s"
     return datetime.datetime.fromtimestamp(stamp_ns // 1_000_000_000, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def results(summary: RunSummary) -> RenderableType:
-    """A finished run as tables: the team, each robot, and the frames that could not be used."""
+    """Return the results of a run as tables: the team, each robot, lossy links and frames that were not mapped."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
     if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
         parts.append(_links_table(summary.links))
@@ -86,7 +86,7 @@ def results(summary: RunSummary) -> RenderableType:
 
 
 def chosen_inputs(config: RunConfig) -> Table:
-    """The robots, logs and topics that a run will use."""
+    """Return a table of the robots, logs and topics of a run."""
     table = styled_table("Robots and topics")
     table.add_column("robot", no_wrap=True)
     table.add_column("log", overflow="fold")
@@ -98,7 +98,7 @@ def chosen_inputs(config: RunConfig) -> Table:
 
 
 def class_list(class_table: ClassTable) -> RenderableType:
-    """The classes with their colours."""
+    """Return a list of the classes with their colours."""
     items = [
         Text.assemble(("\u25a0 ", "rgb({},{},{})".format(*entry.color)), entry.name) for entry in class_table.classes
     ]
@@ -106,12 +106,12 @@ def class_list(class_table: ClassTable) -> RenderableType:
 
 
 def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, float]], answer: PointQuery) -> Table:
-    """What a map says about points: the three most probable of ``names`` (free, then the classes)."""
+    """Return a table of the most probable classes at points; ``names`` are free, then the classes."""
     table = styled_table("")
     table.add_column("x, y, z [m]", no_wrap=True)
-    table.add_column("what", no_wrap=True)
-    table.add_column("how sure", justify="right", no_wrap=True)
-    table.add_column("else")
+    table.add_column("label", no_wrap=True)
+    table.add_column("probability", justify="right", no_wrap=True)
+    table.add_column("next")
     table.add_column("leaf", justify="right", no_wrap=True)
     for index, point in enumerate(points):
         where = ", ".join(f"{value:g}" for value in point)
@@ -126,17 +126,17 @@ def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, flo
 
 
 def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
-    """How much of each of ``names`` (free, then the classes) a table of leaves holds."""
+    """Return a table of the volume of each class in some leaves; ``names`` are free, then the classes."""
     labels, volumes = best_labels(leaves.log_odds), leaves.sizes**3
-    sure = label_probabilities(leaves.log_odds)
+    probabilities = label_probabilities(leaves.log_odds)
     table = styled_table("")
-    table.add_column("what", no_wrap=True)
-    for heading in ("leaves", "volume", "how sure, mean"):
+    table.add_column("label", no_wrap=True)
+    for heading in ("leaves", "volume", "mean probability"):
         table.add_column(heading, justify="right", no_wrap=True)
     for class_id, name in enumerate(names):
         chosen = labels == class_id
         if chosen.any():
-            mean = np.average(sure[chosen], weights=volumes[chosen])
+            mean = np.average(probabilities[chosen], weights=volumes[chosen])
             table.add_row(name, f"{chosen.sum():,}", f"{number(volumes[chosen].sum())} m\u00b3", share(mean))
     if not len(leaves):
         table.add_row("unknown", "", "", "")
@@ -144,18 +144,18 @@ def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
 
 
 def made_files(files: Mapping[Path, str]) -> Table:
-    """Files or folders and what they are for."""
-    table = styled_table("Made")
+    """Return a table of written files or folders and their content."""
+    table = styled_table("Written")
     table.show_header = False
     table.add_column(overflow="fold")
     table.add_column()
-    for path, purpose in files.items():
-        table.add_row(str(path), purpose)
+    for path, content in files.items():
+        table.add_row(str(path), content)
     return table
 
 
 def description(logs: LogDescription) -> RenderableType:
-    """What logs hold: their topics, the robots in them, and what a run would miss."""
+    """Return a description of logs as tables: topics, robots, classes and missing inputs."""
     parts: list[RenderableType] = [_log_table(log) for log in logs.logs if log.error is None]
     if logs.robots:
         parts.append(_robot_spans(logs))
@@ -164,22 +164,22 @@ def description(logs: LogDescription) -> RenderableType:
 
 
 def terminal(*, stderr: bool = False, file: IO[str] | None = None, width: int | None = None) -> Console:
-    """A console at most 100 columns wide (160 in a pipe), in which square brackets and colons are just text."""
+    """Return a console of at most 100 columns, 160 in a pipe, without markup and emoji codes."""
     console = Console(stderr=stderr, file=file, width=width, markup=False, emoji=False, highlight=False)
-    # A pipe has no width of its own, and nothing that is read by a program should be cut.
+    # A pipe has no width, and text for programs should not be cut.
     console.width = min(console.width, 100) if console.is_terminal or width or "COLUMNS" in os.environ else 160
     return console
 
 
 def show(console: Console, *parts: RenderableType) -> None:
-    """Print tables and texts one below the other, an empty line after each."""
+    """Print tables and texts with an empty line after each."""
     for part in parts:
         console.print(part)
         console.print()
 
 
 def styled_table(title: str) -> Table:
-    """The one style of all tables."""
+    """Return an empty table in the common style of all tables."""
     return Table(
         title=title or None,
         title_justify="left",
@@ -201,7 +201,7 @@ def _spaced(parts: Sequence[RenderableType]) -> Group:
 
 
 def _team_table(summary: RunSummary) -> Table:
-    """Rows of description and value for the whole team."""
+    """Table of the whole team: rows of description and value."""
     last, table = summary.last, styled_table("Team")
     table.show_header = False
     table.add_column(no_wrap=True)
@@ -210,7 +210,7 @@ def _team_table(summary: RunSummary) -> Table:
     if math.isfinite(summary.wall_seconds) and summary.wall_seconds > 0:
         speed = summary.log_seconds / summary.wall_seconds
         table.add_row("wall time", f"{seconds(summary.wall_seconds)} ({speed:.1f} times real time)")
-    settling = f", and {summary.num_settling_ticks} to settle" if summary.num_settling_ticks else ""
+    settling = f", and {summary.num_settling_ticks} settling" if summary.num_settling_ticks else ""
     table.add_row("ticks", f"{summary.num_ticks - summary.num_settling_ticks}{settling}")
     table.add_row("stopped", summary.stop_reason)
     table.add_row("known cells", f"{last.num_known_cells:,}")
@@ -244,7 +244,7 @@ _AGREEMENTS = ("agreement", "agreement_occupied")
 
 
 def _robots_table(last: TickMetrics) -> Table:
-    """One row per robot after the last tick."""
+    """Table of the robots after the last tick."""
     table = styled_table("Robots, after the last tick")
     table.add_column("robot", no_wrap=True)
     for name in ("scans", "agreement\nall cells", "\noccupied", "leaves", "volume", "entropy", "packet"):
@@ -259,11 +259,11 @@ def _robots_table(last: TickMetrics) -> Table:
 
 
 _FATES = ("lost", "dropped", "late", "stale", "gaps", "damaged")
-"""What can happen to packets: fields of LinkMetrics, after num_."""
+"""Fates of packets that were not delivered in time: fields of LinkMetrics without num_."""
 
 
 def _links_table(links: Sequence[LinkMetrics]) -> Table:
-    """One row per directed link over the whole run."""
+    """Table of the directed links over the whole run."""
     table = styled_table("Links, over the whole run")
     table.add_column("link", no_wrap=True)
     for name in ("packets", "delivered", *_FATES, "bytes/s"):
@@ -278,7 +278,7 @@ def _links_table(links: Sequence[LinkMetrics]) -> Table:
 
 
 def _log_table(log: LogSummary) -> RenderableType:
-    """One log: its span, and one row per topic."""
+    """Time span of a log, and a table of its topics."""
     span = "empty"
     if log.start_ns is not None and log.end_ns is not None:
         span = f"{instant(log.start_ns)}, {seconds((log.end_ns - log.start_ns) / 1e9)}"
@@ -289,7 +289,7 @@ def _log_table(log: LogSummary) -> RenderableType:
     table.add_column("type", no_wrap=True)
     table.add_column("count", justify="right", no_wrap=True)
     table.add_column("rate", justify="right", no_wrap=True)
-    table.add_column("what", overflow="fold")
+    table.add_column("content", overflow="fold")
     for topic in log.topics:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.3g} Hz"
         kind = topic.type_name.replace("/msg/", "/")
@@ -300,7 +300,7 @@ def _log_table(log: LogSummary) -> RenderableType:
 
 
 def _robot_spans(logs: LogDescription) -> Table:
-    """One row per robot that was found: its topics, and when it was there."""
+    """Table of the robots found in logs: topics, frames and time span."""
     table = styled_table("Robots")
     table.add_column("robot", no_wrap=True)
     table.add_column("topics and frames", overflow="fold")
@@ -316,23 +316,23 @@ def _robot_spans(logs: LogDescription) -> Table:
 
 
 def _readiness(logs: LogDescription) -> RenderableType:
-    """The time that all robots share, the classes, and what a run would miss."""
+    """Common time of the robots, classes, and missing inputs."""
     lines: list[RenderableType] = []
     if len(logs.robots) > 1:
         shared = "none" if logs.overlap_ns is None else seconds((logs.overlap_ns[1] - logs.overlap_ns[0]) / 1e9)
-        lines.append(Text(f"time that all robots share: {shared}"))
+        lines.append(Text(f"common time of all robots: {shared}"))
     if logs.class_table is not None:
         lines.append(class_list(logs.class_table))
-    missing = [f"{robot.robot.robot_id}: {what}" for robot in logs.robots for what in robot.missing]
+    missing = [f"{robot.robot.robot_id}: {item}" for robot in logs.robots for item in robot.missing]
     missing += logs.missing
     if not missing:
         lines.append(Text("nothing is missing for a run", style="green"))
-    lines += [Text(f"missing for a run: {what}", style="yellow") for what in missing]
+    lines += [Text(f"missing for a run: {item}", style="yellow") for item in missing]
     return Group(*lines)
 
 
 def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
-    """One row per robot: frames that were mapped, and those that were not, by cause."""
+    """Table of frames per robot: mapped, and not mapped by cause."""
     table = styled_table("Frames")
     table.add_column("robot", no_wrap=True)
     table.add_column("mapped", justify="right")
@@ -345,7 +345,7 @@ def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
 
 
 def _choices(robot: RobotConfig) -> list[str]:
-    """One line per topic or frame that a robot's configuration names."""
+    """Lines with the topics and frames of a robot's configuration."""
     names = {
         "depth_topic": "depth", "cloud_topic": "cloud", "label_topic": "labels", "camera_info_topic": "camera",
         "pose_topic": "pose", "label_info_topic": "names", "map_frame": "map frame", "sensor_frame": "sensor frame",

@@ -1,4 +1,4 @@
-"""Tables and sentences for the terminal: what a check found, and how two results differ."""
+"""Tables and verdicts for the terminal: checks of a result, and the comparison of two results."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from octoreplay.evaluate.comparison import MapDifference, Point, ResultCompariso
 from octoreplay.report.tables import styled_table
 
 _MOST_CHANGES = 12
-"""Pairs of labels that the table shows; the others are in one row."""
+"""Number of pairs of labels with a row of their own; one row sums up the others."""
 
 
 def check_rows(rows: Sequence[CheckRow]) -> Table:
-    """One row per limit, in their order."""
+    """Return a table with one row per check, in their order."""
     table = styled_table("")
     table.add_column("", no_wrap=True)
-    table.add_column("what", overflow="fold")
+    table.add_column("check", overflow="fold")
     table.add_column("limit", justify="right", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)
     table.add_column("where", overflow="fold")
@@ -33,7 +33,7 @@ def check_rows(rows: Sequence[CheckRow]) -> Table:
 
 
 def check_verdict(rows: Sequence[CheckRow]) -> str:
-    """One sentence that says what failed."""
+    """Return one sentence that names the failed checks."""
     failed = [row.name.replace("_", " ") for row in rows if not row.passed]
     if not failed:
         return f"passed: {'all ' if len(rows) > 1 else ''}{_count(len(rows), 'check')}"
@@ -41,7 +41,7 @@ def check_verdict(rows: Sequence[CheckRow]) -> str:
 
 
 def comparison(found: ResultComparison) -> Iterator[RenderableType]:
-    """Two results side by side: their files, their maps, the labels, the settings."""
+    """Yield the tables of a comparison: files, maps, differing boxes, labels and settings."""
     yield _files(found)
     if found.maps:
         yield _maps(found)
@@ -55,13 +55,13 @@ def comparison(found: ResultComparison) -> Iterator[RenderableType]:
 
 
 def comparison_verdict(found: ResultComparison) -> str:
-    """One sentence: the same, or how different."""
+    """Return one sentence: whether the maps are the same, and the largest difference otherwise."""
     within = f" within {found.tolerance:g}" if found.tolerance else ""
     num_maps = len(found.maps)
     if found.is_same:
         num_relabelled = sum(one.num_relabelled for one in found.maps)
-        but = f"; labels differ in {_count(num_relabelled, 'cell')}" if num_relabelled else ""
-        return f"the same{within}: {_count(num_maps, 'map')}, every cell{but}"
+        labels = f"; labels differ in {_count(num_relabelled, 'cell')}" if num_relabelled else ""
+        return f"the same{within}: all cells of {_count(num_maps, 'map')}{labels}"
     parts = []
     differing = [one for one in found.maps if one.num_differing]
     if differing:
@@ -69,15 +69,15 @@ def comparison_verdict(found: ResultComparison) -> str:
         most = max(one.num_differing for one in differing)
         parts.append(
             f"{len(differing)} of {_count(num_maps, 'map')}, in up to {_count(most, 'cell')},"
-            f" by up to {number(worst.largest_difference)} ({_place(worst)})"
+            f" by up to {six_digits(worst.largest_difference)} ({_place(worst)})"
         )
-    parts += [f"only {which} has a map of {', '.join(names)}"
-              for which, names in (("A", found.only_a), ("B", found.only_b)) if names]  # fmt: skip
+    parts += [f"only {result} has a map of {', '.join(names)}"
+              for result, names in (("A", found.only_a), ("B", found.only_b)) if names]  # fmt: skip
     return f"different{within}: {'; '.join(parts)}"
 
 
-def number(value: float) -> str:
-    """A number to be compared by eye: six significant digits, thousands separated; a dash for NaN."""
+def six_digits(value: float) -> str:
+    """Format a number with six significant digits and separated thousands; a dash for NaN."""
     if math.isnan(value):
         return "-"
     if math.isfinite(value) and value == round(value) and abs(value) < 1e15:
@@ -86,35 +86,35 @@ def number(value: float) -> str:
 
 
 def _values(row: CheckRow) -> tuple[str, str]:
-    """Limit and measured value, which look different where one is past the other."""
+    """Limit and measured value as texts, which differ wherever the numbers do."""
     if row.is_flag:
         return "yes", "yes" if row.measured else "no"
-    limit, measured = number(row.limit), number(row.measured)
+    limit, measured = six_digits(row.limit), six_digits(row.measured)
     if limit == measured and row.limit != row.measured:
         limit, measured = repr(row.limit), repr(row.measured)
     return f"{'at most' if row.is_upper else 'at least'} {limit}", measured
 
 
 def _where(row: CheckRow) -> str:
-    """Whose value it is, when it was, and what else is to be said."""
+    """Robot, link and time of a value, and the explanation."""
     at = "" if row.seconds is None else f"at {row.seconds:.1f} s"
-    whose = " ".join(part for part in (row.robot, row.link, at) if part)
-    return "; ".join(part for part in (whose, row.detail) if part)
+    place = " ".join(part for part in (row.robot, row.link, at) if part)
+    return "; ".join(part for part in (place, row.detail) if part)
 
 
 def _files(found: ResultComparison) -> Group:
-    """The two files, and whether they were made from the same logs."""
+    """Paths of the two results, and whether their logs are the same."""
     files = (("A", found.a, found.is_complete_a), ("B", found.b, found.is_complete_b))
     lines = [
-        Text(f"{name}: {path}{'' if is_complete else ' (of an interrupted run)'}", overflow="fold")
+        Text(f"{name}: {path}{'' if is_complete else ' (interrupted run)'}", overflow="fold")
         for name, path, is_complete in files
     ]
-    said = {True: "the same", False: "different", None: "not comparable: their fingerprints were taken in two ways"}
-    return Group(*lines, Text(f"logs: {said[found.same_inputs]}"))
+    verdicts = {True: "the same", False: "different", None: "not comparable, since their fingerprint methods differ"}
+    return Group(*lines, Text(f"logs: {verdicts[found.same_inputs]}"))
 
 
 def _maps(found: ResultComparison) -> Table:
-    """One row per map that both results have."""
+    """Table of the maps that both results have."""
     table = styled_table("Maps, in finest cells")
     table.add_column("map", no_wrap=True)
     for name in ("time A", "time B", "in both", "only A", "only B", "other label", "largest\ndifference"):
@@ -124,14 +124,14 @@ def _maps(found: ResultComparison) -> Table:
         table.add_row(
             one.robot_id, f"{one.seconds_a:.1f} s", f"{one.seconds_b:.1f} s", f"{one.num_cells_both:,}",
             f"{one.num_cells_a_only:,}", f"{one.num_cells_b_only:,}", f"{one.num_relabelled:,}",
-            number(one.largest_difference), f"{one.num_over_tolerance:,}",
+            six_digits(one.largest_difference), f"{one.num_over_tolerance:,}",
         )  # fmt: skip
     return table
 
 
 def _places(differing: Sequence[MapDifference]) -> Table:
-    """Where maps differ: the box that holds every differing cell, and the worst cell."""
-    table = styled_table("Where they differ [m]")
+    """Table of the boxes around the differing cells, and of the cells with the largest difference."""
+    table = styled_table("Places of the differences [m]")
     table.add_column("map", no_wrap=True)
     table.add_column("cells", justify="right", no_wrap=True)
     for name in ("from", "to", "largest difference at"):
@@ -142,11 +142,11 @@ def _places(differing: Sequence[MapDifference]) -> Table:
 
 
 def _label_changes(maps: Sequence[MapDifference]) -> Table:
-    """The pairs of different labels, of all maps together."""
+    """Table of the pairs of different labels, summed over all maps."""
     counts: Counter[tuple[str, str]] = Counter()
     for one in maps:
         counts.update({(change.label_a, change.label_b): change.num_cells for change in one.label_changes})
-    table = styled_table("Labels that differ")
+    table = styled_table("Different labels")
     table.add_column("in A", no_wrap=True)
     table.add_column("in B", no_wrap=True)
     table.add_column("cells, in all maps", justify="right", no_wrap=True)
@@ -159,8 +159,8 @@ def _label_changes(maps: Sequence[MapDifference]) -> Table:
 
 
 def _settings(settings: Sequence[SettingDifference]) -> Table:
-    """The settings that are not the same."""
-    table = styled_table("Settings that differ")
+    """Table of the settings with different values."""
+    table = styled_table("Different settings")
     table.add_column("setting", overflow="fold")
     table.add_column("in A", overflow="fold")
     table.add_column("in B", overflow="fold")
@@ -170,20 +170,20 @@ def _settings(settings: Sequence[SettingDifference]) -> Table:
 
 
 def _setting(value: object) -> str:
-    """A setting's value; what is not set follows from others."""
+    """Value of a setting as text; None is a default that follows from other settings."""
     return "(default)" if value is None else "(none)" if value == () else str(value)
 
 
 def _place(one: MapDifference) -> str:
-    """Whose map, and the cell with the largest difference."""
+    """Name of a map and the centre of the cell with the largest difference."""
     return one.robot_id if one.largest_at is None else f"{one.robot_id} at {_point(one.largest_at)}"
 
 
 def _point(point: Point | None) -> str:
-    """Three coordinates."""
+    """Coordinates as text."""
     return "" if point is None else ", ".join(f"{value:g}" for value in point)
 
 
 def _count(number_of: int, noun: str) -> str:
-    """A number of things."""
+    """Number with a noun in singular or plural."""
     return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"

@@ -1,1 +1,1 @@
-"""A synthetic village and a team of robots that explore it, written as ordinary logs."""
+"""Simulation of a team of robots that explore a procedural village, written as ordinary logs."""

@@ -1,6 +1,6 @@
-"""Depth and label images of a mesh by ray casting, and a depth camera's noise.
+"""Depth and label images of a mesh by ray casting, and the noise of a depth camera.
 
-The only module that imports Open3D, and only when a picture is taken.
+Only this module imports Open3D, and only when a camera is made.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from octoreplay.records import CameraModel, Float32Array, Float64Array, UInt8Arr
 from octoreplay.simulate.world import World
 
 NO_LABEL = 255
-"""Raw label of a pixel that measured nothing."""
+"""Raw label of a pixel without a measurement."""
 
 
 class MeshCamera:
-    """Takes depth and label pictures of a world.
+    """Camera that renders depth and label images of a world.
 
-    Raises InputError where Open3D or a shared library that it needs is missing.
+    Raises InputError if Open3D or one of its shared libraries is missing.
     """
 
     def __init__(self, world: World, camera: CameraModel) -> None:
@@ -29,24 +29,24 @@ class MeshCamera:
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(self._tensor(world.vertices), self._tensor(world.triangles.astype(np.uint32)))
-        # One more entry: a ray that meets nothing has the id 2^32 - 1, and is given the label of nothing.
+        # The additional last entry is for rays that hit nothing; their primitive id is 2^32 - 1.
         self._labels = np.append(world.triangle_classes, np.uint8(NO_LABEL))
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
 
     def take(self, T_world_camera: Float64Array, max_depth: float) -> tuple[Float32Array, UInt8Array]:
-        """Depth (H, W) float32 in metres along z, 0 where nothing is nearer than ``max_depth``, and labels (H, W).
+        """Render depth (H, W) float32 [m] along z, 0 beyond ``max_depth`` [m], and labels (H, W) uint8.
 
-        ``T_world_camera`` is (4, 4), optical frame (z forward, x right, y down).
+        ``T_world_camera`` (4, 4) is the pose of the optical frame: z forward, x right, y down.
         """
-        # The rays' z component is 1, so that the distance that comes back is the depth along z itself.
+        # The z component of each ray is 1, so that the returned distance is the depth along z.
         directions = self._rays @ T_world_camera[:3, :3].T
         rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
         rays[..., :3] = T_world_camera[:3, 3]
         rays[..., 3:] = directions
-        answer = self._scene.cast_rays(self._tensor(rays))
-        depth = answer["t_hit"].numpy()
-        ids = np.minimum(answer["primitive_ids"].numpy(), np.uint32(len(self._labels) - 1))
+        hits = self._scene.cast_rays(self._tensor(rays))
+        depth = hits["t_hit"].numpy()
+        ids = np.minimum(hits["primitive_ids"].numpy(), np.uint32(len(self._labels) - 1))
         labels = self._labels[ids]
         beyond = ~(depth <= max_depth)
         depth[beyond] = 0.0
@@ -55,46 +55,46 @@ class MeshCamera:
 
 
 def depth_noise_sigma(depth: npt.ArrayLike) -> Float64Array:
-    """Standard deviation in metres of a depth camera's noise at a depth in metres.
+    """Return the standard deviation [m] of a depth camera's noise at depths [m].
 
-    sigma(z) = 0.0012 + 0.0019 (z - 0.4)^2: Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D
-    Reconstruction and Tracking, 3DIMPVT 2012.
+    sigma(z) = 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D
+    Reconstruction and Tracking, 3DIMPVT 2012).
     """
     sigma: Float64Array = 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
     return sigma
 
 
 def add_depth_noise(depth: Float32Array, rng: np.random.Generator, factor: float = 1.0) -> Float32Array:
-    """The depth image with Gaussian noise of ``factor`` sigma(z); pixels without a measurement stay 0."""
+    """Return the depth image [m] with Gaussian noise of ``factor`` * sigma(z); pixels without a measurement stay 0."""
     noise = np.float32(factor) * rng.standard_normal(depth.shape, dtype=np.float32)
     noisy = depth + noise * depth_noise_sigma(depth).astype(np.float32)
     return np.where(depth > 0, np.maximum(noisy, np.float32(0.001)), np.float32(0.0))
 
 
 def depth_to_millimetres(depth: Float32Array) -> npt.NDArray[np.uint16]:
-    """A depth image in metres as 16UC1 millimetres; 65535 is never written, since it often means 'invalid'."""
+    """Convert a depth image [m] to uint16 millimetres, at most 65534, because 65535 often means 'invalid'."""
     millimetres: npt.NDArray[np.uint16] = np.clip(np.rint(depth * np.float32(1000.0)), 0, 65534).astype(np.uint16)
     return millimetres
 
 
 def add_label_noise(labels: UInt8Array, share: float, num_classes: int, rng: np.random.Generator) -> UInt8Array:
-    """The label image with this share of its measured pixels turned into another class, each equally likely."""
+    """Return the label image with this share of its measured pixels changed to another class, uniformly drawn."""
     wrong = (rng.random(labels.shape, dtype=np.float32) < share) & (labels != NO_LABEL)
     noisy = labels.copy()
-    # Adding 1..C-1 modulo C never gives the class itself.
+    # Adding 1 to C - 1 modulo C gives each other class with equal probability.
     shift = rng.integers(1, num_classes, int(wrong.sum()), dtype=np.int64)
     noisy[wrong] = (labels[wrong].astype(np.int64) - 1 + shift) % num_classes + 1
     return noisy
 
 
 def _import_open3d() -> ModuleType:
-    """Open3D, or one sentence on what is missing."""
+    """Import Open3D. Raises InputError if it cannot be loaded."""
     try:
         import open3d
     except (ImportError, OSError) as error:
         raise InputError(
-            f"simulation needs Open3D, which cannot be loaded ({error}); on a headless Debian or Ubuntu machine its "
-            "shared libraries come with: apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6"
+            f"simulation needs Open3D, which cannot be loaded ({error}); on a headless Debian or Ubuntu machine install"
+            " its shared libraries with: apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6"
         ) from error
     module: ModuleType = open3d
     return module

@@ -1,9 +1,9 @@
-"""A team that explores: frontiers on one shared 2-D map, goals that robots share out, and paths round obstacles.
+"""Coordinated exploration of a world by a team of robots on one shared 2-D map.
 
-Frontiers are seen free cells beside unseen ones (Yamauchi, A Frontier-Based Approach for Autonomous Exploration,
-CIRA 1997). A robot takes the frontier with the most unseen area for the least way, and a frontier near another robot's
-goal counts less (Burgard, Moors, Stachniss and Schneider, Coordinated Multi-Robot Exploration, T-RO 2005). When nothing
-is left to see, robots patrol: the same with the area that was seen longest ago.
+Frontiers are free cells next to unseen cells (Yamauchi, A Frontier-Based Approach for Autonomous Exploration, CIRA
+1997). A robot chooses the frontier with the largest unseen area minus path cost; frontiers near another robot's goal
+have a penalty (Burgard, Moors, Stachniss and Schneider, Coordinated Multi-Robot Exploration, T-RO 2005). Without
+frontiers robots patrol: they choose the area that was seen longest ago in the same way.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from octoreplay.records import BoolArray, Float64Array, Int64Array
 from octoreplay.simulate.world import World, grid_length
 
 CELL = 0.5
-"""Edge of the exploration map's cells in metres."""
+"""Edge length of the exploration map's cells [m]."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How a robot drives and looks; the defaults are a Clearpath Husky with a wide camera.
+    """Motion and view of a robot; the defaults are a Clearpath Husky with a wide-angle camera.
 
-    Metres, seconds and radians. ``clearance`` is kept between the centres of the cells that the robot and an obstacle
-    are in; ``view_range`` and ``view_angle`` are the sector that counts as seen.
+    ``speed`` [m/s], ``turn_rate`` [rad/s]. ``clearance`` [m] is the least distance between the centres of the robot's
+    cell and an obstacle's cell. ``view_range`` [m] and ``view_angle`` [rad] define the visible sector.
     """
 
     speed: float = 1.0
@@ -39,9 +39,9 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Exploration:
-    """Where the team drove: ``states`` (N, T, 3) float64 x, y [m] and heading [rad], one every ``period`` seconds.
+    """Trajectories of a team: ``states`` (N, T, 3) float64 of x, y [m] and heading [rad], one every ``period`` [s].
 
-    ``first_seen`` (N, n, n) int32 is the step at which a robot first saw a cell of the map, -1 where it never did.
+    ``first_seen`` (N, n, n) int32 is the step at which a robot first saw a cell of the map, -1 for unseen cells.
     """
 
     period: float
@@ -58,14 +58,14 @@ def explore(
     motion: Motion | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Exploration:
-    """Drive a team through a world for ``num_steps`` states, ``period`` seconds apart.
+    """Drive a team through a world for ``num_steps`` states, ``period`` [s] apart.
 
-    The team starts on a ring around the origin, all looking along x, so that their first views overlap. Deterministic:
-    nothing is drawn at random, and ties go to the lower index. ``progress`` is called with the share that is done.
+    The robots start on a ring around the origin, all heading along x, so that their first views overlap. The result is
+    deterministic; ties go to the lower index. ``progress`` is called with the finished share, 0 to 1.
     """
     team = _Team(world, num_robots, num_steps, period, motion or Motion())
     for step in range(num_steps):
-        team.look(step)
+        team.observe(step)
         if step + 1 < num_steps:
             team.move(step)
         if progress is not None:
@@ -74,7 +74,7 @@ def explore(
 
 
 class _Team:
-    """The robots' states and the map that they share."""
+    """States of the robots and the map that they share."""
 
     def __init__(self, world: World, num_robots: int, num_steps: int, period: float, motion: Motion) -> None:
         from scipy.ndimage import distance_transform_edt
@@ -84,7 +84,7 @@ class _Team:
         self.period = period
         self.motion = motion
         self.obstacles = world.obstacle_mask(CELL)
-        # Distance from a cell's centre to the nearest obstacle cell's centre; the map's edge counts as an obstacle.
+        # Distance between the centres of a cell and the nearest obstacle cell. The map's edge is an obstacle.
         padded = np.pad(~self.obstacles, 1, constant_values=False)
         self.true_distance: Float64Array = distance_transform_edt(padded)[1:-1, 1:-1] * CELL
         self.first_seen = np.full((num_robots, self.n, self.n), -1, dtype=np.int32)
@@ -98,7 +98,7 @@ class _Team:
         self._rays = self._sector()
 
     def _start(self, num_robots: int) -> Float64Array:
-        """A ring around the origin, headings along x; a place that is taken moves to the nearest free cell."""
+        """States (N, 3) on a ring around the origin, heading along x, each moved to the nearest free cell."""
         ring = max(1.2, num_robots * 2.6 / (2 * math.pi)) if num_robots > 1 else 0.0
         free = np.argwhere(self.true_distance >= self.motion.clearance)
         centers = self._center(free)
@@ -114,13 +114,13 @@ class _Team:
         return states
 
     def _sector(self) -> tuple[Float64Array, Float64Array]:
-        """Angles of the view's rays and distances along them, dense enough to touch every cell."""
+        """Angles of the rays in the visible sector and distances along them, dense enough to reach every cell."""
         reach, spread = self.motion.view_range, self.motion.view_angle
         count = math.ceil(spread * reach / CELL)
         return np.linspace(-spread / 2, spread / 2, count), np.arange(CELL / 2, reach, CELL / 2)
 
-    def look(self, step: int) -> None:
-        """Mark what every robot sees: its camera's sector up to the first obstacle, and where it stands."""
+    def observe(self, step: int) -> None:
+        """Mark the cells that each robot sees: its sector up to the first obstacles, and its surroundings."""
         angles, distances = self._rays
         for robot in range(len(self.states)):
             x, y, heading = self.states[robot, step]
@@ -131,10 +131,10 @@ class _Team:
             outside = ((cells < 0) | (cells >= self.n)).any(axis=2)
             cells = np.clip(cells, 0, self.n - 1)
             blocked = self.obstacles[cells[..., 0], cells[..., 1]] | outside
-            # The first obstacle on a ray is seen, what comes after it is not.
+            # The first obstacle on a ray is seen, cells behind it are not.
             behind = np.cumsum(blocked, axis=1) - blocked > 0
             self._mark(robot, step, cells[~behind & ~outside])
-            # A robot feels what stands beside it.
+            # A robot also detects obstacles next to it.
             reach = math.ceil(1.5 / CELL)
             i, j = self._cell(x, y)
             near = np.stack(np.meshgrid(np.arange(i - reach, i + reach + 1), np.arange(j - reach, j + reach + 1)), -1)
@@ -142,7 +142,7 @@ class _Team:
             self._mark(robot, step, near[((near >= 0) & (near < self.n)).all(axis=1)])
 
     def _mark(self, robot: int, step: int, cells: Int64Array) -> None:
-        """Remember cells as seen by a robot at a step."""
+        """Mark cells (P, 2) as seen by a robot at a step."""
         first = self.first_seen[robot]
         i, j = cells[:, 0], cells[:, 1]
         new = first[i, j] < 0
@@ -150,14 +150,14 @@ class _Team:
         self.last_seen[i, j] = step
 
     def move(self, step: int) -> None:
-        """Drive every robot one step along its path; a new path is planned when the old one has served."""
+        """Drive every robot one step along its path, with a new path if one is due."""
         for robot in range(len(self.states)):
-            if self._wants_plan(robot, step):
+            if self._needs_plan(robot, step):
                 self._plan(robot, step)
             self.states[robot, step + 1] = self._drive(robot, step)
 
-    def _wants_plan(self, robot: int, step: int) -> bool:
-        """True when the goal is reached or nothing new is to be seen there; at most one plan a second."""
+    def _needs_plan(self, robot: int, step: int) -> bool:
+        """True if the goal is reached or its surroundings have been seen since; at most once a second."""
         if (step - self.planned_at[robot]) * self.period < 1.0:
             return False
         path, goal = self.paths[robot], self.goals[robot]
@@ -169,7 +169,7 @@ class _Team:
         return bool(arrived or (window >= self.planned_at[robot]).all())
 
     def _plan(self, robot: int, step: int) -> None:
-        """Choose the best goal and the shortest path to it over cells known to be free."""
+        """Choose the best goal and the shortest path to it over known free cells."""
         from scipy.ndimage import distance_transform_edt
 
         self.planned_at[robot] = step
@@ -202,7 +202,7 @@ class _Team:
         self.passable[robot] = passable
 
     def _frontier_area(self) -> Float64Array:
-        """Square metres of unseen area about each cell from which a frontier is near; elsewhere -inf."""
+        """Unseen area (n, n) around each cell near a frontier [m^2]; -inf elsewhere."""
         from scipy.ndimage import uniform_filter
 
         unseen = self.last_seen < 0
@@ -211,7 +211,7 @@ class _Team:
         return np.where(self._frontier(unseen), area, -np.inf)
 
     def _age(self, step: int) -> Float64Array:
-        """Mean seconds since the cells about each cell were last seen, 120 at most."""
+        """Mean time (n, n) since the cells around each cell were last seen, clipped at 120 s [s]."""
         from scipy.ndimage import uniform_filter
 
         age: Float64Array = np.minimum((step - self.last_seen) * self.period, 120.0)
@@ -219,11 +219,11 @@ class _Team:
         return mean
 
     def _window(self) -> int:
-        """Cells along the edge of the square that a robot sees well about a place."""
+        """Edge length in cells of the square that a robot sees well from its centre."""
         return 2 * math.ceil(0.5 * self.motion.view_range / CELL) + 1
 
     def _frontier(self, unseen: BoolArray) -> BoolArray:
-        """Seen free cells from which an unseen cell is within reach of the planner's clearance, in groups of five."""
+        """Mask of free cells within the planner's clearance of a frontier of at least five cells."""
         from scipy.ndimage import binary_dilation, label
 
         free = ~unseen & ~self.obstacles
@@ -236,7 +236,7 @@ class _Team:
         return near
 
     def _turning(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
-        """The cost of turning towards each cell, so that a robot does not dither between its left and right."""
+        """Cost of turning towards each cell, which prevents alternating between goals on both sides."""
         x, y, heading = self.states[robot, step]
         offset = self._center(cells) - (x, y)
         error = np.abs(_wrap(np.arctan2(offset[:, 1], offset[:, 0]) - heading))
@@ -244,7 +244,7 @@ class _Team:
         return cost
 
     def _crowding(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
-        """What each cell loses because another robot stands there or goes there."""
+        """Cost of each cell that is near another robot or its goal."""
         cost = np.zeros(len(cells))
         centers = self._center(cells)
         for other, goal in enumerate(self.goals):
@@ -256,7 +256,7 @@ class _Team:
         return cost
 
     def _drive(self, robot: int, step: int) -> Float64Array:
-        """The next state: turn towards a point ahead on the path and drive, never into anything."""
+        """Next state: turn towards a point ahead on the path and drive if the way is clear."""
         x, y, heading = self.states[robot, step]
         path = self.paths[robot]
         if path is None:
@@ -265,24 +265,24 @@ class _Team:
         error = float(_wrap(math.atan2(target[1] - y, target[0] - x) - heading))
         turn = max(-self.motion.turn_rate * self.period, min(self.motion.turn_rate * self.period, error))
         heading += turn
-        # Full speed when the way is ahead, turning on the spot when it is behind.
+        # Full speed if the target is straight ahead, turning on the spot if it is behind.
         pace = self.motion.speed * self.period * max(0.0, math.cos(min(1.2 * abs(error), math.pi / 2)))
         pace = min(pace, math.hypot(target[0] - x, target[1] - y))
         ahead = np.array([x + pace * math.cos(heading), y + pace * math.sin(heading)])
         if not self._may_stand(robot, step, ahead):
-            # Turning on towards the path is enough on a known way; what blocks it straight ahead is news.
+            # If the robot already heads along the path, an unknown obstacle blocks it and a new plan is needed.
             if abs(error) < 0.05:
                 self.paths[robot] = None
             ahead = np.array([x, y])
         return np.array([*ahead, heading])
 
     def _look_ahead(self, robot: int, path: Float64Array, here: Float64Array) -> Float64Array:
-        """The farthest point of the path, up to 2 m on from the robot, that it can make for in a straight line."""
+        """Farthest point of the path, up to 2 m ahead, that the robot can reach in a straight line."""
         nearest = int(np.argmin(np.hypot(*(path - here).T)))
         target: Float64Array = path[nearest]
         for ahead in path[nearest + 1 : nearest + 5]:
             along = ahead - here
-            # A strip rather than a line, for steps have a length and may clip a corner that a thin line just misses.
+            # A strip instead of a line, because steps of finite length may clip a corner that a line just misses.
             side = 0.06 * np.array([-along[1], along[0]]) / max(1e-9, float(np.hypot(*along)))
             line = here + np.linspace(0.0, 1.0, 40)[:, None] * along
             strip = np.concatenate([line - side, line + side])
@@ -293,21 +293,21 @@ class _Team:
         return target
 
     def _may_stand(self, robot: int, step: int, place: Float64Array) -> bool:
-        """True when a place keeps clear of obstacles, and of other robots or at least leads away from them."""
+        """True if a position is clear of obstacles, and of other robots unless it increases the distance to them."""
         if self.true_distance[self._cell(*place)] < self.motion.clearance:
             return False
         here = self.states[robot, step, :2]
         for other in range(len(self.states)):
             if other == robot:
                 continue
-            # Robots with a lower index have moved already.
+            # Robots with a lower index have already moved.
             there = self.states[other, step + 1 if other < robot else step, :2]
             if np.hypot(*(place - there)) < min(1.0, float(np.hypot(*(here - there)))):
                 return False
         return True
 
     def _block(self, passable: BoolArray, place: Float64Array, radius: float) -> None:
-        """Take a disc out of a mask."""
+        """Clear a disc in a mask."""
         reach = math.ceil(radius / CELL)
         i, j = self._cell(*place)
         rows, columns = np.ogrid[max(0, i - reach) : min(self.n, i + reach + 1),
@@ -315,7 +315,7 @@ class _Team:
         passable[rows, columns] &= np.hypot(rows - i, columns - j) * CELL > radius
 
     def _nearest(self, passable: BoolArray, place: Float64Array) -> Int64Array | None:
-        """The passable cell nearest to a place, at most 3 m away."""
+        """Nearest passable cell, None if it is 3 m away or more."""
         cells = np.argwhere(passable)
         if len(cells) == 0:
             return None
@@ -324,21 +324,21 @@ class _Team:
         return cells[best] if distance[best] < 3.0 else None
 
     def _cell(self, x: float, y: float) -> tuple[int, int]:
-        """The cell that holds a point; points on the edge belong to the last cell."""
+        """Cell that contains a point; points on the map's edge belong to the last cell."""
         i, j = (min(self.n - 1, max(0, math.floor((value + self.size / 2) / CELL))) for value in (x, y))
         return i, j
 
     def _center(self, cells: Int64Array) -> Float64Array:
-        """Centres in metres of cells (..., 2)."""
+        """Centres (..., 2) of cells (..., 2) [m]."""
         centers: Float64Array = (np.asarray(cells, dtype=np.float64) + 0.5) * CELL - self.size / 2
         return centers
 
 
 def _shortest_paths(passable: BoolArray, start: Int64Array) -> tuple[Int64Array, Float64Array, Int64Array]:
-    """Dijkstra over the eight neighbours of passable cells; a diagonal step needs both cells beside it.
+    """Shortest paths over passable cells with eight neighbours (Dijkstra); diagonal steps need both adjacent cells.
 
-    Gives the cells (P, 2), their distance from the start in cells, infinite where there is no way, and the index of the
-    cell before each on the way, negative at the start.
+    Returns the cells (P, 2), their distances from the start in cells, infinite if unreachable, and the index of each
+    cell's predecessor, negative at the start.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
@@ -366,6 +366,6 @@ def _shortest_paths(passable: BoolArray, start: Int64Array) -> tuple[Int64Array,
 
 
 def _wrap(angle: npt.ArrayLike) -> Float64Array:
-    """Angles in [-pi, pi)."""
+    """Angles wrapped to [-pi, pi)."""
     wrapped: Float64Array = (np.asarray(angle, dtype=np.float64) + math.pi) % (2 * math.pi) - math.pi
     return wrapped

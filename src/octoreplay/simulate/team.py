@@ -1,4 +1,4 @@
-"""A simulated team: a village, robots that explore it, and their logs, as robots would have recorded them."""
+"""Simulation of a team: a village, robots that explore it, and the logs that they record."""
 
 from __future__ import annotations
 
@@ -18,17 +18,12 @@ from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWrite
 from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore
-from octoreplay.simulate.world import (
-    MAX_KINDS,
-    Terrain,
-    make_village,
-    village_classes,
-    write_ground_truth,
-    write_mesh,
-)
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import MAX_KINDS, Terrain, village_classes
+from octoreplay.simulate.world_files import write_ground_truth, write_mesh
 
 START_NS = 1_700_000_000_000_000_000
-"""Stamp of a simulation's first message: fixed, so that the same options give the same bytes."""
+"""Stamp of a simulation's first message, constant so that equal settings give equal bytes."""
 
 _ODOMETRY_RATE = 20.0
 _POSE_CORRELATION_TIME = 10.0
@@ -39,14 +34,34 @@ _CAMERA_PITCH = 0.08
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What is simulated.
+    """Settings of a simulation. Raises ConfigError for a value out of range.
 
-    ``duration`` in seconds; ``rate`` images per second; ``image`` (width, height) in pixels; ``resolution`` in metres,
-    of the ground truth's cells and of the team file; ``label_noise`` is the share of pixels that get another class;
-    ``depth_noise`` multiplies the standard deviation of a depth camera's noise; ``pose_noise`` is the standard
-    deviation in metres of the recorded poses' x and y, a tenth of it in radians that of their heading;
-    ``kinds_per_class`` splits each of the eight classes; ``world_size`` is the edge in metres of the square that robots
-    may drive in; ``max_depth`` the camera's range in metres. Raises ConfigError for a value out of range.
+    Attributes
+    ----------
+    num_robots : int
+        Number of robots.
+    duration : float
+        Length of the logs [s].
+    rate : float
+        Images per second and robot [Hz].
+    image : tuple of int
+        Width and height of the images [pixels].
+    seed : int
+        Seed of the village and of all noise.
+    resolution : float
+        Cell size of the ground truth, and resolution in the team file [m].
+    label_noise : float
+        Share of the pixels that get a wrong class.
+    depth_noise : float
+        Factor on the standard deviation of a depth camera's noise.
+    pose_noise : float
+        Standard deviation of the recorded x and y [m]; a tenth of it is that of the heading [rad].
+    kinds_per_class : int
+        Number of classes that each of the eight classes is divided into.
+    world_size : float
+        Edge length of the drivable square [m].
+    max_depth : float
+        Range of the camera [m].
     """
 
     num_robots: int = 6
@@ -83,25 +98,25 @@ class SimulationConfig:
 
     @property
     def camera(self) -> CameraModel:
-        """The robots' camera: fx = fy = 65.25 pixels at 160 pixels width, the principal point at the centre."""
+        """Camera of the robots: fx = fy = 65.25 pixels at a width of 160 pixels, principal point at the centre."""
         width, height = self.image
         focal = 65.25 * width / 160
         return CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     @property
     def class_table(self) -> ClassTable:
-        """The classes that the cameras label."""
+        """Classes of the label images."""
         return village_classes(self.kinds_per_class)
 
     @property
     def robot_ids(self) -> tuple[str, ...]:
-        """husky_1, husky_2, ..."""
+        """Names of the robots: husky_1, husky_2, ..."""
         return tuple(f"husky_{index + 1}" for index in range(self.num_robots))
 
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """What a simulation wrote. ``num_cells`` counts the ground truth's labelled cells."""
+    """Files of a simulation, and the numbers of images, of labelled ground truth cells and of bytes in them."""
 
     folder: Path
     team_file: Path
@@ -116,9 +131,9 @@ def simulate_team(
 ) -> SimulationSummary:
     """Simulate a team and write one log per robot, ``team.yaml``, ``world.npz`` and ``world.ply`` into a folder.
 
-    The same configuration gives the same bytes. ``progress`` is called with the share that is done, 0 to 1. Files
-    appear under their names only when all are complete. Raises OutputError where the folder is not empty or cannot be
-    written, InputError where Open3D cannot be loaded.
+    Equal settings give equal bytes. ``progress`` is called with the finished share, 0 to 1. Files get their names only
+    when all of them are complete. Raises OutputError if the folder is not empty or cannot be written, InputError if
+    Open3D cannot be loaded.
     """
     created = _prepare(folder)
     work = folder / ".partial"
@@ -126,7 +141,7 @@ def simulate_team(
         work.mkdir()
         num_frames, num_cells = _write_all(work, config, progress or _no_progress)
         names = sorted(path.name for path in work.iterdir())
-        # The team file comes last: where it stands, everything does.
+        # The team file is moved last. If it exists, all other files do too.
         for name in sorted(names, key=lambda name: name == "team.yaml"):
             (work / name).replace(folder / name)
         work.rmdir()
@@ -148,17 +163,17 @@ def simulate_team(
 
 
 def _no_progress(share: float) -> None:
-    """Nobody watches."""
+    """Default progress callback."""
 
 
 def _prepare(folder: Path) -> bool:
-    """Make sure of an empty folder; True when it was made."""
+    """Create the folder or check that it is empty; True if it was created."""
     try:
         if folder.exists():
             if not folder.is_dir():
-                raise OutputError(f"{folder}: is a file; give a new folder")
+                raise OutputError(f"{folder}: is a file; use a new folder")
             if any(folder.iterdir()):
-                raise OutputError(f"{folder}: is not empty; give a new folder, or empty this one")
+                raise OutputError(f"{folder}: is not empty; use a new folder, or empty this one")
             return False
         folder.mkdir(parents=True)
     except OSError as error:
@@ -167,9 +182,9 @@ def _prepare(folder: Path) -> bool:
 
 
 def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float], None]) -> tuple[int, int]:
-    """Write every file; the numbers of frames and of labelled cells."""
+    """Write all files; return the numbers of images and of labelled cells."""
     world = make_village(config.world_size, config.seed).with_kinds(config.kinds_per_class)
-    eye = MeshCamera(world, config.camera)
+    camera = MeshCamera(world, config.camera)
     num_cells = write_ground_truth(work / "world.npz", world, config.resolution, config.class_table)
     write_mesh(work / "world.ply", world, config.class_table)
     progress(0.1)
@@ -184,7 +199,7 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
     total = config.num_robots * len(schedule.exposures(0, config.num_robots))
     num_frames = 0
     for index, robot_id in enumerate(config.robot_ids):
-        recorder = _Recorder(config, world.terrain, eye, drive, index, schedule)
+        recorder = _Recorder(config, world.terrain, camera, drive, index, schedule)
         with RobotLogWriter(
             work / f"{robot_id}.mcap",
             robot_id,
@@ -201,7 +216,7 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
 
 
 def _team(folder: Path, config: SimulationConfig) -> RunConfig:
-    """The team file's content: every robot with its topics, the classes and the resolution."""
+    """Configuration for the team file: robots with their topics, classes and resolution."""
     robots = []
     for robot_id in config.robot_ids:
         depth, labels, camera_info, odometry, label_info = topics(robot_id)
@@ -221,7 +236,7 @@ def _team(folder: Path, config: SimulationConfig) -> RunConfig:
 
 @dataclass(frozen=True)
 class _Schedule:
-    """When poses and images are taken: whole numbers of nanoseconds, ``stride`` poses per image."""
+    """Times of poses and images: the period of poses [ns], poses per image, and the number of poses."""
 
     pose_period_ns: int
     stride: int
@@ -229,30 +244,30 @@ class _Schedule:
 
     @classmethod
     def of(cls, config: SimulationConfig) -> _Schedule:
-        """About 20 poses a second, and a whole number of them per image."""
+        """Schedule with about 20 poses a second and a whole number of poses per image."""
         stride = max(1, round(_ODOMETRY_RATE / config.rate))
         pose_period_ns = round(1e9 / config.rate / stride)
         return cls(pose_period_ns, stride, max(2, round(config.duration * 1e9 / pose_period_ns) + 1))
 
     def exposures(self, robot_index: int, num_robots: int) -> range:
-        """The poses after which a robot takes a picture; robots take theirs at different times, as real cameras do."""
+        """Indices of the poses after which a robot takes an image; they differ between robots, as for real cameras."""
         return range(robot_index * self.stride // num_robots, self.num_poses - 1, self.stride)
 
 
 class _Recorder:
-    """Records one robot's drive."""
+    """Writer of one robot's poses and images."""
 
     def __init__(
         self,
         config: SimulationConfig,
         terrain: Terrain,
-        eye: MeshCamera,
+        camera: MeshCamera,
         drive: Exploration,
         index: int,
         schedule: _Schedule,
     ) -> None:
         self._config = config
-        self._eye = eye
+        self._camera = camera
         self._schedule = schedule
         self._states = drive.states[index]
         self._poses = body_poses(terrain, self._states)
@@ -263,7 +278,7 @@ class _Recorder:
         self._rng = np.random.default_rng([config.seed, 2, index])
 
     def record(self, log: RobotLogWriter) -> Iterator[int]:
-        """Write all poses and images in time order; gives each image's stamp."""
+        """Write all poses and images in the order of time; yield each image's stamp."""
         period_ns = self._schedule.pose_period_ns
         for step, (state, T_map_body) in enumerate(zip(self._states, self._poses, strict=True)):
             recorded = self._recorded[step]
@@ -272,15 +287,15 @@ class _Recorder:
             speed = float(np.hypot(*(following[:2] - state[:2]))) * 1e9 / period_ns
             log.write_pose(stamp_ns, recorded, speed, float(following[2] - state[2]) * 1e9 / period_ns)
             if step in self._exposures:
-                # Exposed midway between two poses: whoever reads the log has to interpolate.
+                # Exposed midway between two poses, so that readers have to interpolate.
                 T_map_camera = midway(T_map_body, self._poses[step + 1]) @ T_BODY_CAMERA
                 self._write_image(log, stamp_ns + period_ns // 2, T_map_camera)
                 yield stamp_ns + period_ns // 2
 
     def _write_image(self, log: RobotLogWriter, stamp_ns: int, T_map_camera: Float64Array) -> None:
-        """Take one picture and spoil it as a real camera and a real network would."""
+        """Render and write one image with the noise of a depth camera and of a segmentation network."""
         config = self._config
-        depth, labels = self._eye.take(T_map_camera, config.max_depth)
+        depth, labels = self._camera.take(T_map_camera, config.max_depth)
         if config.depth_noise > 0:
             depth = add_depth_noise(depth, self._rng, config.depth_noise)
         if config.label_noise > 0:
@@ -289,7 +304,7 @@ class _Recorder:
 
 
 def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
-    """Poses (T, 4, 4) of a base that stands on the ground at states (T, 3) of x, y and heading."""
+    """Return poses (T, 4, 4) of a base on the ground at states (T, 3) of x, y [m] and heading [rad]."""
     poses = np.zeros((len(states), 4, 4))
     up = terrain.normal(states[:, :2])
     heading = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))], axis=1)
@@ -305,26 +320,26 @@ def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
 
 
 def pose_errors(sigma: float, num_poses: int, period: float, rng: np.random.Generator) -> Float64Array:
-    """Errors (T, 3) of x, y [m] and heading [rad] of a robot that localises itself, one pose every ``period`` seconds.
+    """Draw localisation errors (T, 3) of x, y [m] and heading [rad], one every ``period`` [s].
 
-    A first-order Gauss-Markov process with a correlation time of 10 s: stationary with standard deviation ``sigma`` in
-    x and y, and ``sigma`` / 10 m in heading, which moves what is seen 10 m away by as much again.
+    They are a stationary first-order Gauss-Markov process with a correlation time of 10 s. Its standard deviation is
+    ``sigma`` in x and y, and ``sigma`` / 10 m in heading, which moves points at 10 m distance by ``sigma`` as well.
     """
-    kept = np.exp(-period / _POSE_CORRELATION_TIME)
+    correlation = np.exp(-period / _POSE_CORRELATION_TIME)
     steps = rng.standard_normal((num_poses, 3)) * (sigma, sigma, sigma / 10.0)
-    steps[1:] *= np.sqrt(1.0 - kept**2)
+    steps[1:] *= np.sqrt(1.0 - correlation**2)
     errors: Float64Array = np.empty_like(steps)
     error = np.zeros(3)
     for row, step in zip(errors, steps, strict=True):
-        error = kept * error + step
+        error = correlation * error + step
         row[:] = error
     return errors
 
 
 def midway(T_a: Float64Array, T_b: Float64Array) -> Float64Array:
-    """The pose (4, 4) halfway between two: mean position, and the rotation that slerp gives at one half.
+    """Return the pose (4, 4) halfway between two: mean position and slerp's rotation at one half.
 
-    Halfway, slerp's rotation is the one nearest to the sum of the two matrices; its columns come from an SVD.
+    That rotation is the one nearest to the sum of the two rotation matrices, computed by an SVD.
     """
     middle = np.eye(4)
     u, _, vt = np.linalg.svd(T_a[:3, :3] + T_b[:3, :3])
@@ -334,7 +349,7 @@ def midway(T_a: Float64Array, T_b: Float64Array) -> Float64Array:
 
 
 def _camera_mount() -> Float64Array:
-    """From the camera's optical frame to the base: ahead of its middle, on a mast, tilted down a little."""
+    """Transform from the camera's optical frame to the base: ahead of its centre, on a mast, tilted down."""
     cos, sin = np.cos(_CAMERA_PITCH), np.sin(_CAMERA_PITCH)
     mount = np.eye(4)
     mount[:3, :3] = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]) @ OPTICAL_IN_BODY
@@ -343,4 +358,4 @@ def _camera_mount() -> Float64Array:
 
 
 T_BODY_CAMERA = _camera_mount()
-"""(4, 4): where the simulated robots carry their camera."""
+"""Transform (4, 4) from the camera's optical frame to the body of a simulated robot."""

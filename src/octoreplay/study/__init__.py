@@ -1,1 +1,1 @@
-"""Many runs: sweeps over settings, and the experiments of docs/experiments.md."""
+"""Sweeps over settings, and the experiments of docs/experiments.md."""

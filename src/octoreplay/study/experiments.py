@@ -1,4 +1,4 @@
-"""An experiment: simulated teams, and sweeps over them whose tables answer a question (docs/experiments.md)."""
+"""Experiments: simulated teams and the sweeps over them whose tables answer a question (docs/experiments.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
-from octoreplay.replay.session import replay_team
+from octoreplay.replay.run import replay_team
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study.folder import table_csv
 from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep
@@ -21,12 +21,12 @@ from octoreplay.study.task import Row
 from octoreplay.study.teams import simulated_team
 
 TRUTH = "world.npz"
-"""Where a simulated team's ground truth is, beside its team file."""
+"""File of a simulated team's ground truth, in the folder of its team file."""
 
 
 @dataclass(frozen=True)
 class SimulatedTeam:
-    """A team to simulate, and the classes that become one in its team file."""
+    """Settings of a simulated team, and the classes that its team file merges."""
 
     simulation: SimulationConfig
     merge_classes: Merges = ()
@@ -34,11 +34,24 @@ class SimulatedTeam:
 
 @dataclass(frozen=True)
 class Plan:
-    """One sweep of an experiment over the teams named by their labels.
+    """One sweep of an experiment.
 
-    ``vary`` and ``settings`` are as ``run_sweep`` takes them. With ``has_truth`` the maps are evaluated against the
-    simulated world. ``keep`` keeps the results. A plan with ``num_threads`` above 1 measures time: one run at once.
-    ``more`` gives further columns of a row, from its team and the sweep that it is of.
+    Attributes
+    ----------
+    name : str
+        Name of the sweep's folder and CSV file.
+    teams : tuple of str
+        Labels of the teams.
+    vary, settings
+        Variations and settings of ``run_sweep``.
+    has_truth : bool
+        True to evaluate the maps against the simulated world.
+    keep : bool
+        True to keep the results.
+    num_threads : int
+        Threads of each run. A plan with more than one measures time and does one run at once.
+    extra_columns : callable
+        Additional columns of a row, from its team, the row and the sweep.
     """
 
     name: str
@@ -48,19 +61,19 @@ class Plan:
     has_truth: bool = True
     keep: bool = False
     num_threads: int = 1
-    more: Callable[[SimulatedTeam, Row, Sweep], Row] = lambda *_: {}
+    extra_columns: Callable[[SimulatedTeam, Row, Sweep], Row] = lambda *_: {}
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """The teams that are simulated by their labels, and the sweeps over them."""
+    """Simulated teams by label, and the sweeps over them."""
 
     teams: Mapping[str, SimulatedTeam]
     plans: tuple[Plan, ...]
 
 
-Stage = Callable[[str, float | None], None]
-"""Told what is done at present, and the share of the whole experiment that is done, None where it is not known."""
+Stage = Callable[[str, float], None]
+"""Progress callback: description of the current stage, and the finished share of it, 0 to 1."""
 
 
 def run_experiment(
@@ -71,18 +84,17 @@ def run_experiment(
     scheduler: str | None = None,
     progress: Stage | None = None,
 ) -> dict[str, list[Row]]:
-    """Simulate what is not there yet, run what has not been run yet, and give the rows by the plans' names.
+    """Simulate the teams, do the sweeps, and return the rows of each plan by its name.
 
-    ``folder`` gets ``teams/<label>`` and a folder for each plan, and ``<plan>.csv`` with the rows. ``num_jobs`` and
-    ``scheduler`` are as ``run_sweep`` takes them, for the plans that do not measure time. Raises InputError
-    where a run failed, and what ``simulated_team`` and ``run_sweep`` raise.
+    ``folder`` gets ``teams/<label>`` for each simulation, a folder and ``<plan>.csv`` for each plan. Teams and runs
+    that it already holds are used again. Teams with equal simulation settings share the logs of the first of them.
+    ``num_jobs`` and ``scheduler`` are those of ``run_sweep`` for plans that do not measure time.
+
+    Raises InputError if a run failed, and the errors of ``simulated_team`` and ``run_sweep``.
     """
     check_workers(num_jobs, 1, scheduler)
-    show = progress or _nobody_watches
-    teams = {}
-    for index, (label, team) in enumerate(experiment.teams.items()):
-        stage = f"simulating team {index + 1} of {len(experiment.teams)}"
-        teams[label] = _team_file(team, folder / "teams" / label, functools.partial(show, stage))
+    show = progress or _ignore_progress
+    teams = _team_files(experiment, folder / "teams", show)
     tables: dict[str, list[Row]] = {}
     for plan in experiment.plans:
 
@@ -100,8 +112,8 @@ def run_experiment(
         )  # fmt: skip
         for row in sweep.failed:
             raise InputError(
-                f"{folder / plan.name}: {len(sweep.failed)} of {len(sweep.rows)} runs failed, the first:"
-                f" {row['error']}; the same command does them again"
+                f"{folder / plan.name}: {len(sweep.failed)} of {len(sweep.rows)} runs failed, the first with:"
+                f" {row['error']}; the same command repeats them"
             )
         tables[plan.name] = _rows(experiment, plan, sweep)
         columns = list(dict.fromkeys(name for row in tables[plan.name] for name in row))
@@ -110,31 +122,42 @@ def run_experiment(
 
 
 def _rows(experiment: Experiment, plan: Plan, sweep: Sweep) -> list[Row]:
-    """A sweep's rows with the experiment's own labels of the teams and the plan's further columns."""
-    # The team is what changes last.
+    """Rows of a sweep with the experiment's team labels and the plan's extra columns."""
+    # The team is the outermost variation of a sweep.
     num_runs = len(sweep.rows) // len(plan.teams)
     labels = [label for label in plan.teams for _ in range(num_runs)]
     return [
-        {**row, "team": label, **plan.more(experiment.teams[label], row, sweep)}
+        {**row, "team": label, **plan.extra_columns(experiment.teams[label], row, sweep)}
         for label, row in zip(labels, sweep.rows, strict=True)
     ]
 
 
-def _team_file(team: SimulatedTeam, folder: Path, progress: Callable[[float], None]) -> Path:
-    """The team's file, simulated if need be."""
-    path = simulated_team(folder, team.simulation, progress)
+def _team_files(experiment: Experiment, folder: Path, show: Stage) -> dict[str, Path]:
+    """Team files by label; each distinct simulation is done once."""
+    folders: dict[SimulationConfig, Path] = {}
+    for label, team in experiment.teams.items():
+        folders.setdefault(team.simulation, folder / label)
+    for index, (simulation, team_folder) in enumerate(folders.items()):
+        stage = f"simulating team {index + 1} of {len(folders)}"
+        simulated_team(team_folder, simulation, functools.partial(show, stage))
+    return {label: _team_file(label, team, folders[team.simulation]) for label, team in experiment.teams.items()}
+
+
+def _team_file(label: str, team: SimulatedTeam, folder: Path) -> Path:
+    """Team file of one team whose logs are in ``folder``; written beside them if it merges classes."""
+    path = folder / "team.yaml"
     if not team.merge_classes:
         return path
     config = dataclasses.replace(load_team_file(path), merge_classes=team.merge_classes)
-    merged = folder / "merged.yaml"
+    merged = folder / f"{label}.yaml"
     write_whole(merged, dump_team(config, folder.resolve()))
     return merged
 
 
 def _compile(team: Path) -> None:
-    """Replay a second of a team's logs, so that what is measured after it finds its kernels compiled."""
+    """Replay one second of a team's logs, so that measured times do not include the compilation of kernels."""
     replay_team(load_team_file(team).with_parameters({"duration": 1.0}), None)
 
 
-def _nobody_watches(*_: object) -> None:
-    """Progress that nobody watches."""
+def _ignore_progress(*_: object) -> None:
+    """Default progress callback."""

@@ -1,4 +1,4 @@
-"""What a sweep leaves in its folder: one file for every finished run, and the table of all of them."""
+"""Folder of a sweep: a row file for each finished run, kept results, and the table."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _LONGEST_NAME = 150
 
 
 def file_name(name: str) -> str:
-    """A run's name as a file's: what a file system or a shell might not like is replaced, and then a hash added."""
+    """File name of a run: special characters are replaced and long names cut; changed names get a hash."""
     safe = re.sub(r"[^A-Za-z0-9._=,+-]", "_", name)[:_LONGEST_NAME]
     return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 class SweepFolder:
-    """The folder of a sweep; ``locked`` makes one. Raises OutputError where something cannot be written."""
+    """Folder of a sweep, opened with ``locked``. Methods raise OutputError if a file cannot be written."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -40,15 +40,15 @@ class SweepFolder:
         self.figures = path / "figures"
         self._rows = path / "rows"
         self._runs = path / "runs"
-        # Runs of an earlier sweep that was killed may still write: they see that theirs is gone.
+        # Workers of a killed sweep may still write. They end when they find their own folder removed.
         self._unfinished = path / "unfinished" / uuid.uuid4().hex[:12]
 
     @classmethod
     @contextmanager
     def locked(cls, path: Path) -> Iterator[SweepFolder]:
-        """The folder, made if need be, while no other sweep has it.
+        """Create or open the folder and lock it against other sweeps.
 
-        Raises OutputError where another one does, and where the folder holds something else.
+        Raises OutputError if another sweep has locked it, or if the folder holds other files than a sweep's.
         """
         import fcntl
 
@@ -56,7 +56,7 @@ class SweepFolder:
         with _writing(path):
             path.mkdir(parents=True, exist_ok=True)
             if {entry.name for entry in path.iterdir()} - {_LOCK} and not folder._is_sweep():
-                raise OutputError(f"{path}: is not empty and holds no sweep; give a folder of its own")
+                raise OutputError(f"{path}: is not empty and holds no sweep; use another folder")
             lock = (path / _LOCK).open("a+", encoding="utf-8")
         with lock:
             try:
@@ -65,7 +65,7 @@ class SweepFolder:
                 lock.seek(0)
                 owner = lock.read().strip() or "unknown"
                 raise OutputError(
-                    f"{path}: another sweep is at work here (process {owner}); wait for it, or give another folder"
+                    f"{path}: is in use by another sweep (process {owner}); wait for it, or use another folder"
                 ) from None
             with _writing(path):
                 lock.truncate(0)
@@ -78,19 +78,19 @@ class SweepFolder:
                 folder._end()
 
     def result(self, name: str) -> Path:
-        """Where a run's result is kept."""
+        """Path of a run's kept result."""
         return self._runs / f"{file_name(name)}.mcap"
 
     def unfinished(self, name: str) -> Path:
-        """Where a run's result is written until it is complete, in a folder that goes when the sweep ends."""
+        """Path of a run's result while it is written, in a folder that is removed when the sweep ends."""
         return self._unfinished / f"{file_name(name)}.mcap"
 
     def describe(self, content: Mapping[str, Any]) -> None:
-        """Say in ``sweep.json`` what is swept."""
+        """Write ``sweep.json``, the description of the sweep."""
         write_whole(self.path / "sweep.json", json_text(content))
 
     def row(self, name: str, key: str) -> Row | None:
-        """What a finished run came to; None where there is none, or where it depended on something else."""
+        """Stored row of a finished run; None if there is none or if its key is another."""
         try:
             stored = json.loads(self._row_path(name).read_text(encoding="utf-8"))
             return from_json(stored["row"]) if stored["key"] == key else None
@@ -98,26 +98,26 @@ class SweepFolder:
             return None
 
     def add_row(self, name: str, key: str, row: Row) -> None:
-        """Store what a run came to."""
+        """Store the row of a finished run."""
         write_whole(self._row_path(name), json_text({"name": name, "key": key, "row": to_json(row)}))
 
     def write_table(self, columns: Sequence[str], rows: Sequence[Row]) -> None:
-        """Write ``table.csv``: numbers are exact, ``nan`` where one is not defined, empty where a run failed."""
+        """Write ``table.csv`` with exact numbers, ``nan`` for undefined ones and empty cells for failed runs."""
         write_whole(self.table, table_csv(columns, rows))
 
     def _row_path(self, name: str) -> Path:
         return self._rows / f"{file_name(name)}.json"
 
     def _is_sweep(self) -> bool:
-        """Whether a sweep has been at work here."""
+        """True if the folder holds a sweep."""
         try:
             return "octoreplay" in json.loads((self.path / "sweep.json").read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError):
             return False
 
     def _begin(self) -> None:
-        """Make the folders, and take away what sweeps that were killed left behind."""
-        # This comes first: it says whose folder this is.
+        """Create the subfolders and remove what killed sweeps left."""
+        # First, because this file marks the folder as a sweep's.
         if not self._is_sweep():
             self.describe({"octoreplay": __version__})
         for folder in (self._rows, self._runs):
@@ -128,7 +128,7 @@ class SweepFolder:
             partial.unlink()
 
     def _end(self) -> None:
-        """Take away what is empty or of no use any more."""
+        """Remove unfinished results and empty subfolders."""
         shutil.rmtree(self._unfinished.parent, ignore_errors=True)
         with contextlib.suppress(OSError):
             self._runs.rmdir()
@@ -136,7 +136,7 @@ class SweepFolder:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """What fails to be written is one sentence."""
+    """Turn OSError into OutputError."""
     try:
         yield
     except OSError as error:
@@ -144,7 +144,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def table_csv(columns: Sequence[str], rows: Sequence[Row]) -> str:
-    """Rows as CSV text, one line each in their order, with only these columns."""
+    """CSV text of rows in their order, with only these columns."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()

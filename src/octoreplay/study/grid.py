@@ -1,4 +1,4 @@
-"""What a sweep varies: names and values from text, and every combination of them as a configuration."""
+"""Variations of a sweep parsed from text, and their combinations as run configurations."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, suggestion
 
 BASE = "-"
-"""Stands for what the team file, the options and the defaults say."""
+"""Text of the value that the team file, the options or the default give."""
 
 SEED = "network_seed"
-"""The parameter that ``--seeds`` varies."""
+"""Parameter that ``--seeds`` varies."""
 
 Values = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Variation:
-    """Parameters that are varied together, and their values as text: each of ``values`` has one for every name."""
+    """Parameters that vary together, and their values as text: each entry of ``values`` has one text per name."""
 
     names: tuple[str, ...]
     values: tuple[Values, ...]
@@ -31,7 +31,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Combination:
-    """One run of a sweep: the team's label, the varied values as text by name, the seed, and what follows from them."""
+    """One run of a sweep: the team's label, the varied values as text by name, the seed and the configuration."""
 
     team: str
     values: Mapping[str, str]
@@ -40,10 +40,10 @@ class Combination:
 
 
 def parse_variation(text: str) -> Variation:
-    """A variation from ``NAME=V1,V2,...`` or ``NAME+NAME=V1+V1,V2+V2,...``.
+    """Parse ``NAME=V1,V2,...`` or ``NAME+NAME=V1+V1,V2+V2,...``.
 
-    Values are separated by semicolons where the text holds one. The value '-' is what the run would have anyway.
-    Raises ConfigError.
+    Semicolons separate the values if the text contains one, so that values can contain commas. The value '-' leaves
+    the parameter unchanged. Raises ConfigError for an unknown name, a wrong value or a repeated one.
     """
     left, separator, right = text.partition("=")
     names = tuple(name.strip().replace("-", "_") for name in left.split("+"))
@@ -59,17 +59,17 @@ def parse_variation(text: str) -> Variation:
 
 
 def check_variations(variations: Sequence[Variation], settings: Mapping[str, Any], num_seeds: int | None) -> None:
-    """Refuse a parameter that would be set twice. Raises ConfigError."""
+    """Check that no parameter is set twice. Raises ConfigError."""
     if num_seeds is not None and num_seeds < 1:
         raise ConfigError(f"seeds: {num_seeds} is below the least value 1")
     varied = [name for variation in variations for name in variation.names]
     _check_distinct("vary", varied)
     if num_seeds is not None and SEED in varied:
-        raise ConfigError(f"{SEED}: is varied, and so does --seeds; leave one out")
+        raise ConfigError(f"{SEED}: is set by --vary and by --seeds; leave one out")
     names = (*varied, *(() if num_seeds is None else (SEED,)))
     for name in names:
         if settings.get(name) is not None:
-            raise ConfigError(f"{name}: is varied and set to {settings[name]} as well; leave one out")
+            raise ConfigError(f"{name}: is varied and also set to {settings[name]}; leave one out")
 
 
 def combinations(
@@ -78,10 +78,10 @@ def combinations(
     settings: Mapping[str, Any],
     num_seeds: int | None,
 ) -> Iterator[Combination]:
-    """Every combination, the team outermost and the seed innermost.
+    """Yield every combination, the team outermost and the seed innermost.
 
-    ``bases`` are the teams by label, ``settings`` the parameters (and ``preset``) that all runs have. Raises
-    ConfigError with the combination for one that cannot be.
+    ``bases`` are the teams' configurations by label, ``settings`` the parameters (and ``preset``) of all runs. Raises
+    ConfigError that names the combination if its configuration is invalid.
     """
     seeds: list[int | None] = [None] if num_seeds is None else list(range(num_seeds))
     names = [name for variation in variations for name in variation.names]
@@ -101,10 +101,10 @@ def combinations(
 
 
 def _parts(names: Sequence[str], entry: str) -> Values:
-    """One value for every name."""
+    """Texts of one entry, one for each name."""
     parts = tuple(part.strip() for part in (entry.split("+") if len(names) > 1 else [entry]))
     if not all(parts):
-        raise ConfigError(f"vary: {'+'.join(names)}: has an empty value; '-' stands for what the run has anyway")
+        raise ConfigError(f"vary: {'+'.join(names)}: has an empty value; use '-' to leave a parameter unchanged")
     if len(parts) != len(names):
         raise ConfigError(f"vary: '{entry}' has {len(parts)} values for the {len(names)} names {'+'.join(names)}")
     for name, part in zip(names, parts, strict=True):
@@ -114,7 +114,7 @@ def _parts(names: Sequence[str], entry: str) -> Values:
 
 
 def _value(name: str, text: str) -> Any:
-    """A parameter's value from its text. Raises ConfigError."""
+    """Value of a parameter from its text. Raises ConfigError."""
     if name == "preset":
         if text not in PRESETS:
             raise ConfigError(f"preset: '{text}' is not one of {', '.join(PRESETS)}")
@@ -129,8 +129,8 @@ def _value(name: str, text: str) -> Any:
     return parameter.coerce(text)
 
 
-def _check_distinct(what: str, entries: Sequence[str]) -> None:
-    """Refuse what is listed twice."""
+def _check_distinct(subject: str, entries: Sequence[str]) -> None:
+    """Check that no entry is listed twice. Raises ConfigError."""
     for index, entry in enumerate(entries):
         if entry in entries[:index]:
-            raise ConfigError(f"{what}: '{entry}' is listed twice")
+            raise ConfigError(f"{subject}: '{entry}' is listed twice")

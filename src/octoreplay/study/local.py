@@ -1,4 +1,4 @@
-"""Runs of a sweep on this machine: as many processes at once as there are jobs, each on processors of its own."""
+"""Execution of a sweep's tasks on this machine: parallel processes, each on processors of its own."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import threading
 from collections import deque
 from collections.abc import Generator, Sequence
 
-from octoreplay.study.process import RunProcess
+from octoreplay.study.process import TaskProcess
 from octoreplay.study.task import Row, Task, failed
 
 
-def run_local(tasks: Sequence[Task], num_jobs: int | None = None) -> Generator[tuple[Task, Row]]:
-    """Every task with its row, as they finish; ``num_jobs`` at once, as many as there are processors for unless given.
+def execute_locally(tasks: Sequence[Task], num_jobs: int | None = None) -> Generator[tuple[Task, Row]]:
+    """Execute tasks in parallel processes; yield each task with its row, in the order in which they finish.
 
-    All tasks have the same number of threads. Closing the generator ends the processes that still run.
+    ``num_jobs`` is the number of processes at once, by default processors / threads of a task. All tasks have the same
+    number of threads. Closing the generator kills the processes that have not finished.
     """
     num_threads = max(task.num_threads for task in tasks)
-    pool = _Pool(tasks, min(num_jobs or max(1, _num_processors() // num_threads), len(tasks)), num_threads)
+    pool = _WorkerPool(tasks, min(num_jobs or max(1, _num_processors() // num_threads), len(tasks)), num_threads)
     try:
         for _ in tasks:
             yield pool.finished.get()
@@ -26,13 +27,13 @@ def run_local(tasks: Sequence[Task], num_jobs: int | None = None) -> Generator[t
         pool.stop()
 
 
-class _Pool:
-    """Workers, each of which waits for one process at a time."""
+class _WorkerPool:
+    """Worker threads that start one process at a time each and wait for it."""
 
     def __init__(self, tasks: Sequence[Task], num_workers: int, num_threads: int) -> None:
         self.finished: queue.SimpleQueue[tuple[Task, Row]] = queue.SimpleQueue()
         self._left = deque(tasks)
-        self._processes: dict[int, RunProcess] = {}
+        self._processes: dict[int, TaskProcess] = {}
         self._lock = threading.Lock()
         self._workers = [
             threading.Thread(target=self._work, args=(slot, num_threads), daemon=True) for slot in range(num_workers)
@@ -41,7 +42,7 @@ class _Pool:
             worker.start()
 
     def stop(self) -> None:
-        """End all processes and workers."""
+        """Kill all processes and join the workers."""
         with self._lock:
             self._left.clear()
             for process in self._processes.values():
@@ -50,7 +51,7 @@ class _Pool:
             worker.join()
 
     def _work(self, slot: int, num_threads: int) -> None:
-        """Do what is left, one after the other."""
+        """Execute the remaining tasks one by one."""
         _pin(slot, num_threads)
         while True:
             with self._lock:
@@ -58,9 +59,9 @@ class _Pool:
                     return
                 task = self._left.popleft()
                 try:
-                    process = self._processes[slot] = RunProcess(task)
+                    process = self._processes[slot] = TaskProcess(task)
                 except OSError as error:
-                    self.finished.put((task, failed(f"no process could be started: {error.strerror}")))
+                    self.finished.put((task, failed(f"the process could not be started: {error.strerror}")))
                     continue
             row = process.wait()
             with self._lock:
@@ -75,7 +76,7 @@ def _num_processors() -> int:
 
 
 def _pin(slot: int, num_threads: int) -> None:
-    """Keep this thread, and the processes that it starts, to as many processors as a run has threads."""
+    """Restrict this thread and the processes that it starts to ``num_threads`` processors."""
     if hasattr(os, "sched_setaffinity"):
         allowed = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {allowed[(slot * num_threads + n) % len(allowed)] for n in range(num_threads)})

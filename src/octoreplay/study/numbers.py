@@ -1,4 +1,4 @@
-"""What one run of a sweep comes to, as a flat row of numbers (docs/sweeps.md)."""
+"""Numbers of one run of a sweep, as a flat row (docs/sweeps.md)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RUN_COLUMNS = (
     "contraction", "entropy_bits", "packet_bytes", "octree_bytes", "grid_bytes", "sent_bytes_per_second",
     "delivered_share", "num_leaves", "memory_bytes",
 )  # fmt: skip
-"""What every run has."""
+"""Columns of every run."""
 
 _SCORES = (
     "mean_iou", "mean_iou_known", "coverage", "world_coverage", "occupied_accuracy", "free_accuracy",
@@ -33,17 +33,17 @@ _SCORES = (
 _TEAM_SCORES = ("team_calibration_error", "team_calibration_error_occupied")
 
 TRUTH_COLUMNS = (*_SCORES, *_TEAM_SCORES, "mean_iou_least", *(f"central_{name}" for name in _SCORES))
-"""What a run has besides where the truth is known."""
+"""Additional columns if the ground truth is known."""
 
 TIMING_COLUMNS = ("wall_seconds", "realtime_factor", "peak_rss_bytes")
-"""What differs when the same run is repeated."""
+"""Columns that differ when a run is repeated."""
 
 
 def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str, Any]:
-    """The values of ``RUN_COLUMNS``; ``metrics`` are those of all ticks."""
+    """Values of ``RUN_COLUMNS`` from a run's summary and the metrics of all its ticks."""
     last = summary.last
     log_ticks = [tick for tick in metrics if not tick.settling]
-    # Before the first scan everybody agrees on nothing.
+    # Agreement is not defined before the first scan.
     seen = [tick for tick in log_ticks if tick.num_known_cells > 0]
     sent_bytes = sum(robot.sent_bytes for tick in log_ticks for robot in tick.robots)
     num_sent = sum(link.num_sent for link in summary.links)
@@ -86,21 +86,21 @@ def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str
 
 
 def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
-    """The values of ``TRUTH_COLUMNS``: means over the robots, and those of the centralised map."""
+    """Values of ``TRUTH_COLUMNS``: means over the robots, and the scores of the centralised map."""
     final = evaluation.final
     central = final.central
     return {
         **{name: final.mean(name) for name in (*_SCORES, *_TEAM_SCORES)},
         "mean_iou_least": final.least("mean_iou"),
-        **{f"central_{name}": math.nan if central is None else getattr(central, name) for name in _SCORES},
+        **{f"central_{name}": math.nan if central is None else central.score(name) for name in _SCORES},
     }
 
 
 def contraction(distances: Sequence[float]) -> float:
-    """The factor by which the total distance shrank per tick: the geometric mean over the later half of the ticks.
+    """Factor per tick by which the total distance shrinks: geometric mean over the later half of the ticks.
 
-    ``distances`` are those of the settling ticks; what is below a billionth of the first is rounding, and ends them.
-    NaN where fewer than four are left.
+    ``distances`` are the total distances of the settling ticks, used up to the first one that is at most 1e-9 of the
+    first, where rounding dominates. NaN if fewer than four are used.
     """
     num_ticks = next((n for n, value in enumerate(distances) if value <= _ROUNDING * distances[0]), len(distances))
     if num_ticks < 4:
@@ -110,16 +110,16 @@ def contraction(distances: Sequence[float]) -> float:
 
 
 def _worst(tick: TickMetrics, name: str) -> float:
-    """The least of one number over the robots that are active; over all where none is."""
+    """Minimum of a metric over the active robots, or over all if none is active."""
     return min((float(getattr(robot, name)) for robot in tick.counted_robots), key=lambda v: (not math.isnan(v), v))
 
 
 def _mean(values: Iterable[float]) -> float:
-    """The mean of the numbers that there are; NaN of none."""
+    """Mean of the values that are not NaN; NaN if there are none."""
     found = [value for value in values if not math.isnan(value)]
     return sum(found) / len(found) if found else math.nan
 
 
 def _ratio(part: float, whole: float) -> float:
-    """NaN where there is nothing to divide by."""
+    """Quotient; NaN if ``whole`` is not positive."""
     return part / whole if whole > 0 else math.nan

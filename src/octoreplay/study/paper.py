@@ -1,4 +1,4 @@
-"""The paper's experiment: six robots explore a village, agree by Alg. 1 on every arriving map, and are looked at.
+"""The paper's experiment: six robots explore a village and iterate Alg. 1 on every arriving map.
 
 ::
 
@@ -22,20 +22,21 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.text_files import json_text, write_whole
 from octoreplay.records import TickMetrics, UInt8Array
-from octoreplay.replay.session import Progress
+from octoreplay.replay.run import Progress
 from octoreplay.report import map_view, paper_plots, plots
 from octoreplay.report.figures import save_figures
 from octoreplay.result import Result, StoredMap, open_result
 from octoreplay.simulate.team import SimulationConfig
-from octoreplay.simulate.world import World, make_village
+from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import World
 from octoreplay.study.teams import replayed_team, simulated_team
 
 TEAM, RESULT, FIGURES, NUMBERS = "team", "paper.mcap", "figures", "numbers.json"
-"""What the experiment's folder holds."""
+"""Files and folders in the experiment's folder."""
 
 PRESET = "paper"
 LEAST_DURATION = 6.0
-"""Seconds: before, no map has been exchanged by a third of the run."""
+"""Shortest duration [s] with which maps have been exchanged after a third of the run."""
 
 _AZIMUTH, _ELEVATION = math.radians(74.0), math.radians(42.0)
 _WIDTH, _HEIGHT = 1600, 1000
@@ -44,13 +45,13 @@ _PERCENTILE = 99.0
 
 @dataclass(frozen=True)
 class Moment:
-    """The team at one time, ``seconds`` after the run's start.
+    """Numbers of the team ``seconds`` after the run's start.
 
-    ``total_distance`` is the paper's Phi. ``relative_distance`` is Phi per pair of robots over the mean of their maps'
-    squared norms, how far maps are apart in terms of what they say. Bytes are means and standard deviations over the
-    robots that published; ``ratio`` is the mean grid over the mean octree. Agreement is the worst active robot's. The
-    deviation of an occupied cell is the largest ||h_i - h_j|| of two robots; ``median_deviation`` is over
-    ``num_occupied_cells``, those of the maps laid over each other.
+    ``total_distance`` is the paper's Phi. ``relative_distance`` is Phi per pair of robots divided by the mean squared
+    norm of their maps. Bytes are means and standard deviations over the robots that published; ``ratio`` is mean grid
+    bytes / mean octree bytes. Agreement is the minimum over the active robots. The deviation of an occupied cell is the
+    largest ||h_i - h_j|| of two robots; ``median_deviation`` is over the ``num_occupied_cells`` cells that are occupied
+    in any robot's map.
     """
 
     seconds: float
@@ -73,11 +74,12 @@ class Moment:
 
 @dataclass(frozen=True)
 class PaperNumbers:
-    """What the experiment came to.
+    """Numbers of the whole experiment.
 
-    ``peak_total_distance`` is the largest Phi of any tick, ``peak_seconds`` after the run's start. ``mean_ratio`` is
-    the mean over ticks of the size of a map as uniform grid over that as octree, each the mean over robots;
-    ``least_ratio`` the least of any tick. ``transparent_deviation`` is the one that would make a cell invisible.
+    ``peak_total_distance`` is the largest Phi of any tick, reached ``peak_seconds`` after the run's start.
+    ``mean_ratio`` is the mean over ticks of (size of a map as uniform grid) / (its size as octree), with both sizes
+    averaged over robots; ``least_ratio`` is the minimum over ticks. ``transparent_deviation`` is the deviation at which
+    a cell in the figure is fully transparent.
     """
 
     version: str
@@ -92,36 +94,40 @@ class PaperNumbers:
 
 
 def paper_team(num_robots: int = 6, duration: float = 300.0, seed: int = 0) -> SimulationConfig:
-    """The team of the experiment. Raises ConfigError for a value out of range."""
+    """Settings of the experiment's team. Raises ConfigError for a value out of range."""
     if duration < LEAST_DURATION:
-        raise ConfigError(f"duration: {duration:g} s is too short for the experiment; give {LEAST_DURATION:g} or more")
+        raise ConfigError(
+            f"duration: {duration:g} s is too short for the experiment; use at least {LEAST_DURATION:g} s"
+        )
     return SimulationConfig(num_robots=num_robots, duration=duration, seed=seed)
 
 
 def paper_config(team_file: Path, simulation: SimulationConfig) -> RunConfig:
-    """How the team is replayed: preset 'paper', with maps stored after each third of the run, a whole second."""
+    """Run configuration of the team: preset 'paper', with maps stored after each third of the run (whole seconds)."""
     third = float(simulation.duration // 3)
     return with_options(load_team_file(team_file), PRESET, None, {"state_every": third, "view_every": third})
 
 
 def run_paper(
-    folder: Path, simulation: SimulationConfig, simulated: Callable[[float], None] | None = None,
-    replayed: Callable[[Progress], None] | None = None,
-) -> PaperNumbers:  # fmt: skip
-    """Do the experiment into a folder: the team, its result, figures and numbers; what is complete is used again.
+    folder: Path,
+    simulation: SimulationConfig,
+    simulation_progress: Callable[[float], None] | None = None,
+    replay_progress: Callable[[Progress], None] | None = None,
+) -> PaperNumbers:
+    """Repeat the experiment: write the team, its result, figures and numbers into a folder.
 
-    ``simulated`` and ``replayed`` are told how far the two long steps are. Raises as ``simulated_team``,
-    ``replayed_team`` and ``write_paper``.
+    A complete team and a complete result in the folder are used again. The callbacks receive the progress of the two
+    long steps. Raises the errors of ``simulated_team``, ``replayed_team`` and ``write_paper``.
     """
-    team_file = simulated_team(folder / TEAM, simulation, simulated)
-    replayed_team(paper_config(team_file, simulation), folder / RESULT, replayed)
+    team_file = simulated_team(folder / TEAM, simulation, simulation_progress)
+    replayed_team(paper_config(team_file, simulation), folder / RESULT, replay_progress)
     return write_paper(folder, simulation)
 
 
 def write_paper(folder: Path, simulation: SimulationConfig) -> PaperNumbers:
     """Write the figures and numbers of the result in a folder.
 
-    Raises OutputError where that cannot be, InputError for a damaged result or one in which nothing was mapped.
+    Raises OutputError if a file cannot be written, InputError for a damaged result or one without occupied cells.
     """
     with open_result(folder / RESULT) as result:
         ticks = _shown_ticks(result)
@@ -146,17 +152,17 @@ def write_paper(folder: Path, simulation: SimulationConfig) -> PaperNumbers:
 
 
 def transparent_deviation(overlays: Sequence[map_view.Overlay]) -> float:
-    """The deviation at which opacity would be 0: that of 99 % of the first overlay is below it.
+    """Deviation at which the opacity is 0 in all overlays: the 99th percentile of the first overlay's deviations.
 
-    One scale for all overlays. Raises InputError where the first overlay has no cell.
+    Raises InputError if the first overlay has no cell.
     """
     if not len(overlays[0].labels):
-        raise InputError("the robots' maps hold no occupied cell; give a longer duration")
+        raise InputError("the robots' maps hold no occupied cell; use a longer duration")
     return float(np.percentile(overlays[0].deviations, _PERCENTILE))
 
 
 def relative_distance(tick: TickMetrics, maps: Sequence[StoredMap]) -> float:
-    """Phi of all pairs of robots, per pair, over the mean of the maps' sums over cells of ||h - h_0||^2."""
+    """Phi over all pairs of robots, per pair, divided by the mean over maps of the sum over cells of ||h - h_0||^2."""
     spans = [stored.octree.spans() for stored in maps]
     norms = [float(span.num_cells @ np.square(span.deviations, dtype=np.float64).sum(axis=1)) for span in spans]
     num_pairs = len(maps) * (len(maps) - 1) / 2
@@ -164,14 +170,14 @@ def relative_distance(tick: TickMetrics, maps: Sequence[StoredMap]) -> float:
 
 
 def _shown_ticks(result: Result) -> list[TickMetrics]:
-    """The ticks whose maps are shown: a third of the run, as the paper's 100 s of 300 s, and its end."""
+    """Ticks of the two shown maps: after a third of the run, as the paper's 100 s of 300 s, and at its end."""
     stored = result.stored_ticks(result.robots[0])
     third = max(tick for tick in stored if 3 * tick <= stored[-1])
     return [tick for tick in result.metrics if tick.tick in (third, stored[-1])]
 
 
 def _numbers(result: Result, simulation: SimulationConfig, moments: tuple[Moment, ...], largest: float) -> PaperNumbers:
-    """The numbers of a result."""
+    """Numbers of a result."""
     peak = max(result.metrics, key=lambda tick: tick.total_distance)
     octree, grid = (plots.over_robots(result.metrics, name)[0] for name in ("octree_bytes", "grid_bytes"))
     ratios = (grid / octree)[np.isfinite(grid)]
@@ -199,7 +205,7 @@ def _moment(seconds: float, tick: TickMetrics, shown: map_view.Overlay, relative
 def _pictures(
     result: Result, seconds: Sequence[float], overlays: Sequence[map_view.Overlay], largest: float, village: World
 ) -> dict[str, UInt8Array]:
-    """The last map, the earlier one and the true village by their titles, all from one side."""
+    """Pictures by title, from one viewpoint: the last map, the earlier map and the true village."""
     colors = result.class_table.colors
     view = map_view.view_of(village.vertices, _AZIMUTH, _ELEVATION, _WIDTH, _HEIGHT)
     pictures = {}

@@ -1,4 +1,4 @@
-"""The questions that the paper left open, as experiments (docs/experiments.md)."""
+"""Experiments on the questions that the paper leaves open (docs/experiments.md)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from octoreplay.study.sweep import Sweep
 from octoreplay.study.task import Row
 
 RADIO_RANGE = 25.0
-"""In the village, whose robots drive in a square of 70 m, teams of six fall apart and meet again with it [m]."""
+"""Radio range [m] with which six robots in the village, a square of 70 m, separate into groups and reconnect."""
 
 _FINAL_STATES = {"state_every": 1e6, "view_every": 1e6}
-"""Only the last maps are read: a result needs no others."""
+"""Settings that store only the last maps, the only ones that are read."""
 
-_MINUTE = {"settle_max": 60}
-"""On slow links and sparse graphs maps need hundreds of ticks to come to rest; a minute is what a team would wait."""
+_SHORT_SETTLING = {"settle_max": 60}
+"""Settings that end settling after a minute; slow links and sparse graphs would need hundreds of ticks."""
 
 _LABEL_NOISES = (0.0, 0.1, 0.2, 0.3, 0.4)
 _POSE_NOISES = (0.05, 0.1, 0.2, 0.4)
@@ -34,7 +34,7 @@ _EPSILON_SHARES = (0.1, 0.25, 0.5, 0.67, 0.8, 0.9, 0.95, 0.99)
 
 
 def rules(duration: float, num_villages: int) -> Experiment:
-    """Which rule on which graph?"""
+    """Compare the consensus rules on four graphs."""
     teams = _villages(duration, num_villages)
     variants = (
         *(f"gradient+{evidence}+{steps}" for evidence in ("sum", "time-average", "cell-average")
@@ -51,7 +51,7 @@ def rules(duration: float, num_villages: int) -> Experiment:
 
 
 def steps(duration: float, num_villages: int) -> Experiment:
-    """How do the steps trade consensus against the pull of the robots' own evidence?"""
+    """Vary the step sizes epsilon and gamma, and epsilon near its bound."""
     teams = _villages(duration, num_villages)
     bounds = ",".join(
         f"{topology}+{share * mixing.epsilon_bound(topology, 6):.6g}"
@@ -65,7 +65,7 @@ def steps(duration: float, num_villages: int) -> Experiment:
                 "steps",
                 tuple(teams),
                 ("rule=gradient,natural", "epsilon=0.1,0.2,0.35,0.5,0.7", "gamma=0.05,0.1,0.25,0.5,1,1.5"),
-                {"topology": "ring", **_MINUTE, **_FINAL_STATES},
+                {"topology": "ring", **_SHORT_SETTLING, **_FINAL_STATES},
             ),
             Plan(
                 "bound",
@@ -73,15 +73,15 @@ def steps(duration: float, num_villages: int) -> Experiment:
                 (f"topology+epsilon={bounds}",),
                 {"rule": "bayes", "duration": min(duration, 20.0), "settle_max": 200, **_FINAL_STATES},
                 has_truth=False,
-                more=_theory,
+                extra_columns=_theory,
             ),
         ),
     )
 
 
 def scale(duration: float, num_villages: int) -> Experiment:
-    """How many robots, cells and classes are mapped in real time?"""
-    del num_villages  # the work depends on the numbers, hardly on the village
+    """Measure run times for numbers of robots, cells and classes."""
+    del num_villages  # run times hardly depend on the village
     robots = {
         f"robots_{count:02d}": SimulatedTeam(SimulationConfig(num_robots=count, duration=duration))
         for count in _NUM_ROBOTS
@@ -114,7 +114,7 @@ def scale(duration: float, num_villages: int) -> Experiment:
 
 
 def noise(duration: float, num_villages: int) -> Experiment:
-    """What does consensus repair of noisy labels, poses and depths, and what does it spread?"""
+    """Count the errors of noisy labels, poses and depths that consensus repairs and spreads."""
     levels: dict[str, dict[str, Any]] = {
         **{f"label_{level:g}": {"label_noise": level} for level in _LABEL_NOISES},
         **{f"pose_{level:g}": {"pose_noise": level} for level in _POSE_NOISES},
@@ -126,13 +126,18 @@ def noise(duration: float, num_villages: int) -> Experiment:
         for seed in range(num_villages)
     }
     plan = Plan(
-        "noise", tuple(teams), ("rule=local,gradient,bayes",), _FINAL_STATES, keep=True, more=_noise_and_repairs
+        "noise",
+        tuple(teams),
+        ("rule=local,gradient,bayes",),
+        _FINAL_STATES,
+        keep=True,
+        extra_columns=_noise_and_repairs,
     )
     return Experiment(teams, (plan,))
 
 
 def choose(duration: float, num_villages: int) -> Experiment:
-    """Which settings for a good radio, for a poor one, and for many robots?"""
+    """Compare rules and packet contents on a good radio, on a poor one, and with many robots."""
     teams = _villages(duration, num_villages)
     many = {"many": SimulatedTeam(SimulationConfig(num_robots=16, duration=duration / 2))}
     variants = (
@@ -142,7 +147,7 @@ def choose(duration: float, num_villages: int) -> Experiment:
     )  # fmt: skip
     vary = (f"rule+packets+content={','.join(variants)}",)
     poor = {
-        **_MINUTE, "topology": "range", "radio_range": RADIO_RANGE, "loss": 0.3, "latency": 0.2, "rate": 50_000,
+        **_SHORT_SETTLING, "topology": "range", "radio_range": RADIO_RANGE, "loss": 0.3, "latency": 0.2, "rate": 50_000,
     }  # fmt: skip
     return Experiment(
         {**teams, **many},
@@ -150,18 +155,21 @@ def choose(duration: float, num_villages: int) -> Experiment:
             Plan("good_radio", tuple(teams), vary, _FINAL_STATES),
             Plan("poor_radio", tuple(teams), vary, {**poor, **_FINAL_STATES}),
             Plan(
-                "many_robots", tuple(many), vary, {**_MINUTE, "topology": "nearest", "num_nearest": 3, **_FINAL_STATES}
+                "many_robots",
+                tuple(many),
+                vary,
+                {**_SHORT_SETTLING, "topology": "nearest", "num_nearest": 3, **_FINAL_STATES},
             ),
         ),
     )
 
 
 QUESTIONS = {make.__name__: make for make in (rules, steps, scale, noise, choose)}
-"""The experiments by name: each is made from the length of the logs in seconds and the number of villages."""
+"""Functions that make the experiments, by name, from the length of the logs [s] and the number of villages."""
 
 
 def _villages(duration: float, num_villages: int) -> dict[str, SimulatedTeam]:
-    """Six robots in so many villages."""
+    """Teams of six robots, each in a village of its own."""
     return {
         f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed)) for seed in range(num_villages)
     }
@@ -170,7 +178,7 @@ def _villages(duration: float, num_villages: int) -> dict[str, SimulatedTeam]:
 def _timed(
     name: str, teams: Mapping[str, SimulatedTeam], vary: tuple[str, ...], settings: Mapping[str, object]
 ) -> Plan:
-    """A plan that measures time: two threads, nothing beside it, no settling and no truth to wait for."""
+    """Plan that measures time: two threads, one run at once, without settling and evaluation."""
     return Plan(
         name,
         tuple(teams),
@@ -178,19 +186,19 @@ def _timed(
         {**settings, "settle": 0, **_FINAL_STATES},
         has_truth=False,
         num_threads=2,
-        more=_sizes,
+        extra_columns=_sizes,
     )
 
 
 def _theory(team: SimulatedTeam, row: Row, _: Sweep) -> Row:
-    """Epsilon as a share of its bound, and the factor by which Phi should shrink, by theory."""
+    """Epsilon as a share of its bound, and the theoretical factor per tick by which Phi shrinks."""
     graph, epsilon = (row["topology"], team.simulation.num_robots), float(row["epsilon"])
     bound = mixing.epsilon_bound(*graph)
     return {"epsilon_share": epsilon / bound, "contraction_theory": mixing.contraction(*graph, epsilon)}
 
 
 def _sizes(team: SimulatedTeam, *_: object) -> Row:
-    """How many robots and classes a team has."""
+    """Numbers of robots and classes of a team."""
     simulation = team.simulation
     return {
         "num_robots": simulation.num_robots,
@@ -199,7 +207,7 @@ def _sizes(team: SimulatedTeam, *_: object) -> Row:
 
 
 def _noise_and_repairs(team: SimulatedTeam, row: Row, sweep: Sweep) -> Row:
-    """A team's noise; which cells are wrong, put right and made wrong, as shares of those that count (``Repairs``)."""
+    """Noise levels of a team, and the shares of its cells that are wrong, repaired and spoiled (``Repairs``)."""
     simulation = team.simulation
     noise = {name: getattr(simulation, name) for name in ("label_noise", "pose_noise", "depth_noise")}
     with (

@@ -1,4 +1,4 @@
-"""A sweep: every combination of varied settings as a run of its own, their numbers in one table."""
+"""Sweeps: one run for every combination of varied settings, with the numbers of all runs in one table."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from octoreplay.io.containers.fingerprint import fingerprint, log_files
 from octoreplay.report.sweep_plots import write_sweep_figures
 from octoreplay.study.folder import SweepFolder
 from octoreplay.study.grid import Combination, Variation, check_variations, combinations, parse_variation
-from octoreplay.study.local import run_local
+from octoreplay.study.local import execute_locally
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 from octoreplay.study.task import DATA_LOST, FAILED, Row, Task
 
 _TABLE_SECONDS = 2.0
-"""The table is written at most this often while runs finish; a table of very many runs takes its time."""
+"""Shortest time between two writes of the table while runs finish; writing a large table takes long."""
 
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """Runs finished so far, those of earlier sweeps included, how many of them failed, and an estimate [s] or NaN."""
+    """Progress of a sweep. Finished runs include those of earlier calls; ``seconds_left`` is NaN if unknown."""
 
     num_finished: int
     num_failed: int
@@ -42,9 +42,22 @@ class SweepProgress:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A finished sweep. ``rows`` are the runs in the order of the combinations, by column; ``names`` what is varied.
+    """Finished sweep.
 
-    ``num_earlier`` of them were finished before and not run again; ``warnings`` are sentences.
+    Attributes
+    ----------
+    folder, table : Path
+        Folder of the sweep, and its table as CSV.
+    names : tuple of str
+        Varied parameters.
+    columns : tuple of str
+        Columns of the table.
+    rows : tuple of dict
+        One row for each run, in the order of the combinations.
+    num_earlier : int
+        Number of runs that had been finished before and were not repeated.
+    warnings : tuple of str
+        Warnings, one sentence each.
     """
 
     folder: Path
@@ -57,16 +70,16 @@ class Sweep:
 
     @property
     def failed(self) -> tuple[Row, ...]:
-        """The runs that failed; their ``error`` says why."""
+        """Rows of the failed runs, with the reason in the column ``error``."""
         return tuple(row for row in self.rows if row["status"] == FAILED)
 
     def result(self, row: Row) -> Path:
-        """Where the result of a run is kept, of a sweep that keeps them."""
+        """Path of a run's kept result, in a sweep with ``keep``."""
         return SweepFolder(self.folder).result(_name({name: row[name] for name in ("team", *self.names, "seed")}))
 
     @property
     def lost_data(self) -> bool:
-        """True when any log was cut or any frame could not be used."""
+        """True if a run had a truncated log or a frame that could not be used."""
         return any(row["status"] == DATA_LOST for row in self.rows)
 
 
@@ -84,17 +97,21 @@ def run_sweep(
     scheduler: str | None = None,
     progress: Callable[[SweepProgress], None] | None = None,
 ) -> Sweep:
-    """Run every combination of team files and variations, and write the table into the folder ``output``.
+    """Run every combination of team files and variations, and write the table into a folder.
 
-    ``variations`` are texts such as ``topology=complete,ring`` (docs/sweeps.md), ``settings`` parameters of all runs by
-    name, and ``preset``; ``num_seeds`` runs every combination with so many values of network_seed. ``truth`` is the
-    file to evaluate against, beside each team file or as given; ``keep`` keeps the results. The runs are processes on
-    this machine, ``num_jobs`` at once (unless given, as many as there are processors for ``num_threads`` each), or on
-    the dask cluster of ``scheduler``. What ``output`` holds of the same runs is not run again. A run that fails has a
-    row that says why.
+    Each run is a process of its own. A failed run has a row with the reason and does not stop the others.
 
-    Raises ConfigError for anything that is wrong with any combination before the first run, InputError and
-    OutputError where the team files, the truth, the folder or the scheduler cannot be used.
+    ``teams`` are team files, ``variations`` texts such as ``topology=complete,ring`` (docs/sweeps.md), and ``settings``
+    the parameters of all runs by name, and ``preset``. ``num_seeds`` runs every combination with ``network_seed`` 0 to
+    num_seeds - 1. ``truth`` is the ground truth to evaluate against, relative to each team file or to the working
+    folder. Finished runs in the folder ``output`` are not repeated; ``keep`` keeps the results there.
+
+    The runs are executed on this machine, ``num_jobs`` at once (default: processors / ``num_threads``) with
+    ``num_threads`` threads each, or on the workers of the dask scheduler at the address ``scheduler``. ``progress`` is
+    called whenever a run has finished.
+
+    Raises ConfigError before the first run if any combination is invalid, InputError and OutputError if the team files,
+    the truth, the scheduler or the folder cannot be used.
     """
     fixed = {name: value for name, value in (settings or {}).items() if value is not None}
     parsed = [parse_variation(text) for text in variations]
@@ -107,50 +124,56 @@ def run_sweep(
     names = tuple(name for variation in parsed for name in variation.names)
     columns = _columns(names, has_truth=truth is not None)
     with SweepFolder.locked(Path(output)) as folder:
-        keys = _Keys()
+        keys = _CacheKeys()
         tasks = [_task(run, truths[run.team], folder, keys, keep=keep, num_threads=num_threads) for run in runs]
         folder.describe(_description(paths, parsed, fixed, num_seeds, truths, tasks))
-        board = _Board(folder, tasks, columns, progress)
-        left = board.begin()
+        table = _Table(folder, tasks, columns, progress)
+        left = table.begin()
         if left:
-            finished = run_local(left, num_jobs) if scheduler is None else _on_cluster(left, scheduler)
-            try:
-                with closing(finished):
-                    for task, row in finished:
-                        board.add(task, row)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt(
-                    f"interrupted; {len(board.rows)} of {len(tasks)} runs are finished, and the same command goes on"
-                    " with the others"
-                ) from None
-            finally:
-                board.write()
-        varied = [variation.names for variation in parsed]
-        write_sweep_figures(board.ordered(), varied, folder.figures)
-        rows, num_earlier = board.ordered(), len(tasks) - len(left)
-        return Sweep(folder.path, folder.table, names, columns, rows, num_earlier, tuple(_warnings(runs, num_seeds)))
+            _fill(table, execute_locally(left, num_jobs) if scheduler is None else _on_cluster(left, scheduler))
+        rows = table.ordered()
+        write_sweep_figures(rows, [variation.names for variation in parsed], folder.figures)
+        return Sweep(
+            folder.path, folder.table, names, columns, rows, len(tasks) - len(left), tuple(_warnings(runs, num_seeds))
+        )  # fmt: skip
+
+
+def _fill(table: _Table, finished: Generator[tuple[Task, Row]]) -> None:
+    """Add the rows of tasks to the table as they finish; an interrupt's message gives their number."""
+    try:
+        with closing(finished):
+            for task, row in finished:
+                table.add(task, row)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted; {len(table.rows)} of {table.num_tasks} runs are finished, and the same command continues"
+            " with the others"
+        ) from None
+    finally:
+        table.write()
 
 
 def _on_cluster(tasks: Sequence[Task], scheduler: str) -> Generator[tuple[Task, Row]]:
-    from octoreplay.study.cluster import run_on_cluster
+    """Execute tasks on a cluster; dask is imported only here."""
+    from octoreplay.study.cluster import execute_on_cluster
 
-    return run_on_cluster(tasks, scheduler)
+    return execute_on_cluster(tasks, scheduler)
 
 
 def check_workers(num_jobs: int | None, num_threads: int, scheduler: str | None) -> None:
-    """Refuse what says wrongly where runs are done. Raises ConfigError."""
+    """Check the options that say where and how runs are executed. Raises ConfigError."""
     for name, number in (("jobs", num_jobs), ("threads", num_threads)):
         if number is not None and number < 1:
             raise ConfigError(f"{name}: {number} is below the least value 1")
     if scheduler is not None:
         if num_jobs is not None:
-            raise ConfigError("--jobs is for this machine and --scheduler for another; leave one out")
+            raise ConfigError("--jobs applies to this machine and --scheduler to a cluster; leave one out")
         if not re.fullmatch(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d{1,5}/?", scheduler):
             raise ConfigError(f"scheduler: '{scheduler}' is not an address such as tcp://host:8786")
 
 
-class _Board:
-    """What is finished: the rows, the table, and the progress."""
+class _Table:
+    """Rows of the finished runs, written to the table and reported as progress."""
 
     def __init__(
         self,
@@ -160,6 +183,7 @@ class _Board:
         progress: Callable[[SweepProgress], None] | None,
     ) -> None:
         self.rows: dict[str, Row] = {}
+        self.num_tasks = len(tasks)
         self._folder = folder
         self._tasks = tasks
         self._columns = columns
@@ -168,11 +192,11 @@ class _Board:
         self._num_earlier = 0
 
     def begin(self) -> list[Task]:
-        """Take in what is finished; the tasks that are left."""
+        """Load the rows of finished runs and return the remaining tasks."""
         for task in self._tasks:
             row = self._folder.row(task.name, task.key)
             has_result = not task.keep or Path(task.result).exists()
-            # A row of another version of the table, or of a run that failed, is made again.
+            # Rows of failed runs and rows that lack columns are made again.
             if row is not None and set(self._columns) <= {*row, *task.labels} and has_result:
                 self.rows[task.name] = {**row, **task.labels}
         self._num_earlier = len(self.rows)
@@ -181,10 +205,10 @@ class _Board:
         return [task for task in self._tasks if task.name not in self.rows]
 
     def add(self, task: Task, row: Row) -> None:
-        """Take in one run."""
+        """Store the row of a finished run."""
         self.rows[task.name] = {**task.labels, **row}
         if not task.keep or row["status"] == FAILED:
-            # An earlier sweep's, of other settings.
+            # A result at this path is from an earlier sweep with other settings.
             Path(task.result).unlink(missing_ok=True)
         self._folder.add_row(task.name, task.key, self.rows[task.name])
         if time.monotonic() > self._written + _TABLE_SECONDS:
@@ -192,41 +216,41 @@ class _Board:
         self._show()
 
     def write(self) -> None:
-        """Write the table of what is finished."""
+        """Write the table of the finished runs."""
         self._folder.write_table(self._columns, self.ordered())
         self._written = time.monotonic()
 
     def ordered(self) -> tuple[Row, ...]:
-        """The rows in the tasks' order."""
+        """Rows in the order of the tasks."""
         return tuple(self.rows[task.name] for task in self._tasks if task.name in self.rows)
 
     def _show(self) -> None:
-        """Report the progress."""
+        """Report the progress with an estimate from the mean time of the runs of this call."""
         if self._progress is None:
             return
         rows = self.rows.values()
         num_new = len(rows) - self._num_earlier
         pace = (time.monotonic() - self._started) / num_new if num_new else math.nan
         num_failed = sum(row["status"] == FAILED for row in rows)
-        left = len(self._tasks) - len(rows)
-        self._progress(SweepProgress(len(rows), num_failed, len(self._tasks), pace * left if left else 0.0))
+        left = self.num_tasks - len(rows)
+        self._progress(SweepProgress(len(rows), num_failed, self.num_tasks, pace * left if left else 0.0))
 
 
-class _Keys:
-    """What runs depend on, as hashes; every file is looked at once."""
+class _CacheKeys:
+    """Hashes of everything that a run's numbers depend on; each file is read once."""
 
     def __init__(self) -> None:
         self._files: dict[tuple[Path, bool], list[Any]] = {}
 
     def key(self, config: RunConfig, team: str, truth: Path | None) -> str:
-        """The hash of a configuration, its logs, the truth and the program's version."""
+        """Hash of a configuration, its logs, the truth and the program's version."""
         whole = config.output.hash
         logs = [self._identity(path, whole=whole) for robot in config.robots for path in robot.files]
         truths = [] if truth is None else [self._identity(truth.resolve(), whole=whole)]
         return hashlib.sha256(json.dumps([__version__, team, logs, truths]).encode()).hexdigest()
 
     def _identity(self, path: Path, *, whole: bool) -> list[Any]:
-        """What identifies the file or the folder; the reason where it cannot be read: the run will say it too."""
+        """Fingerprints of a file or of a folder's files, or the reason if unreadable, which the run reports too."""
         if (path, whole) not in self._files:
             try:
                 found = [fingerprint(file, whole=whole) for file in log_files(path)]
@@ -237,9 +261,9 @@ class _Keys:
 
 
 def _task(
-    run: Combination, truth: Path | None, folder: SweepFolder, keys: _Keys, *, keep: bool, num_threads: int
+    run: Combination, truth: Path | None, folder: SweepFolder, keys: _CacheKeys, *, keep: bool, num_threads: int
 ) -> Task:
-    """The task of one combination."""
+    """Task of one combination."""
     labels = {"team": run.team, **run.values, "seed": run.seed}
     robots = tuple(robot.with_absolute_paths() for robot in run.config.robots)
     config = dataclasses.replace(run.config, robots=robots)
@@ -260,24 +284,24 @@ def _task(
 
 
 def _warnings(runs: Sequence[Combination], num_seeds: int | None) -> Iterator[str]:
-    """What is worth knowing of a sweep that can be done."""
-    if (num_seeds or 1) > 1 and not any(_draws(run.config) for run in runs):
-        yield "no setting of these runs leaves anything to chance, so --seeds repeats the same runs; leave it out"
+    """Warnings about a valid sweep."""
+    if (num_seeds or 1) > 1 and not any(_is_random(run.config) for run in runs):
+        yield "no run of this sweep uses random numbers, so --seeds repeats identical runs; leave it out"
 
 
-def _draws(config: RunConfig) -> bool:
-    """Whether a run depends on its seed."""
+def _is_random(config: RunConfig) -> bool:
+    """True if a run depends on its seed."""
     overrides = (value for *_, values in config.link_overrides for _, value in values)
     return config.network.topology == "random" or config.link.is_random or any(overrides)
 
 
 def _name(labels: Mapping[str, Any]) -> str:
-    """A run's name, from what tells it from the others."""
+    """Name of a run, made of its labels."""
     return ",".join(f"{key}={value}" for key, value in labels.items())
 
 
 def _labels(teams: Sequence[Path]) -> dict[str, Path]:
-    """Team files by a short label: their names, with as many folders as it takes to tell them apart."""
+    """Team files by label: the file name, preceded by as many folders as make all labels distinct."""
     if not teams:
         raise ConfigError("a sweep needs a team file")
     paths = [path.resolve().with_suffix("") for path in teams]
@@ -288,15 +312,15 @@ def _labels(teams: Sequence[Path]) -> dict[str, Path]:
 
 
 def _truth(truth: Path, team: Path) -> Path:
-    """The truth, a file or a folder that holds one: beside the team file, else as given."""
+    """Path of the truth, relative to the team file's folder if it exists there. Raises InputError if not found."""
     for path in dict.fromkeys((team.parent / truth, truth)):
         if path.exists():
             return path
-    raise InputError(f"{truth}: not found, neither beside {team} nor here")
+    raise InputError(f"{truth}: not found, neither beside {team} nor in the working folder")
 
 
 def _columns(names: Sequence[str], *, has_truth: bool) -> tuple[str, ...]:
-    """The table's columns."""
+    """Columns of the table."""
     truth = TRUTH_COLUMNS if has_truth else ()
     return ("team", *names, "seed", "status", "error", *RUN_COLUMNS, *truth, *TIMING_COLUMNS)
 
@@ -309,7 +333,7 @@ def _description(
     truths: Mapping[str, Path | None],
     tasks: Sequence[Task],
 ) -> dict[str, Any]:
-    """What is swept, for the reader."""
+    """Content of sweep.json."""
     return {
         "octoreplay": __version__,
         "teams": {label: str(path.resolve()) for label, path in paths.items()},

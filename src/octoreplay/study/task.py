@@ -1,6 +1,7 @@
-"""One run of a sweep, in a process of its own: a task as JSON on standard input, its row as JSON on standard output.
+"""Execution of one run of a sweep in a process of its own.
 
-The process ends with the one that started it, which holds the other end of its standard input.
+The process reads a task as JSON from standard input and writes its row as JSON to standard output. It ends when its
+standard input is closed, thus when its parent ends.
 """
 
 from __future__ import annotations
@@ -19,19 +20,38 @@ from octoreplay.errors import OctoreplayError
 from octoreplay.records import FrameCounts, RunSummary
 
 Row = dict[str, Any]
-"""What one run came to, by column."""
+"""Numbers and texts of one run by column."""
 
 OK, DATA_LOST, FAILED = "ok", "data lost", "failed"
-"""What ``status`` says."""
+"""Values of the column ``status``."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a team file's text with absolute paths, and where its result goes.
+    """One run of a sweep, as given to a process.
 
-    ``name`` is the run's, ``key`` identifies everything that its numbers depend on, ``labels`` are its first columns.
-    The result is kept at ``result`` if ``keep`` is set, and written at ``unfinished`` until then. ``version`` is that
-    of the program that made the task, ``num_threads`` how many threads the run has.
+    Attributes
+    ----------
+    name : str
+        Name of the run.
+    key : str
+        Hash of everything that the run's numbers depend on.
+    labels : mapping
+        First columns of the row.
+    team : str
+        Text of the team file, with absolute paths.
+    unfinished : str
+        Path of the result while it is written.
+    result : str
+        Path of the result if it is kept.
+    keep : bool
+        True to keep the result.
+    truth : str or None
+        Path of the ground truth, None to skip the evaluation.
+    version : str
+        Version of octoreplay that made the task.
+    num_threads : int
+        Threads of the run.
     """
 
     name: str
@@ -47,41 +67,42 @@ class Task:
 
 
 def failed(sentence: str) -> Row:
-    """The row of a run that failed."""
+    """Row of a failed run."""
     return {"status": FAILED, "error": " ".join(sentence.split())}
 
 
 def to_json(row: Row) -> Row:
-    """A row that JSON can hold: None for NaN and infinities."""
+    """Row for JSON, with None for NaN and infinities."""
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in row.items()}
 
 
 def from_json(row: Row) -> Row:
-    """What ``to_json`` was given, with NaN for infinities."""
+    """Row that was given to ``to_json``, with NaN for infinities."""
     return {name: math.nan if value is None else value for name, value in row.items()}
 
 
-def run_task(task: Task) -> Row:
-    """Replay, measure and, where there is a truth, evaluate; a run that fails says why in its row."""
+def execute_task(task: Task) -> Row:
+    """Replay, measure and, if the truth is known, evaluate. If that fails, the row holds the reason."""
     try:
-        return _run(task)
+        return _replay_and_measure(task)
     except OctoreplayError as error:
         return failed(str(error))
     except MemoryError:
-        return failed("the run needs more memory than there is")
+        return failed("out of memory")
     finally:
         Path(task.unfinished).unlink(missing_ok=True)
 
 
-def _run(task: Task) -> Row:
+def _replay_and_measure(task: Task) -> Row:
+    """Row of a task; errors are raised."""
     from octoreplay.config.team_file import parse_team
-    from octoreplay.replay.session import replay_team
+    from octoreplay.replay.run import replay_team
     from octoreplay.result import open_result
     from octoreplay.study.numbers import run_numbers, truth_numbers
 
     _compile_first()
     unfinished = Path(task.unfinished)
-    config = parse_team(task.team, source=task.name, folder=Path("/"))
+    config = parse_team(task.team, name=task.name, folder=Path("/"))
     summary = replay_team(config, unfinished, num_threads=task.num_threads)
     timing = _timing(summary)
     with open_result(unfinished) as result:
@@ -97,30 +118,28 @@ def _run(task: Task) -> Row:
 
 
 def _compile_first() -> None:
-    """Compile where there are no compiled kernels yet, so that the run's time is the run's."""
-    from octoreplay.mapping.kernels import compiler
-    from octoreplay.mapping.warm_up import compile_kernels
+    """Compile the kernels if needed, so that the run's time does not include compilation."""
+    from octoreplay.mapping.warm_up import compile_if_needed
 
-    if compiler.cache_is_empty():
-        compile_kernels()
+    compile_if_needed()
 
 
 def _loss(counts: FrameCounts) -> str:
-    """What one robot's logs lost."""
+    """Data that one robot's logs lost."""
     damaged = f", {len(counts.truncated_files)} damaged logs" if counts.truncated_files else ""
-    return f"{counts.skipped} images or clouds were not mapped{damaged}"
+    return f"{counts.skipped} images or clouds not mapped{damaged}"
 
 
 def _timing(summary: RunSummary) -> Row:
-    """The values of TIMING_COLUMNS."""
+    """Values of TIMING_COLUMNS."""
     factor = summary.log_seconds / summary.wall_seconds if summary.wall_seconds > 0 else math.nan
     return {"wall_seconds": summary.wall_seconds, "realtime_factor": factor, "peak_rss_bytes": _peak_memory()}
 
 
 def _peak_memory() -> int:
-    """The most memory that this process has had resident, in bytes."""
+    """Peak resident memory of this process in bytes."""
     try:
-        # getrusage counts what the process that started this one had as well.
+        # Unlike VmHWM, getrusage includes the memory that the parent had when it forked.
         for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
@@ -133,19 +152,19 @@ def _peak_memory() -> int:
 
 
 def _end_with_the_parent() -> None:
-    """End this process when its input ends, as it does with the process at the other end, however that ends."""
+    """End this process when its standard input is closed, which happens whenever the parent ends."""
     os.read(0, 1)
     os._exit(1)
 
 
 def main() -> None:
-    """Run the task on standard input."""
-    # Nothing that a library prints gets into the row.
+    """Execute the task on standard input."""
+    # Standard output is for the row only; prints of libraries go to standard error.
     row_file = os.dup(1)
     os.dup2(2, 1)
     task = Task(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
-    row = run_task(task)
+    row = execute_task(task)
     with os.fdopen(row_file, "w", encoding="utf-8") as stream:
         json.dump(to_json(row), stream)
 

@@ -1,4 +1,4 @@
-"""Simulated teams and results of them in folders: made once, and used again when they are complete and the same."""
+"""Simulated teams and their results in folders, which are used again when complete and unchanged."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import partial_path
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.replay.session import Progress, replay_team
+from octoreplay.replay.run import Progress, replay_team
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 SETTINGS_FILE = "simulation.json"
-"""Beside a team's logs: the version and the settings that made them, and how large every file is."""
+"""File beside a team's logs with the version, the settings and the size of every file."""
 
 
 def simulated_team(folder: Path, config: SimulationConfig, progress: Callable[[float], None] | None = None) -> Path:
-    """Simulate a team into a folder, or use the team that is there; the team file.
+    """Simulate a team into a folder, unless it holds the team already; return the team file.
 
     A team is used again when it is complete and was made with the same settings by the same version. ``progress`` is
-    called with the share that is done, 0 to 1, and not at all for a team that is there. The folder appears when it is
-    complete. Raises OutputError where it holds something else or cannot be written, InputError where Open3D cannot be
-    loaded.
+    called with the finished share, 0 to 1, but not for an existing team. The folder appears when it is complete. Raises
+    OutputError where the folder holds something else or cannot be written, InputError where Open3D cannot be loaded.
     """
     if not is_simulated(folder, config):
         with _in_place_of(folder) as work:
@@ -40,7 +39,7 @@ def simulated_team(folder: Path, config: SimulationConfig, progress: Callable[[f
 
 
 def is_simulated(folder: Path, config: SimulationConfig) -> bool:
-    """Whether a folder holds the team of these settings; False where there is nothing yet.
+    """True where a folder holds the team of these settings; False where it is missing or empty.
 
     Raises OutputError where the folder holds anything else.
     """
@@ -52,18 +51,17 @@ def is_simulated(folder: Path, config: SimulationConfig) -> bool:
     except (OSError, ValueError):
         stored = None
     if not isinstance(stored, dict) or set(stored) != set(present):
-        raise OutputError(f"{folder}: is there and holds no simulated team; give another folder, or remove this one")
+        raise OutputError(f"{folder}: exists and holds no simulated team; give another folder, or remove this one")
     for reason in _differences(stored, present):
         raise OutputError(f"{folder}: {reason}; give another folder, or remove this one")
     return True
 
 
 def replayed_team(config: RunConfig, output: Path, progress: Callable[[Progress], None] | None = None) -> Path:
-    """Replay a team into a result, or use the result that is there; the result.
+    """Replay a team into a result, unless it exists already; return the result.
 
-    A result is used again when it is complete, of the same configuration and version, and its logs have not changed
-    since. An interrupted replay leaves nothing behind. Raises OutputError where another result is there, and whatever
-    ``replay_team`` raises.
+    A result is used again when it is complete, of the same configuration and version, and its logs are unchanged. An
+    interrupted replay leaves no file. Raises OutputError where another result exists, and as ``replay_team`` does.
     """
     config = resolve(config)
     if not is_replayed(config, output):
@@ -76,18 +74,18 @@ def replayed_team(config: RunConfig, output: Path, progress: Callable[[Progress]
 
 
 def is_replayed(config: RunConfig, output: Path) -> bool:
-    """Whether a file is the result of this configuration; False where there is nothing yet.
+    """True where a file is the result of this configuration; False where it does not exist.
 
-    Raises OutputError where it is the result of something else, InputError where it is no result.
+    Raises OutputError where it is another result, InputError where it is not a result.
     """
     if not output.exists():
         return False
     with ResultReader(output) as reader:
         is_same = reader.is_complete and reader.description["version"] == __version__ and not reader.changed_inputs()
-        is_same = is_same and _absolute(reader.config) == _absolute(resolve(config))
+        is_same = is_same and _absolute(reader.config) == _absolute(resolve(config).to_config())
     if not is_same:
         raise OutputError(
-            f"{output}: is there and was made from other logs, with other settings or by another version; give another"
+            f"{output}: exists and was made from other logs, with other settings or by another version; give another"
             " folder, or remove it"
         )
     return True
@@ -95,10 +93,10 @@ def is_replayed(config: RunConfig, output: Path) -> bool:
 
 @contextlib.contextmanager
 def _in_place_of(folder: Path) -> Iterator[Path]:
-    """A new folder beside a folder, which takes its place when all went well and is removed when not."""
+    """Yield a new folder that replaces ``folder`` at the end, and is removed after any error."""
     work = folder.with_name(f".{folder.name}.partial")
     try:
-        # What a killed process left.
+        # A killed process leaves its folder.
         shutil.rmtree(work, ignore_errors=True)
         folder.parent.mkdir(parents=True, exist_ok=True)
         yield work
@@ -110,14 +108,14 @@ def _in_place_of(folder: Path) -> Iterator[Path]:
 
 
 def _content(folder: Path, config: SimulationConfig) -> dict[str, Any]:
-    """What the settings file of a team says."""
+    """Content of a team's settings file."""
     files = {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != SETTINGS_FILE}
     settings = json.loads(json_text(config))
     return {"version": __version__, "settings": settings, "files": files}
 
 
 def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> Iterator[str]:
-    """What keeps a stored team from being the wanted one."""
+    """Differences between a stored team and the wanted one, as clauses."""
     if stored["version"] != wanted["version"]:
         yield f"was simulated by octoreplay {stored['version']}, this is {wanted['version']}"
     for name, value in wanted["settings"].items():
@@ -129,5 +127,5 @@ def _differences(stored: dict[str, Any], wanted: dict[str, Any]) -> Iterator[str
 
 
 def _absolute(config: RunConfig) -> RunConfig:
-    """A configuration with paths that hold from everywhere."""
+    """The configuration with absolute paths."""
     return dataclasses.replace(config, robots=tuple(robot.with_absolute_paths() for robot in config.robots))

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from log_damage import read_all
 from octoreplay.io.containers.db3_log import Db3Log
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.ros_types import typestore
+from support.log_damage import read_all
 
 
 def write_long_db3(folder: Path) -> Path:

@@ -12,7 +12,12 @@ import zstandard
 from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
-from log_damage import (
+from octoreplay.errors import InputError
+from octoreplay.io.containers.bag_records import CHUNK, read_head
+from octoreplay.io.containers.damage import Damage, damage_sentence
+from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES, decompress, is_plausible_size
+from octoreplay.io.containers.logs import open_log
+from support.log_damage import (
     NUM_MESSAGES,
     mcap_chunks,
     read_all,
@@ -21,11 +26,6 @@ from log_damage import (
     write_strings_mcap,
     write_strings_rosbag2,
 )  # fmt: skip
-from octoreplay.errors import InputError
-from octoreplay.io.containers.bag_records import CHUNK, read_head
-from octoreplay.io.containers.damage import Damage, damage_sentence
-from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES, decompress, is_plausible_size
-from octoreplay.io.containers.logs import open_log
 
 COMPRESSIONS = [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD]
 

@@ -16,12 +16,12 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
-from log_factory import ROS1, SECOND, Entry, Factory, robot_entries, ros2, write_bag, write_mcap, write_rosbag2
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import RawMessage, normalise_type_name
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.ros_types import typestore
+from support.log_factory import ROS1, SECOND, Entry, Factory, robot_entries, ros2, write_bag, write_mcap, write_rosbag2
 
 CONTAINERS = Path(__file__).parents[2] / "fixtures" / "containers"
 

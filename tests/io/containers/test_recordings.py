@@ -9,7 +9,7 @@ from mcap.reader import NonSeekingReader
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 
 from octoreplay.io.containers.logs import open_log
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 
 def contents(path: Path) -> list[tuple[str, int, bytes]]:

@@ -18,10 +18,10 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from log_factory import ROS1, SECOND, ros2
 from octoreplay.io.containers.db3_log import Db3Log
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.ros_types import typestore
+from support.log_factory import ROS1, SECOND, ros2
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "containers"
 STRING = "std_msgs/msg/String"

@@ -1,4 +1,4 @@
-"""One cloud from a file of any kind: fields, labels, colours, and what is damaged."""
+"""Point cloud files: fields, labels, colours and damage."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.cloud_files import read_cloud, read_kitti_labels
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]
 
@@ -83,17 +83,17 @@ def test_a_ply_file_cut_anywhere_is_never_read(tmp_path, text):
 @pytest.mark.parametrize("text", [True, False])
 @pytest.mark.parametrize(
     ("new", "message"),
-    [(b"vertex 2", "more follows than its header announces"), (b"vertex 4000000000000", "is cut or damaged"),
+    [(b"vertex 2", "it is longer than its header says"), (b"vertex 4000000000000", "is cut or damaged"),
      (b"vertex -3", "is cut or damaged"), (b"vertex three", "is cut or damaged"), (b"point 3", "no element 'vertex'")],
 )  # fmt: skip
-def test_a_ply_header_that_lies_is_found_out(tmp_path, text, new, message):
+def test_a_wrong_ply_header_is_refused(tmp_path, text, new, message):
     whole = save_ply(tmp_path / "a.ply", vertices([]), text=text).read_bytes()
     (tmp_path / "a.ply").write_bytes(whole.replace(b"vertex 3", new))
     with pytest.raises(InputError, match=rf"a\.ply: .*{message}"):
         read_cloud(tmp_path / "a.ply")
 
 
-def test_bytes_that_are_wrong_end_in_one_sentence(tmp_path):
+def test_damaged_bytes_are_refused_in_one_sentence(tmp_path):
     rng = np.random.default_rng(3)
     whole = save_ply(tmp_path / "a.ply", vertices([("label", "u1")]), text=True).read_bytes()
     for _ in range(300):
@@ -120,7 +120,7 @@ def test_pcl_colours_are_the_bits_of_a_float_or_an_integer(tmp_path):
     assert cloud.rgb.tolist() == [1]
 
 
-def test_what_is_no_label_is_65535(tmp_path):
+def test_invalid_labels_are_65535(tmp_path):
     rows = ["1 2 3 5", "1 2 3 -1", "1 2 3 nan", "1 2 3 4294967295", "1 2 3 70000"]
     cloud = read_cloud(save_pcd(tmp_path / "a.pcd", "x y z class", "4 4 4 4", "F F F F", rows))
     assert cloud.labels is not None
@@ -133,7 +133,7 @@ def test_what_is_no_label_is_65535(tmp_path):
 
 def test_a_cloud_without_coordinates_names_its_fields(tmp_path):
     path = save_pcd(tmp_path / "a.pcd", "x y label", "4 4 4", "F F U", ["1 2 3"])
-    with pytest.raises(InputError, match=r"has no field 'z' of one number a point; its fields are x, y, label"):
+    with pytest.raises(InputError, match=r"has no field 'z' with one number per point; its fields are x, y, label"):
         read_cloud(path)
 
 

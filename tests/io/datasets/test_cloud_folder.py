@@ -1,4 +1,4 @@
-"""Folders of point clouds become logs: small ones made here, and real ones where they are at hand."""
+"""Import of folders of point clouds: small ones made here, and real ones where available."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.datasets.cloud_folder import import_clouds
 from octoreplay.io.sensors.clouds import decode_cloud
 from octoreplay.records import ClassTable, SemanticClass
-from recordings import RECORDINGS, needs_recordings
-from stored_messages import matrix, read_messages
+from support.recordings import RECORDINGS, needs_recordings
+from support.stored_messages import matrix, read_messages
 
 BKI = RECORDINGS / "semantic_pcd" / "bki_sim"
 KITTI = RECORDINGS / "semantic_misc" / "mmdet3d_semantickitti" / "sequences" / "00"
@@ -89,7 +89,7 @@ def tum_table(path: Path, stamps: tuple[str, ...]) -> Path:
 
 
 def clouds(path: Path) -> list[tuple[int, np.ndarray, np.ndarray | None]]:
-    """(stamp, points, labels) of every cloud of a log, by the reader that a run uses."""
+    """(stamp, points, labels) of every cloud of a log, from the reader of a run."""
     with open_log(path) as log:
         [topic] = [topic.name for topic in log.topics if topic.name.endswith("/lidar/points")]
         found = [(message.log_time_ns, message.sensor_message()) for message in log.messages((topic,))]
@@ -128,7 +128,7 @@ def test_pcd_with_viewpoints(tmp_path, frame, expected):
     assert (summary.layout, summary.poses, summary.frame) == ("PCD", "VIEWPOINT", frame or "world")
     assert (summary.robot_id, summary.num_frames, summary.num_labelled, summary.num_points) == ("left_arm", 3, 3, 9)
     found = clouds(output)
-    # Names are ordered by their numbers; the point that is not finite is left out with its label.
+    # Names are sorted by their numbers; a point that is not finite is left out with its label.
     assert [stamp for stamp, *_ in found] == [0, 125_000_000, 250_000_000]
     for index, (_, stored, labels) in enumerate(found):
         np.testing.assert_allclose(stored, expected(index), atol=1e-5)
@@ -156,7 +156,7 @@ def test_kitti_with_its_labels_times_and_poses(tmp_path):
     assert [field.name for field in message.fields] == ["x", "y", "z", "intensity", "label"]
 
 
-def test_kitti_camera_poses_are_said_to_be_made_the_lidars(tmp_path):
+def test_the_summary_names_the_conversion_of_kitti_poses(tmp_path):
     folder = kitti(tmp_path / "00")
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
     summary = import_clouds(folder, tmp_path / "a.mcap")
@@ -186,13 +186,13 @@ def test_tum_poses_are_found_by_the_clouds_times(tmp_path):
     folder = ply_folder(tmp_path / "in", names)
     table = tum_table(tmp_path / "track.txt", ("1305031102.0", "1305031102.1"))
     summary = import_clouds(folder, tmp_path / "a.mcap", poses=table)
-    # The last cloud lies beyond the last pose.
+    # The last cloud is later than the last pose.
     assert (summary.poses, summary.num_frames, summary.num_without_pose) == ("track.txt (TUM)", 3, 1)
     found = lidar_poses(tmp_path / "a.mcap")
     assert [stamp - 1305031102_000_000_000 for stamp, _ in found] == [0, 50_000_000, 100_000_004]
     np.testing.assert_allclose(found[1][1][:3, 3], (pose(0)[:3, 3] + pose(1)[:3, 3]) / 2, atol=1e-6)
     np.testing.assert_allclose(found[2][1], pose(1), atol=1e-9)
-    # With a rate the log has other stamps, and the same poses.
+    # With a rate the log has other stamps and the same poses.
     import_clouds(folder, tmp_path / "b.mcap", poses=table, rate=1.0)
     again = lidar_poses(tmp_path / "b.mcap")
     assert [stamp for stamp, _ in again] == [0, 1_000_000_000, 2_000_000_000]
@@ -210,7 +210,7 @@ def test_tum_rows_belong_to_clouds_without_times_one_by_one(tmp_path):
 
 @pytest.mark.parametrize("order", [("b", "a"), ("a", "b")])
 def test_labels_that_only_some_clouds_have(tmp_path, order):
-    """The log says of every cloud whether it has labels, since readers look at the first."""
+    """Every cloud of a log has a label field or none has, since readers examine the first."""
     folder = kitti(tmp_path / "00", count=2)
     (folder / "labels" / ("000000.label" if order[0] == "b" else "000001.label")).unlink()
     summary = import_clouds(folder, tmp_path / "a.mcap")
@@ -248,7 +248,7 @@ def test_world_coordinates_far_away_keep_their_digits(tmp_path):
     np.testing.assert_array_equal(clouds(tmp_path / "a.mcap")[0][1], [[0.25, 0.125, 2.0]])
 
 
-def test_points_of_the_world_stay_where_they_are_by_a_rounded_matrix(tmp_path):
+def test_world_points_are_kept_with_a_rounded_matrix(tmp_path):
     far = np.array([(90.0, -60.0, 20.0)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     (tmp_path / "in").mkdir()
     PlyData([PlyElement.describe(far, "vertex")]).write(str(tmp_path / "in" / "1.ply"))
@@ -272,7 +272,7 @@ def test_a_part_of_the_folder(tmp_path, selection, expected):
     assert [round(stamp / 1e8) for stamp, *_ in clouds(tmp_path / "a.mcap")] == expected
     assert [T[0, 3] for _, T in lidar_poses(tmp_path / "a.mcap")] == expected
     assert [stored[1, 2] for _, stored, _ in clouds(tmp_path / "a.mcap")] == expected
-    # The table may also hold a line for each cloud that is taken.
+    # The table may also hold one line per chosen cloud.
     np.savetxt(tmp_path / "few.txt", [pose(index)[:3].ravel() for index in expected])
     import_clouds(folder, tmp_path / "b.mcap", poses=tmp_path / "few.txt", rate=2.0, **selection)
     assert [T[0, 3] for _, T in lidar_poses(tmp_path / "b.mcap")] == expected
@@ -287,7 +287,7 @@ def test_a_part_of_the_folder(tmp_path, selection, expected):
         (("1305031102175304", "1305031102175305"), [1305031102_175_304_000, 1305031102_175_305_000]),
         (("1305031102175304123", "1305031102175304124"), [1305031102_175_304_123, 1305031102_175_304_124]),
         (("3_1305031102_000000004", "4_1305031102_000000005"), [1305031102_000_000_004, 1305031102_000_000_005]),
-        # As times these are in another order than as names.
+        # The order by time differs from the order by name.
         (("scan_0.5", "scan_0.25"), [250_000_000, 500_000_000]),
     ],
 )
@@ -308,7 +308,7 @@ def test_numbers_in_file_names_that_are_no_times(tmp_path, names):
     assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0).num_frames == 2
 
 
-def test_a_file_of_times_goes_before_all_others(tmp_path):
+def test_a_given_file_of_times_has_precedence(tmp_path):
     folder = pcd_folder(tmp_path / "in", ("1305031102", "1305031103"))
     (folder / "times.txt").write_text("3\n4.5\n")
     import_clouds(folder, tmp_path / "a.mcap")
@@ -342,7 +342,7 @@ def remove(pattern: str):
     [
         (spoil("velodyne/000001.bin", bytes(40)), r"000001\.bin: 40 bytes are not KITTI's points"),
         (spoil("labels/000001.label", bytes(12)), r"000001\.label: holds 3 labels of 4 bytes, but its cloud has 4"),
-        (spoil("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2), "has 2 poses; the folder has 3 clouds, of which 3 are"),
+        (spoil("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2), "has 2 poses; the folder has 3 frames, 3 of them chosen"),
         (spoil("poses.txt", "1 0 0 0 0 1 0\n" * 3), r"poses\.txt line 1: expects 8 numbers"),
         (spoil("poses.txt", ""), r"poses\.txt: holds no poses"),
         (spoil("poses.txt", "nan " * 12 + "\n" + "inf " * 12 + "\n" + "nan " * 12),
@@ -351,11 +351,11 @@ def remove(pattern: str):
         (remove("poses.txt"), "no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one"),
         (spoil("times.txt", "1\n2\n"), r"times\.txt: has 2 times; the folder has 3 frames"),
         (spoil("times.txt", "1\n2\n3000000000"), r"times\.txt: times must be below 2\^31 s"),
-        (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; leave the clouds of one kind in it"),
+        (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; keep clouds of one format in it"),
         (remove("velodyne/*.bin"), r"no clouds found; looked for \.pcd, \.ply, \.bin, also in velodyne/; the fold"),
     ],
 )  # fmt: skip
-def test_what_is_damaged_is_named_and_nothing_is_left(tmp_path, spoiler, message):
+def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
     folder = kitti(tmp_path / "00")
     spoiler(folder)
     (tmp_path / "out").mkdir()
@@ -375,13 +375,13 @@ def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
     assert not list(tmp_path.glob("*.partial*"))
 
 
-def test_viewpoints_that_nobody_set_are_no_poses(tmp_path):
+def test_unset_viewpoints_are_not_poses(tmp_path):
     folder = pcd_folder(tmp_path / "in")
     for path in folder.glob("*.pcd"):
         save_pcd(path, 0, viewpoint="0 0 0 1 0 0 0")
     with pytest.raises(InputError, match="the VIEWPOINT of every cloud is unset; give a file of poses"):
         import_clouds(folder, tmp_path / "a.mcap", rate=1.0)
-    # One cloud may well define the map.
+    # A single cloud may define the map.
     assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0, last=0).num_frames == 1
 
 
@@ -389,7 +389,7 @@ def test_labels_that_begin_later_are_refused(tmp_path):
     folder = pcd_folder(tmp_path / "in")
     first = folder / "scan_2.pcd"
     first.write_text(first.read_text().replace("x y z label", "x y z nothing"))
-    with pytest.raises(InputError, match=r"scan_9\.pcd: has labels, but the clouds before it have none; start with it"):
+    with pytest.raises(InputError, match=r"scan_9\.pcd: has labels, but the clouds before it have none; choose it as"):
         import_clouds(folder, tmp_path / "a.mcap", rate=1.0)
     assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0, first=1).num_labelled == 2
 
@@ -404,7 +404,7 @@ def test_labels_that_begin_later_are_refused(tmp_path):
         ({"robot_id": "a/b"}, ConfigError, "robot id 'a/b'"),
         ({"times": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
         ({"poses": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
-        ({"labels": Path("missing")}, InputError, r"missing: holds no \.label file that is named like a cloud such as"),
+        ({"labels": Path("missing")}, InputError, r"missing: holds no \.label file with the name of a cloud such as"),
     ],
 )
 def test_options_that_do_not_fit(tmp_path, options, error, message):
@@ -427,7 +427,7 @@ def test_missing_input_and_unwritable_output(tmp_path):
 
 
 def meeting_points(path: Path) -> tuple[int, float]:
-    """How many points of a log's clouds, placed in the map, have one of a cloud from elsewhere within 0.1 m.
+    """Share of a log's points in the map that have a point of a cloud from another position within 0.1 m.
 
     And the share of them whose labels are the same.
     """
@@ -445,7 +445,7 @@ def meeting_points(path: Path) -> tuple[int, float]:
 
 
 @needs_recordings
-def test_real_labelled_scans_line_up_as_they_are_taken_to_be_given(tmp_path):
+def test_real_labelled_scans_line_up_in_the_assumed_frame(tmp_path):
     summary = import_clouds(BKI, tmp_path / "a.mcap", rate=1.0)
     assert (summary.num_frames, summary.num_labelled, summary.frame) == (12, 12, "world")
     [sentence] = summary.warnings
@@ -453,7 +453,7 @@ def test_real_labelled_scans_line_up_as_they_are_taken_to_be_given(tmp_path):
         "annotated_1.pcd and 11 more: rows have more columns than the header names; "
         "those after the named ones were not read"
     )
-    # Scans from four places meet in one room; taken to be in the sensor's frame they do not.
+    # Scans from four positions overlap in one room, but not when read as in the sensor's frame.
     import_clouds(BKI, tmp_path / "b.mcap", rate=1.0, frame="sensor")
     count, agreement = meeting_points(tmp_path / "a.mcap")
     assert count > 5000

@@ -1,4 +1,4 @@
-"""What folders of frames share: order, names of robots, and times that messages can hold."""
+"""Import of folders of frames: order, robot names, and the range of times."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from octoreplay.errors import InputError, OutputError
 from octoreplay.io.datasets.frames_folder import frame_stamps, natural_order, robot_name, unfinished
 
 
-def test_numbers_in_names_count_as_numbers():
+def test_numbers_in_names_sort_as_numbers():
     names = ["a10b2", "a10b10", "a9", "b1", "a010", "7", "10"]
     assert sorted(names, key=lambda name: natural_order(Path(name))) == [
         "7",
@@ -26,18 +26,18 @@ def test_numbers_in_names_count_as_numbers():
 @pytest.mark.parametrize(
     ("name", "expected"), [("left-arm.mcap", "left_arm"), ("00.mcap", "robot_00"), ("---.mcap", "robot")]
 )
-def test_a_log_names_its_robot(name, expected):
+def test_a_robot_is_named_by_its_log(name, expected):
     assert robot_name(None, Path(name)) == expected
 
 
-def test_times_end_where_messages_do():
+def test_times_are_limited_to_the_range_of_messages():
     last = 2**31 * 1_000_000_000 - 1
     assert frame_stamps(Path("a"), [0, last], None, 2) == [0, last]
     with pytest.raises(InputError, match=r"a: times must be below 2\^31 s"):
         frame_stamps(Path("a"), [0, last + 1], None, 2)
 
 
-def test_a_log_appears_when_it_is_finished_or_not_at_all(tmp_path):
+def test_a_log_appears_only_when_it_is_finished(tmp_path):
     output = tmp_path / "a.mcap"
     with unfinished(output) as partial:
         partial.write_bytes(b"whole")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.pcd import _unpack_lzf, read_pcd, read_viewpoint
-from recordings import RECORDINGS, needs_recordings
+from support.recordings import RECORDINGS, needs_recordings
 
 HEADER = (
     "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\n"
@@ -29,7 +29,7 @@ def save(path: Path, text: str, data: bytes = b"") -> Path:
 
 
 def literal_lzf(data: bytes) -> bytes:
-    """LZF that copies nothing: runs of at most 32 bytes."""
+    """LZF data of literals alone, in runs of at most 32 bytes."""
     return b"".join(bytes([len(data[k : k + 32]) - 1]) + data[k : k + 32] for k in range(0, len(data), 32))
 
 
@@ -40,7 +40,7 @@ def compressed(points: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
-def test_the_three_kinds_hold_the_same(tmp_path, data):
+def test_the_three_encodings_hold_the_same_points(tmp_path, data):
     body = {"ascii": ROWS.encode(), "binary": POINTS.tobytes(), "binary_compressed": compressed(POINTS)}[data]
     columns, extra = read_pcd(save(tmp_path / "a.pcd", HEADER.format(data), body))
     assert (list(columns), extra) == (["x", "y", "z", "label"], 0)
@@ -53,7 +53,7 @@ def test_the_three_kinds_hold_the_same(tmp_path, data):
 def test_files_of_open3d_are_read_to_the_bit(tmp_path, options):
     o3d = pytest.importorskip("open3d")
     rng = np.random.default_rng(1)
-    # Rounded numbers repeat, so that the compressed file copies from near and far.
+    # Rounded numbers repeat, so that the compressed file has copies of several distances.
     positions = np.round(rng.normal(size=(5000, 3)) * 4).astype(np.float32)
     positions[:40] = rng.normal(size=(40, 3))
     labels = rng.integers(-3, 70000, size=(5000, 1)).astype(np.int32)
@@ -91,7 +91,7 @@ def test_extra_columns_of_a_text_are_counted_and_not_read(tmp_path):
     np.testing.assert_array_equal(columns["label"], [7, 7, 7])
 
 
-def test_a_number_that_its_type_cannot_hold_is_kept(tmp_path):
+def test_a_number_out_of_its_types_range_is_kept(tmp_path):
     columns, _ = read_pcd(save(tmp_path / "a.pcd", HEADER.format("ascii"), b"1 2 3 -1\n1 2 3 4\n1 2 3 nan\n"))
     np.testing.assert_array_equal(columns["label"], [-1, 4, np.nan])
 
@@ -106,21 +106,21 @@ def test_a_file_may_hold_no_points(tmp_path, data):
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
-    [("DATA ascii", "", "is no PCD file, or cut: its header has no line 'DATA'"),
+    [("DATA ascii", "", "is not a PCD file, or is cut: its header has no line 'DATA'"),
      ("DATA ascii", "DATA zip", "its data is 'zip'; expects ascii"),
      ("FIELDS x y z label", "", "FIELDS, SIZE, TYPE and COUNT do not fit together"),
      ("SIZE 4 4 4 4", "SIZE 4 4 4", "FIELDS, SIZE, TYPE and COUNT do not fit together"),
      ("SIZE 4 4 4 4", "SIZE 4 4 4 four", "line SIZE is '4 4 4 four'; expects integers"),
-     ("SIZE 4 4 4 4", "SIZE 4 4 4 3", "field 'label' has the unknown type U of 1 times 3 bytes"),
+     ("SIZE 4 4 4 4", "SIZE 4 4 4 3", "field 'label' has the unknown type U with 1 x 3 bytes"),
      ("COUNT 1 1 1 1", "COUNT 1 1 1 999999999999", "field 'label' has the unknown type"),
      ("COUNT 1 1 1 1", "COUNT 1 1 1 0", "field 'label' has the unknown type"),
      ("POINTS 3", "POINTS 4", "POINTS, WIDTH and HEIGHT do not fit together"),
      ("POINTS 3", "POINTS -3", "POINTS, WIDTH and HEIGHT do not fit together"),
      ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0 0", "VIEWPOINT is '0 0 0'; expects 7 numbers"),
      ("FIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1",
-      "FIELDS x y z label more\nSIZE 4 4 4 4 4\nTYPE F F F U U\nCOUNT 1 1 1 1 1", "announces 5 columns, but its rows"),
-     ("-1.5 nan 0 8", "", "announces 3 points, but it has 2 rows"),
-     ("4 5 6 9", "4 5 6 9\n4 5 6 9", "announces 3 points, but it has 4 rows"),
+      "FIELDS x y z label more\nSIZE 4 4 4 4 4\nTYPE F F F U U\nCOUNT 1 1 1 1 1", "gives 5 columns, but its rows"),
+     ("-1.5 nan 0 8", "", "gives 3 points, but it has 2 rows"),
+     ("4 5 6 9", "4 5 6 9\n4 5 6 9", "gives 3 points, but it has 4 rows"),
      ("4 5 6 9", "4 5", "row 3 has 2 columns, the first one 4"),
      ("4 5 6 9", "4 5 six 9", "row 3 is not numbers: '4 5 six 9'")],
 )  # fmt: skip
@@ -135,22 +135,22 @@ def test_damage_is_one_sentence(tmp_path, old, new, message):
 def test_a_file_cut_anywhere_is_never_read(tmp_path, data):
     body = {"ascii": ROWS.encode(), "binary": POINTS.tobytes(), "binary_compressed": compressed(POINTS)}[data]
     whole = HEADER.format(data).encode() + body
-    # A text may miss its last line break, and the last digit of its last number is not missed.
+    # A text file may lack its last line break, and a lost last digit cannot be detected.
     for length in range(len(whole) - (2 if data == "ascii" else 0)):
         (tmp_path / "a.pcd").write_bytes(whole[:length])
         with pytest.raises(InputError, match=r"a\.pcd: "):
             read_pcd(tmp_path / "a.pcd")
 
 
-def test_more_binary_points_than_announced_are_refused(tmp_path):
-    with pytest.raises(InputError, match="announces 3 points of 16 bytes, but it holds 64 bytes"):
+def test_more_binary_points_than_the_header_gives_are_refused(tmp_path):
+    with pytest.raises(InputError, match="gives 3 points of 16 bytes, but it holds 64 bytes"):
         read_pcd(save(tmp_path / "a.pcd", HEADER.format("binary"), POINTS.tobytes() + bytes(16)))
     read_pcd(save(tmp_path / "a.pcd", HEADER.format("binary"), POINTS.tobytes() + b"\n"))
 
 
 @settings(deadline=None)
 @given(st.binary(max_size=400))
-def test_whatever_bytes_follow_the_header_end_in_one_sentence(tmp_path_factory, body):
+def test_random_data_is_refused_in_one_sentence(tmp_path_factory, body):
     path = tmp_path_factory.getbasetemp() / "any.pcd"
     for data in ("ascii", "binary", "binary_compressed"):
         try:
@@ -166,7 +166,7 @@ copies = st.tuples(st.integers(3, 264), st.integers(1, 8192))
 
 @settings(deadline=None)
 @given(st.lists(st.one_of(literals, copies), max_size=30))
-def test_lzf_is_unpacked_as_its_pieces_say(pieces):
+def test_lzf_literals_and_copies_are_unpacked(pieces):
     packed, plain = bytearray(), bytearray()
     for piece in pieces:
         if isinstance(piece, bytes):
@@ -203,7 +203,7 @@ def test_a_viewpoint_without_a_direction_is_none(tmp_path, line):
 
 @needs_recordings
 def test_the_fourth_column_of_the_real_scans_is_the_label():
-    """Their rows have five columns for four fields: near points of two scans agree in the fourth alone."""
+    """The rows have five columns for four fields; near points of two scans agree in the fourth alone."""
     from scipy.spatial import cKDTree
 
     folder = RECORDINGS / "semantic_pcd" / "bki_sim"

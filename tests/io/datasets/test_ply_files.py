@@ -55,7 +55,7 @@ def test_points_with_labels_of_any_type(tmp_path: Path, kind: str) -> None:
     assert labels.tolist() == [1, 2, 3, 4, 5]
 
 
-def test_labels_that_are_none() -> None:
+def test_invalid_labels() -> None:
     assert raw_labels(np.array([3.0, -1.0, np.nan, np.inf])).tolist() == [3, 65535, 65535, 65535]
     assert raw_labels(np.array([-1, 70_000], np.int32)).tolist() == [65535, 70_000]
     assert raw_labels(np.array([2**32 - 1, 8], np.uint32)).tolist() == [65535, 8]
@@ -71,12 +71,12 @@ def test_a_mesh_cut_anywhere_is_never_read(tmp_path: Path, options: dict[str, ob
 
 
 @pytest.mark.parametrize("index", [-1, 5])
-def test_a_face_of_vertices_that_are_not_there(tmp_path: Path, index: int) -> None:
-    with pytest.raises(InputError, match=r"a\.ply: is damaged: a face names a vertex that is not there"):
+def test_a_vertex_index_out_of_range_is_refused(tmp_path: Path, index: int) -> None:
+    with pytest.raises(InputError, match=r"a\.ply: is damaged: a face has a vertex index out of range"):
         read_labelled_ply(save(tmp_path / "a.ply", [[0, 1, index]], [7]))
 
 
-def test_what_a_mesh_needs(tmp_path: Path) -> None:
+def test_missing_properties_of_a_mesh_are_named(tmp_path: Path) -> None:
     for path, message in (
         (save(tmp_path / "a.ply", [[0, 1, 2]], [7], name="quality"), "neither its faces nor its vertices have labels"),
         (save(tmp_path / "b.ply", [[0, 1, 2]], [7], list_name="edges"), "its faces have no list 'vertex_indices'"),
@@ -85,7 +85,7 @@ def test_what_a_mesh_needs(tmp_path: Path) -> None:
             read_labelled_ply(path)
     points = np.array([(0, 0, 1)], [("x", "f4"), ("z", "f4"), ("label", "u1")])
     PlyData([PlyElement.describe(points, "vertex")]).write(str(tmp_path / "c.ply"))
-    with pytest.raises(InputError, match=r"c\.ply: its vertices have no number 'y'"):
+    with pytest.raises(InputError, match=r"c\.ply: its vertices have no numeric property 'y'"):
         read_labelled_ply(tmp_path / "c.ply")
     with pytest.raises(InputError, match=r"d\.ply: cannot be read"):
         read_labelled_ply(tmp_path / "d.ply")

@@ -1,4 +1,4 @@
-"""Files of poses: TUM, KITTI with and without calibration."""
+"""Pose files: TUM, KITTI with and without calibration."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def test_kitti_rows_are_matrices(tmp_path):
     assert table.poses[2] is None
 
 
-def test_kitti_camera_poses_become_the_lidars_with_calib(tmp_path):
-    """Where a point of the lidar is in the first lidar's frame, reached by way of the cameras."""
+def test_kitti_camera_poses_become_lidar_poses_with_calib(tmp_path):
+    """A lidar point in the first lidar frame, computed through the camera frames."""
     Tr = np.eye(4)
     Tr[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
     Tr[:3, 3] = 0.1, -0.2, -0.3
@@ -51,7 +51,7 @@ def test_kitti_camera_poses_become_the_lidars_with_calib(tmp_path):
     point_lidar = np.array([3.0, 1.0, -0.5, 1.0])
     point_first_camera = pose(2) @ (Tr @ point_lidar)
     np.testing.assert_allclose(Tr @ (table.poses[1] @ point_lidar), point_first_camera, atol=1e-12)
-    # Forwards for the camera, its z, is forwards for the lidar, its x.
+    # The camera's z axis (forward) is the lidar's x axis.
     ahead = np.eye(4)
     ahead[2, 3] = 5.0
     table = read_poses(save(tmp_path / "poses.txt", kitti_row(ahead)))
@@ -61,7 +61,7 @@ def test_kitti_camera_poses_become_the_lidars_with_calib(tmp_path):
 @pytest.mark.parametrize("lines", [("P0: " + "1 " * 12,), ("Tr: " + "nan " * 12,)])
 def test_a_calibration_without_the_lidar_is_refused(tmp_path, lines):
     save(tmp_path / "calib.txt", *lines)
-    with pytest.raises(InputError, match=r"calib\.txt: has no usable row 'Tr:', lidar to camera; mend it, or take it"):
+    with pytest.raises(InputError, match=r"calib\.txt: has no usable row 'Tr:' \(lidar to camera\); correct it"):
         read_poses(save(tmp_path / "poses.txt", kitti_row(pose(0))))
 
 
@@ -75,7 +75,7 @@ def test_tum_poses_are_interpolated_and_rounded_stamps_forgiven(tmp_path):
     rotations = Rotation.from_matrix([pose(0)[:3, :3], pose(1)[:3, :3]])
     np.testing.assert_allclose(T[:3, :3], Slerp([0, 1], rotations)(0.5).as_matrix(), atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], (pose(0)[:3, 3] + pose(1)[:3, 3]) / 2, atol=1e-6)
-    # Up to a millisecond from a row is that row; farther there is nothing before the first and in a gap.
+    # Within 1 ms of a row the result is that row; otherwise there is none before the first row and in a gap.
     for near in (start - 900_000, start + 7_000_900_000, start + 6_999_100_000):
         assert table.at(near) is not None
     for far in (start - 1_100_000, start + 1_000_000_000, start + 7_001_100_000):
@@ -83,7 +83,7 @@ def test_tum_poses_are_interpolated_and_rounded_stamps_forgiven(tmp_path):
     np.testing.assert_allclose(table.at(start + 7_000_900_000), pose(9), atol=1e-12)
 
 
-def test_a_tum_row_that_is_no_pose_is_none(tmp_path):
+def test_a_tum_row_that_is_not_finite_has_no_pose(tmp_path):
     table = read_poses(save(tmp_path / "a.txt", tum_row("1", pose(0)), "2 0 0 0 0 0 0 0", "3 nan 0 0 0 0 0 1"))
     assert [T is None for T in table.poses] == [False, True, True]
     assert table.at(2_000_000_000) is None
@@ -99,6 +99,6 @@ def test_a_tum_row_that_is_no_pose_is_none(tmp_path):
      (["soon 2 3 0 0 0 1 0"], r"a\.txt line 1: 'soon' is not a time"),
      (["1 2 3 a b c d e"], r"a\.txt line 1: expects numbers")],
 )  # fmt: skip
-def test_what_is_no_file_of_poses(tmp_path, lines, message):
+def test_other_files_are_refused(tmp_path, lines, message):
     with pytest.raises(InputError, match=message):
         read_poses(save(tmp_path / "a.txt", *lines))

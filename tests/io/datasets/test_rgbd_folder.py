@@ -1,4 +1,4 @@
-"""Folders of depth pictures become logs: small ones made here, and real ones where they are at hand."""
+"""Import of folders of depth images: small ones made here, and real ones where available."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError
 from octoreplay.io.datasets.rgbd_folder import import_rgbd
 from octoreplay.records import ClassTable, SemanticClass
-from recordings import RECORDINGS, needs_recordings
-from stored_messages import matrix, pixels, read_messages
+from support.recordings import RECORDINGS, needs_recordings
+from support.stored_messages import matrix, pixels, read_messages
 
 K = "4 0 2.5\n0 4.5 1.5\n0 0 1\n"
 
@@ -72,7 +72,7 @@ def tum(folder: Path, stamps: tuple[str, ...] = ("1305031102.000000123", "130503
 
 
 def camera_poses(messages) -> list[tuple[int, np.ndarray]]:
-    """The camera's poses as a reader of the log finds them: odometry after the static transform."""
+    """Camera poses from the log: odometry and the static transform."""
     [(_, tf)] = next(found for topic, found in messages.items() if topic == "/tf_static")
     static = tf.transforms[0].transform
     T_body_camera = matrix(static.translation, static.rotation)
@@ -111,7 +111,7 @@ def test_intrinsics_one_folder_up_and_by_option(tmp_path):
     assert (given.fx, given.fy, given.cx, given.cy) == (5.0, 6.0, 2.0, 1.0)
 
 
-def test_intrinsics_are_not_guessed_for_another_size(tmp_path):
+def test_published_intrinsics_are_used_for_their_size_only(tmp_path):
     folder = seven_scenes(tmp_path / "in", count=1)
     (folder / "camera-intrinsics.txt").unlink()
     with pytest.raises(ConfigError, match=r"is 6x4 pixels, and the folder has no intrinsics; give"):
@@ -146,7 +146,7 @@ def test_times_from_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1\n2\n", "has 2 times; the folder has 3 frames, of which 3 are taken"), ("1\n1\n2\n", "do not ascend"),
+    [("1\n2\n", "has 2 times; the folder has 3 frames, 3 of them chosen"), ("1\n1\n2\n", "do not ascend"),
      ("1\nsoon\n2\n", "line 2: 'soon' is not a time"), ("1\nnan\n2\n", "line 2: 'nan' is not a time"),
      ("-2\n-1\n2\n", "must not be negative")],
 )  # fmt: skip
@@ -159,7 +159,7 @@ def test_times_that_do_not_fit(tmp_path, text, message):
 def test_tum_has_its_own_stamps_and_interpolated_poses(tmp_path):
     summary = import_rgbd(tum(tmp_path / "in"), tmp_path / "a.mcap", intrinsics=(4, 4, 2.5, 1.5))
     messages = read_messages(tmp_path / "a.mcap")
-    # The third picture lies beyond the last pose.
+    # The third image is later than the last pose.
     assert (summary.layout, summary.num_frames, summary.num_without_pose) == ("TUM RGB-D", 2, 1)
     assert [t for t, _ in images(messages, "depth")] == [1305031102_000000123, 1305031102_050000000]
     rotations = Rotation.from_matrix([pose(0)[:3, :3], pose(1)[:3, :3]])
@@ -227,9 +227,9 @@ def repaint(values: np.ndarray):
     ("spoiler", "message"),
     [
         (damage_picture, r"frame-000005\.depth\.png: is damaged"),
-        (spoil("frame-000005.depth.png", "text"), r"frame-000005\.depth\.png: is not a picture"),
+        (spoil("frame-000005.depth.png", "text"), r"frame-000005\.depth\.png: is not an image"),
         (repaint(np.zeros((4, 6, 3), np.uint8)), "16-bit grey PNG, this one has 8 bits in 3"),
-        (repaint(np.zeros((4, 7), np.uint16)), "is 7x4 pixels, but the depth pictures are 6x4"),
+        (repaint(np.zeros((4, 7), np.uint16)), "is 7x4 pixels, but the depth images are 6x4"),
         (spoil("frame-000005.pose.txt", "1 2 3"), r"frame-000005\.pose\.txt: expects a 4x4 matrix, got 3 numbers"),
         (spoil("frame-000005.pose.txt", "a b c"), r"pose\.txt line 1: expects numbers, got 'a b c'"),
         (spoil("frame-000005.pose.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1"), "is not a rotation"),
@@ -239,7 +239,7 @@ def repaint(values: np.ndarray):
         (lambda f: [path.unlink() for path in f.glob("*.png")], "no RGB-D sequence found; looked for"),
     ],
 )  # fmt: skip
-def test_what_is_damaged_is_named_and_nothing_is_left(tmp_path, spoiler, message):
+def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
     folder = seven_scenes(tmp_path / "in")
     spoiler(folder)
     (tmp_path / "out").mkdir()
@@ -272,7 +272,7 @@ def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
         ({"rate": 1.0, "intrinsics": (0, 1, 2, 3)}, ConfigError, "intrinsics: expects 4 numbers"),
         ({"rate": 1.0, "depth_unit": 0.0}, ConfigError, "depth_unit: 0 must"),
         ({"times": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
-        ({"rate": 1.0, "labels": Path("missing")}, InputError, "missing: is not a folder of label pictures"),
+        ({"rate": 1.0, "labels": Path("missing")}, InputError, "missing: is not a folder of label images"),
     ],
 )
 def test_options_that_do_not_fit(tmp_path, options, error, message):
@@ -281,13 +281,13 @@ def test_options_that_do_not_fit(tmp_path, options, error, message):
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_label_pictures_of_another_size_or_name_are_refused(tmp_path):
+def test_label_images_of_another_size_or_name_are_refused(tmp_path):
     folder = scannet(tmp_path / "in")
     save_png(folder / "label" / "9.png", np.zeros((8, 12), np.uint8))
-    with pytest.raises(InputError, match=r"9\.png: is 12x8 pixels, but the depth pictures are 6x4; resize it"):
+    with pytest.raises(InputError, match=r"9\.png: is 12x8 pixels, but the depth images are 6x4; resize it"):
         import_rgbd(folder, tmp_path / "a.mcap", rate=1.0)
     save_png(tmp_path / "other" / "x.png", np.zeros((4, 6), np.uint8))
-    with pytest.raises(InputError, match=r"other: no label picture is named like"):
+    with pytest.raises(InputError, match=r"other: no label image has the name of"):
         import_rgbd(folder, tmp_path / "a.mcap", rate=1.0, labels=tmp_path / "other")
 
 
@@ -296,7 +296,7 @@ def test_label_pictures_of_another_size_or_name_are_refused(tmp_path):
     [("groundtruth.txt", "1.0 2 3\n", "line 1: expects 8 numbers in every row"),
      ("groundtruth.txt", "soon 1 2 3 0 0 0 1\n", "'soon' is not a time"),
      ("depth.txt", "1.0\n", "line 1: expects a stamp and a file name"),
-     ("depth.txt", "# nothing\n", "lists no depth pictures"),
+     ("depth.txt", "# nothing\n", "lists no depth images"),
      ("depth.txt", "1305031102.05 depth/none.png\n", "none.png: not found")],
 )  # fmt: skip
 def test_damaged_tum_tables(tmp_path, name, text, message):

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from log_factory import (
+from octoreplay.errors import InputError
+from octoreplay.io.messages.decoders import DamagedMessageError, UndefinedTypeError, decode
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     SECOND,
     Entry,
@@ -22,8 +24,6 @@ from log_factory import (
     ros2,
     ros_row,
 )
-from octoreplay.errors import InputError
-from octoreplay.io.messages.decoders import DamagedMessageError, UndefinedTypeError, decode
 
 ODOMETRY = Entry("/odom", "nav_msgs/msg/Odometry", ros2.odometry(5 * SECOND, (1, 2, 3)), 0)
 IMAGE = Entry("/image", "sensor_msgs/msg/Image", ros2.image(5, np.ones((2, 3), np.uint16), "16UC1"), 0)

@@ -10,21 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from log_factory import (
-    FOXGLOVE_ENCODINGS,
-    IDENTITY,
-    SECOND,
-    Entry,
-    Factory,
-    Row,
-    foxglove_pose,
-    foxglove_row,
-    foxglove_stamp,
-    foxglove_transform,
-    ros1_row,
-    ros2,
-    ros_row,
-)
 from octoreplay.errors import OctoreplayError
 from octoreplay.io.messages import sensor_messages
 from octoreplay.io.messages.decoders import DamagedMessageError
@@ -43,6 +28,21 @@ from octoreplay.io.messages.sensor_messages import (
     kind_of,
 )
 from octoreplay.transforms import pose_matrix
+from support.log_factory import (
+    FOXGLOVE_ENCODINGS,
+    IDENTITY,
+    SECOND,
+    Entry,
+    Factory,
+    Row,
+    foxglove_pose,
+    foxglove_row,
+    foxglove_stamp,
+    foxglove_transform,
+    ros1_row,
+    ros2,
+    ros_row,
+)
 
 STAMP = 1_700_000_000 * SECOND + 123_456_789
 STAMPED = {"timestamp": foxglove_stamp(STAMP), "frame_id": "camera"}

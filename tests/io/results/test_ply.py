@@ -7,7 +7,7 @@ from plyfile import PlyData
 from octoreplay.errors import OutputError
 from octoreplay.io.results import ply
 from octoreplay.records import LeafTable
-from result_factory import leaf_table
+from support.result_factory import leaf_table
 
 COLORS = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9], [250, 251, 252]], dtype=np.uint8)
 

@@ -9,7 +9,7 @@ from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import message, time_message
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
-from result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
+from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
 
 
 class CountedFile:
@@ -37,7 +37,7 @@ def test_a_written_result_is_read(tmp_path: Path) -> None:
         assert reader.metrics() == METRICS
         assert reader.robots == ("alpha", "beta")
         assert reader.class_table == CLASSES
-        assert reader.config == team(tmp_path)
+        assert reader.config == team(tmp_path).to_config()
         assert reader.prior == 0.0
         written = summary(METRICS)
         read = reader.summary(reader.metrics())
@@ -49,10 +49,10 @@ def test_a_written_result_is_read(tmp_path: Path) -> None:
 def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:
     values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
     config = team(tmp_path).with_parameters(values)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary(METRICS))
     with ResultReader(tmp_path / "out.mcap") as reader:
-        assert reader.config == config
+        assert reader.config == config.to_config()
         assert reader.prior == config.map.prior(2)
 
 

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 from pathlib import Path
 
@@ -11,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.results.result_writer import ResultWriter, _quaternion, partial_path
-from result_factory import (
-    CLASSES,
+from support.result_factory import (
     SECOND,
     START,
     leaf_table,
@@ -166,7 +164,7 @@ def test_metadata_describe_the_run(tmp_path: Path) -> None:
 
 def test_hash_fingerprints_the_whole_input(tmp_path: Path) -> None:
     config = team(tmp_path).with_parameters({"hash": True})
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     assert json.loads(metadata(tmp_path / "out.mcap")["inputs"]["alpha.bag"])["method"] == "sha256"
 
@@ -180,7 +178,7 @@ def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
 def test_the_result_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     out.write_text("the result of yesterday")
-    with ResultWriter(out, team(tmp_path), CLASSES) as writer:
+    with ResultWriter(out, team(tmp_path)) as writer:
         writer.write_metrics(tick_metrics(1))
         assert out.read_text() == "the result of yesterday"
         assert partial_path(out).exists()
@@ -224,7 +222,7 @@ def test_an_output_that_cannot_be_written_is_refused_at_once(tmp_path: Path, nam
     config = team(tmp_path)
     (tmp_path / "none").mkdir() if name.startswith("none/..") else None
     with pytest.raises(OutputError, match=sentence):
-        ResultWriter(tmp_path / name, config, CLASSES)
+        ResultWriter(tmp_path / name, config)
     assert (tmp_path / "alpha.bag").read_bytes() == b"log of alpha"
 
 
@@ -232,21 +230,21 @@ def test_a_missing_input_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
     config = team(tmp_path)
     (tmp_path / "beta.bag").unlink()
     with pytest.raises(InputError, match=r"beta\.bag: cannot be read"):
-        ResultWriter(tmp_path / "out.mcap", config, CLASSES)
+        ResultWriter(tmp_path / "out.mcap", config)
     assert [path.name for path in tmp_path.iterdir()] == ["alpha.bag"]
 
 
 def test_logs_below_the_results_folder_are_stored_relative_to_it(tmp_path: Path) -> None:
     config = team(tmp_path)
     (tmp_path / "out").mkdir()
-    with ResultWriter(tmp_path / "out" / "out.mcap", config, CLASSES) as writer:
+    with ResultWriter(tmp_path / "out" / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     text = metadata(tmp_path / "out" / "out.mcap")["config"]["team_file"]
     assert str(tmp_path.resolve() / "alpha.bag") in text
 
 
-def test_the_class_table_is_stored_even_where_the_configuration_has_none(tmp_path: Path) -> None:
-    config = dataclasses.replace(team(tmp_path), classes=None)
-    with ResultWriter(tmp_path / "out.mcap", config, CLASSES) as writer:
+def test_the_class_table_is_stored(tmp_path: Path) -> None:
+    config = team(tmp_path)
+    with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary([tick_metrics(1)]))
     assert "name: ground" in metadata(tmp_path / "out.mcap")["config"]["team_file"]

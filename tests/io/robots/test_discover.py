@@ -7,7 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.class_file import class_table
+from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, parse_team
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import ConfigError, InputError, OctoreplayError
+from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.describe import LogDescription, describe
+from octoreplay.io.robots.discover import discover, resolve
+from octoreplay.io.robots.robot_log import RobotLog
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     HEIGHT,
     IDENTITY,
@@ -30,15 +41,6 @@ from log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-from octoreplay.config.class_file import class_table
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.config.team_file import dump_team, parse_team
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import ConfigError, InputError, OctoreplayError
-from octoreplay.io.messages.sensor_messages import Kind, kind_of
-from octoreplay.io.robots.discover import LogDescription, describe, discover, resolve
-from octoreplay.io.robots.robot_log import RobotLog
 
 START = 100 * SECOND
 DEPTH, LABELS, INFO = "/camera/depth/image_raw", "/camera/labels/image_raw", "/camera/depth/camera_info"
@@ -48,7 +50,7 @@ def run_of(*robots: RobotConfig, **fields) -> RunConfig:
     return RunConfig(robots=robots, **fields)
 
 
-def count_frames(robot: RobotConfig, table=None) -> int:
+def count_frames(robot: ResolvedRobot, table=None) -> int:
     with RobotLog(robot, TimeConfig(), table) as log:
         return len(list(log.frames()))
 
@@ -76,19 +78,20 @@ def test_a_robot_is_named_by_its_file_and_its_topics_are_found(tmp_path, contain
         path = write_rosbag2(tmp_path / "rover", robot_entries())
     (robot,) = discover([path])
     label_info = None if container == "bag" else "/label_info"
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         "rover", (path,), depth_topic=DEPTH, label_topic=LABELS, camera_info_topic=INFO, pose_topic="/odom",
         label_info_topic=label_info, map_frame="map", sensor_frame="camera",
     )  # fmt: skip
     assert count_frames(robot) == 6
 
 
-def test_what_was_found_survives_a_team_file(tmp_path):
+def test_a_resolved_run_survives_a_team_file(tmp_path):
     path = write_mcap(tmp_path / "rover.mcap", robot_entries())
     config = resolve(run_of(*discover([path])))
     text = dump_team(config, tmp_path)
-    assert parse_team(text, source="team", folder=tmp_path) == config
-    assert resolve(config) == config
+    assert parse_team(text, name="team", folder=tmp_path) == config.to_config()
+    assert config.robots[0].log_span_ns == (START, START + 5 * SECOND // 4)
+    assert resolve(config) is config
 
 
 def test_several_robots_of_one_log_are_named_by_namespace(tmp_path):
@@ -103,7 +106,7 @@ def test_several_robots_of_one_log_are_named_by_namespace(tmp_path):
         assert all(topic.startswith(f"/{robot.robot_id}/") for topic in own)
         assert robot.sensor_frame == f"{robot.robot_id}/camera"
         assert count_frames(robot) == count
-    # A team file that only names them gives the same, and one that names another says which there are.
+    # A team file with their ids alone gives the same robots; another id is refused with the known ones.
     assert resolve(run_of(*(RobotConfig(r.robot_id, (path,)) for r in robots))).robots == robots
     with pytest.raises(ConfigError, match="holds the robots a, b; use one of these names as id"):
         resolve(run_of(RobotConfig("c", (path,))))
@@ -124,7 +127,7 @@ def test_one_namespaced_robot_is_named_by_its_file(tmp_path):
     assert (robot.robot_id, robot.pose_topic) == ("monday", "/husky/odom")
 
 
-def test_equal_file_names_take_the_folders_names(tmp_path):
+def test_equal_file_names_are_replaced_by_the_folders_names(tmp_path):
     paths = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -216,7 +219,7 @@ def test_the_map_frame_of_tf_is_the_root_above_the_sensor(tmp_path):
     ]
     (robot,) = discover([write_mcap(tmp_path / "r.mcap", entries)])
     assert robot.map_frame == "earth"
-    with pytest.raises(InputError, match="TF knows no frame above the sensor's frame 'lens'"):
+    with pytest.raises(InputError, match="TF has no frame above the sensor's frame 'lens'"):
         resolve(run_of(replace(robot, map_frame=None, sensor_frame="lens")))
 
 
@@ -227,11 +230,11 @@ def test_the_map_frame_of_tf_is_the_root_above_the_sensor(tmp_path):
         (INFO, f"there is no CameraInfo for '{DEPTH}'; give intrinsics"),
         (
             "/odom",
-            r"no poses \(.*\) for robot 'r'; give pose_file: .*, or, if the sensor stands still, pose_topic",
+            r"no poses \(.*\) for robot 'r'; give pose_file: .*, or, if the sensor does not move, pose_topic",
         ),
     ],
 )
-def test_what_a_log_lacks_gets_one_sentence(tmp_path, drop, sentence):
+def test_missing_topics_are_named_in_one_sentence(tmp_path, drop, sentence):
     keep = {DEPTH: ("/odom", "/tf_static")}.get(drop)
     entries = [e for e in robot_entries() if e.topic != drop and (keep is None or e.topic in keep)]
     path = write_mcap(tmp_path / "r.mcap", entries)
@@ -242,7 +245,7 @@ def test_what_a_log_lacks_gets_one_sentence(tmp_path, drop, sentence):
     assert str(caught.value) in summary.missing
 
 
-def test_a_sensor_that_stands_still(tmp_path):
+def test_a_sensor_that_does_not_move(tmp_path):
     path = write_mcap(tmp_path / "r.mcap", robot_entries(poses="none"))
     (robot,) = resolve(run_of(RobotConfig("r", (path,), pose_topic="/tf_static"))).robots
     assert robot.map_frame == "base_link"
@@ -256,14 +259,18 @@ def test_a_sensor_that_stands_still(tmp_path):
     ("role", "name", "sentence"),
     [
         ("depth_topic", "/depth", "topic '/depth' not found; image topics: '/camera/depth/image_raw', '/camera/labels"),
-        ("depth_topic", "/odom", "topic '/odom' is of type nav_msgs/msg/Odometry, no depth_topic; image topics: "),
+        (
+            "depth_topic",
+            "/odom",
+            "topic '/odom' is of type nav_msgs/msg/Odometry and cannot be the depth_topic; image topics: ",
+        ),
         ("pose_topic", "/pose", "topic '/pose' not found; pose topics: '/odom', '/tf_static'"),
         ("cloud_topic", "/points", "topic '/points' not found; there are no point cloud or laser scan topics"),
         ("camera_info_topic", "/x", "topic '/x' not found; CameraInfo topics: '/camera/depth/camera_info'"),
         ("label_info_topic", "/x", "topic '/x' not found; LabelInfo topics: '/label_info'"),
     ],
 )
-def test_named_topics_must_be_there(tmp_path, role, name, sentence):
+def test_named_topics_must_exist(tmp_path, role, name, sentence):
     path = write_mcap(tmp_path / "r.mcap", robot_entries())
     with pytest.raises(InputError, match=f"r.mcap: {sentence}"):
         resolve(run_of(RobotConfig("r", (path,), **{role: name})))
@@ -276,14 +283,14 @@ def test_named_topics_are_kept(tmp_path):
         "r", (path,), label_topic="/other/labels", intrinsics=(1.0, 1.0, 0.0, 0.0), map_frame="here", sensor_frame="eye"
     )
     (robot,) = resolve(run_of(given)).robots
-    assert robot == replace(given, depth_topic=DEPTH, pose_topic="/odom", label_info_topic="/label_info")
+    assert robot.to_config() == replace(given, depth_topic=DEPTH, pose_topic="/odom", label_info_topic="/label_info")
 
 
 def test_the_class_table_is_that_of_the_logs_united_over_robots(tmp_path):
     one = write_mcap(tmp_path / "one.mcap", robot_entries())
     entries = [e for e in robot_entries() if e.topic != "/label_info"]
     info = ros2.label_info(START, {1: "ground", 9: "car"})
-    # The second robot's LabelInfo stands at the end of its log.
+    # The second robot's LabelInfo is at the end of its log.
     two = write_mcap(
         tmp_path / "two.mcap", [*entries, Entry("/label_info", "vision_msgs/msg/LabelInfo", info, START + 9)]
     )
@@ -307,7 +314,7 @@ def test_a_team_without_labels_maps_occupancy(tmp_path):
 def test_labels_without_a_table_or_of_some_robots_only_are_refused(tmp_path):
     entries = [e for e in robot_entries() if e.topic != "/label_info"]
     path = write_mcap(tmp_path / "r.mcap", entries)
-    with pytest.raises(ConfigError, match=f"labels on '{LABELS}' but no LabelInfo says what they mean; give 'classes'"):
+    with pytest.raises(ConfigError, match=f"no LabelInfo names the labels on '{LABELS}'; give 'classes'"):
         resolve(run_of(*discover([path])))
     with_labels = write_mcap(tmp_path / "with.mcap", robot_entries())
     without = write_mcap(tmp_path / "without.mcap", robot_entries(labels=False))
@@ -316,19 +323,19 @@ def test_labels_without_a_table_or_of_some_robots_only_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("with_label", [True, False])
-def test_clouds_are_taken_where_there_is_no_depth(tmp_path, with_label):
+def test_clouds_are_used_without_depth(tmp_path, with_label):
     path = write_mcap(tmp_path / "r.mcap", cloud_entries(with_label=with_label))
     (robot,) = discover([path])
     assert (robot.depth_topic, robot.cloud_topic, robot.sensor_frame) == (None, "/points", "camera")
     assert count_frames(robot) == 1
     if with_label:
-        with pytest.raises(ConfigError, match="labels on '/points' but no LabelInfo"):
+        with pytest.raises(ConfigError, match="no LabelInfo names the labels on '/points'"):
             resolve(run_of(robot))
     else:
         assert resolve(run_of(robot)).classes.names == ("occupied",)
 
 
-def test_describe_tells_robots_topics_rates_and_overlap(tmp_path):
+def test_describe_gives_robots_topics_rates_and_overlap(tmp_path):
     first = write_mcap(tmp_path / "a.mcap", robot_entries(num_frames=9))
     second = write_mcap(tmp_path / "b.mcap", robot_entries(start_ns=START + SECOND, num_frames=9))
     description = describe([first, second])
@@ -360,7 +367,7 @@ def test_describe_lists_what_is_missing_instead_of_raising(tmp_path):
     assert any("no poses" in sentence for sentence in a)
     assert any("no transform from 'camera' to 'base_link'" in sentence for sentence in b)
     assert any("the log holds no messages" in sentence for sentence in c)
-    assert any("no LabelInfo says what they mean" in sentence for sentence in description.missing)
+    assert any("no LabelInfo names the labels" in sentence for sentence in description.missing)
     assert description.overlap_ns is not None
     description = describe([tmp_path / "missing.mcap", paths[0]])
     assert [log.error for log in description.logs] == [f"{tmp_path / 'missing.mcap'}: no such file", None]
@@ -384,7 +391,7 @@ def compressed(topic: str, data: bytes, form: str) -> Entry:
 
 
 def replaced(*entries: Entry, **fields) -> list[Entry]:
-    """A robot's messages, with all of the topics of some others replaced by these."""
+    """A robot's messages, with those of the given messages' topics replaced."""
     hints = {DEPTH: ("depth",), LABELS: ("label", "semantic")}
     drop = {topic for topic in hints if any(hint in entry.topic for entry in entries for hint in hints[topic])}
     return [*(e for e in robot_entries(**fields) if e.topic not in drop), *entries]
@@ -409,7 +416,7 @@ def test_encoded_depth_and_labels_are_found(tmp_path):
 @pytest.mark.parametrize(
     "data", [png(label_pixels(0)), png(COLORS), cv2.imencode(".jpg", COLORS)[1].tobytes()], ids=["ids", "png", "jpeg"]
 )
-def test_encoded_images_are_labels_where_their_name_says_so(tmp_path, data):
+def test_compressed_images_are_labels_by_their_name(tmp_path, data):
     (robot,) = discover([write_mcap(tmp_path / "a.mcap", replaced(compressed("/front/semantics", data, "")))])
     assert robot.label_topic == "/front/semantics"
     other = compressed("/front/rgb", data, "")
@@ -419,7 +426,7 @@ def test_encoded_images_are_labels_where_their_name_says_so(tmp_path, data):
 
 
 @pytest.mark.parametrize("form", ["rgb8", "bgr8", "png", "jpeg"])
-def test_ids_are_taken_before_their_picture_in_colours(tmp_path, form):
+def test_ids_are_preferred_to_colours(tmp_path, form):
     topic = "/camera/labels/colored"
     if form in ("rgb8", "bgr8"):
         entry = image_entry(topic, COLORS.reshape(HEIGHT, -1), form)
@@ -444,7 +451,7 @@ def test_confidences_go_with_labels_of_their_size(tmp_path):
     assert (robot.label_topic, robot.confidence_topic) == (None, None)
 
 
-def test_laser_scans_are_taken_where_there_is_nothing_else(tmp_path):
+def test_laser_scans_are_used_without_depth_and_clouds(tmp_path):
     def log(name: str, *topics: str, cloud: bool):
         scans = [
             Entry(topic, "sensor_msgs/msg/LaserScan", ros2.scan(START, [1.0, 2.0], frame_id="camera"), START)
@@ -468,7 +475,7 @@ def test_laser_scans_are_taken_where_there_is_nothing_else(tmp_path):
     assert resolve(run_of(named)).robots[0].cloud_topic == "/scan"
 
 
-def test_a_cloud_with_labels_is_taken_before_others_and_a_field_can_be_named(tmp_path):
+def test_a_cloud_with_labels_is_preferred_and_a_field_can_be_named(tmp_path):
     plain = cloud_entries(with_label=False)[-1]._replace(topic="/raw")
     path = write_mcap(tmp_path / "r.mcap", [*cloud_entries(with_label=True), plain])
     (robot,) = discover([path])
@@ -480,7 +487,7 @@ def test_a_cloud_with_labels_is_taken_before_others_and_a_field_can_be_named(tmp
         resolve(run_of(replace(given, label_field=None), classes=table))
 
 
-def test_transforms_are_poses_as_odometry_is(tmp_path):
+def test_transforms_are_poses_like_odometry(tmp_path):
     vicon = [
         Entry("/vicon", "geometry_msgs/msg/TransformStamped",
               ros2.tf(("world", "base_link", stamp, (1, 2, 3), IDENTITY)).transforms[0], stamp)
@@ -503,7 +510,7 @@ def test_a_path_is_a_pose_topic_even_where_it_is_empty_at_first(tmp_path):
     assert count_frames(robot) == 2
 
 
-def test_a_pose_file_takes_the_place_of_pose_topics(tmp_path):
+def test_a_pose_file_replaces_pose_topics(tmp_path):
     trajectory = tmp_path / "tum.txt"
     trajectory.write_text("100 1 2 3 0 0 0 1\n100.25 1 2 3 0 0 0 1\n")
     path = write_mcap(tmp_path / "r.mcap", robot_entries(poses="none"))
@@ -513,7 +520,7 @@ def test_a_pose_file_takes_the_place_of_pose_topics(tmp_path):
 
 
 def foxglove_rows(encoding: str, namespace: str = "") -> list[Row]:
-    """One frame of a robot that speaks Foxglove's schemas."""
+    """One frame of a robot with Foxglove's schemas."""
     camera, base = f"{namespace}camera", f"{namespace}base"
     head = {"timestamp": foxglove_stamp(START), "frame_id": camera}
     size = {"width": WIDTH, "height": HEIGHT}
@@ -536,10 +543,10 @@ def foxglove_rows(encoding: str, namespace: str = "") -> list[Row]:
 
 
 @pytest.mark.parametrize("encoding", FOXGLOVE_ENCODINGS)
-def test_a_robot_that_speaks_foxgloves_schemas_is_found(tmp_path, encoding):
+def test_a_robot_with_foxglove_schemas_is_found(tmp_path, encoding):
     path = write_rows(tmp_path / "r.mcap", foxglove_rows(encoding))
     (robot,) = discover([path])
-    assert robot == RobotConfig(
+    assert robot.to_config() == RobotConfig(
         "r", (path,), depth_topic="/camera/depth", label_topic="/camera/labels",
         camera_info_topic="/camera/calibration", pose_topic="/camera/tf", map_frame="map", sensor_frame="camera",
     )  # fmt: skip
@@ -549,7 +556,7 @@ def test_a_robot_that_speaks_foxgloves_schemas_is_found(tmp_path, encoding):
     assert (details["/camera/depth"], details["/camera/labels"]) == ("16UC1 12x8", "8UC1 12x8")
 
 
-def test_a_wrong_name_offers_what_there_is_in_every_schema(tmp_path):
+def test_a_wrong_name_lists_the_topics_of_every_schema(tmp_path):
     entry = compressed("/rear/depth", b"\0" * 12 + png(depth_pixels(0)), "16UC1; compressedDepth png")
     rows = [*foxglove_rows("protobuf"), *map(ros_row, [*robot_entries(), entry])]
     path = write_rows(tmp_path / "r.mcap", rows)
@@ -570,12 +577,12 @@ def test_a_wrong_name_offers_what_there_is_in_every_schema(tmp_path):
 
 
 def check_nothing_else_is_raised(path) -> LogDescription:
-    """``info`` describes the log, and finding and reading its robots gives frames or a sentence."""
+    """The log is described, and finding and reading its robots gives frames or an error of the package."""
     description = describe([path])
     for step in (
         lambda: discover([path]),
         lambda: resolve(run_of(RobotConfig("r", (path,)))),
-        lambda: [count_frames(summary.robot) for summary in description.robots],
+        lambda: [count_frames(ResolvedRobot.from_config(summary.robot, None)) for summary in description.robots],
     ):
         try:
             step()
@@ -609,13 +616,13 @@ def test_garbage_on_topics_of_known_types(tmp_path, data, topics, encoding):
 @pytest.mark.parametrize(
     "schema", [b"", b"\xff\xfe", b"\x0a\x03abc", b"uint8 x\n", b"float64 header\n", b"string data\n"]
 )
-def test_definitions_that_are_none_or_of_another_type(tmp_path, encoding, schema):
+def test_missing_or_wrong_definitions(tmp_path, encoding, schema):
     rows = [*map(ros_row, robot_entries())] if encoding == "ros2" else foxglove_rows(encoding)
     check_nothing_else_is_raised(write_rows(tmp_path / "r.mcap", [row._replace(schema=schema) for row in rows]))
 
 
 def test_messages_of_other_types_on_all_topics(tmp_path):
-    """Every topic begins with a message of a type that is not used, and with one of another that is."""
+    """Every topic begins with one message of an unused type and one of another used type."""
     rows = [*map(ros_row, robot_entries())]
     text = ros_row(Entry("", "std_msgs/msg/String", ros2.make("std_msgs/msg/String", data="x"), START - 2))
     scan = ros_row(Entry("", "sensor_msgs/msg/LaserScan", ros2.scan(START, [1.0]), START - 1))

@@ -5,7 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.robot import RobotConfig
+from octoreplay.errors import InputError
+from octoreplay.io.containers.log_reader import RawMessage
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker
+from octoreplay.io.robots.frame_queue import Settled
+from octoreplay.io.sensors import cameras
+from octoreplay.io.sensors.labels import OCCUPIED, LabelLookup, class_table_from_names
+from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
+from support.log_factory import (
     HEIGHT,
     NAMES,
     WIDTH,
@@ -17,15 +26,6 @@ from log_factory import (
     ros2,
     ros_row,
 )
-from octoreplay.config.robot import RobotConfig
-from octoreplay.errors import InputError
-from octoreplay.io.containers.log_reader import RawMessage
-from octoreplay.io.messages.decoders import DamagedMessageError
-from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker
-from octoreplay.io.robots.frame_queue import Settled
-from octoreplay.io.sensors import cameras
-from octoreplay.io.sensors.labels import OCCUPIED, LabelLookup, class_table_from_names
-from octoreplay.records import BodyBox, CameraModel, CloudFrame, DepthFrame
 
 TABLE = class_table_from_names({"r": NAMES})
 DEPTH, LABELS, SURE, INFO, POINTS = "/depth", "/labels", "/sure", "/info", "/points"
@@ -83,7 +83,7 @@ def test_a_depth_frame_holds_everything():
         ({"label_topic": ""}, ()), ({"labels": False}, ()),
     ],
 )  # fmt: skip
-def test_the_topics_that_go_with_a_depth_image(fields, expected):
+def test_partner_topics_of_a_depth_image(fields, expected):
     maker = depth_maker(INFO_MESSAGE, **fields)
     assert maker.partner_topics == expected
     frame = make(maker, DEPTH_IMAGE, *[None] * len(expected))
@@ -99,7 +99,7 @@ def test_the_topics_that_go_with_a_depth_image(fields, expected):
         ("/depth/image_raw", True, 40.0, False),
     ],
 )  # fmt: skip
-def test_a_rectified_image_is_known_by_its_topic_or_told(topic, rectified, fx, distorts):
+def test_a_rectified_image_is_known_by_its_topic_or_the_configuration(topic, rectified, fx, distorts):
     info = ros2.camera_info(0, (WIDTH, HEIGHT), d=D, p=P)
     camera = make(depth_maker(info, depth_topic=topic, rectified=rectified), DEPTH_IMAGE, None, None).camera
     assert (camera.fx, camera.slopes is not None) == (fx, distorts)
@@ -172,17 +172,19 @@ def test_a_scan_is_a_cloud_without_labels():
 
 def test_messages_of_another_type_are_damage_and_no_camera():
     maker = CloudFrameMaker(robot_of(cloud_topic=DEPTH), None)
-    with pytest.raises(DamagedMessageError, match=r"topic '/depth' at .*: is of type sensor_msgs/msg/Image, no point"):
+    with pytest.raises(
+        DamagedMessageError, match=r"topic '/depth' at .*: is of type sensor_msgs/msg/Image, not a point"
+    ):
         make(maker, DEPTH_IMAGE)
     for depth, label in ((cloud(), LABEL_IMAGE), (DEPTH_IMAGE, cloud())):
-        with pytest.raises(DamagedMessageError, match=r"is of type sensor_msgs/msg/PointCloud2, no image"):
+        with pytest.raises(DamagedMessageError, match=r"is of type sensor_msgs/msg/PointCloud2, not an image"):
             make(depth_maker(INFO_MESSAGE), depth, label, None)
     with pytest.raises(InputError, match=r"is of type sensor_msgs/msg/Image, no CameraInfo"):
         DepthFrameMaker(robot_of(depth_topic=DEPTH), None, DEPTH_IMAGE)
 
 
-def test_a_lens_is_worked_out_when_there_is_an_image_of_its_size(monkeypatch):
-    """A CameraInfo may announce any size, and the table of a large image's rays takes gigabytes."""
+def test_rays_are_computed_at_the_first_image(monkeypatch):
+    """A CameraInfo may give any size, and the rays of a large image take gigabytes."""
     sizes, work_out = [], cameras._rays
 
     def rays(*args):

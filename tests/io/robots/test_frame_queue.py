@@ -40,7 +40,7 @@ def make_queue(poses=None, *, window=100, tolerance=10, gap=50, num_partners=1) 
 def run(
     queue: FrameQueue[str], arrivals: list[tuple[str, int]], *, final_only=False
 ) -> tuple[list[Settled], list[int]]:
-    """What a queue gives for messages in the order of arrival, and the stamps that were late."""
+    """Output of a queue for messages in order of arrival, and the late stamps."""
     settled, late = [], []
 
     def drain(*, final: bool) -> None:
@@ -60,7 +60,7 @@ def run(
 
 @st.composite
 def arrivals_within(draw, window: int):
-    """Messages, none twice, whose stamps are behind the newest sensor stamp by at most a window."""
+    """Messages without duplicates, with stamps behind the newest sensor stamp by at most a window."""
     kinds = draw(st.lists(st.tuples(st.sampled_from(["depth", *KINDS]), st.integers(0, 400)), max_size=40))
     delays = draw(st.lists(st.integers(0, window), min_size=len(kinds), max_size=len(kinds)))
     order = sorted(range(len(kinds)), key=lambda i: (kinds[i][1] + delays[i], i))
@@ -69,7 +69,7 @@ def arrivals_within(draw, window: int):
 
 
 @given(arrivals_within(60), st.integers(0, 30))
-def test_reading_in_a_window_gives_what_reading_everything_first_gives(arrivals, tolerance):
+def test_a_window_gives_the_result_of_reading_everything_first(arrivals, tolerance):
     streamed, late = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
     at_once, _ = run(make_queue(window=10**6, tolerance=tolerance, num_partners=2), arrivals, final_only=True)
     assert late == []
@@ -77,7 +77,7 @@ def test_reading_in_a_window_gives_what_reading_everything_first_gives(arrivals,
 
 
 @given(arrivals_within(60), st.integers(0, 30), st.sampled_from([0, 1]))
-def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance, index):
+def test_pairs_are_unique_and_within_the_tolerance_and_exact_where_possible(arrivals, tolerance, index):
     settled, _ = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
     depths = [stamp for kind, stamp in arrivals if kind == "depth"]
     labels = [stamp for kind, stamp in arrivals if kind == KINDS[index]]
@@ -92,7 +92,7 @@ def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance, 
         elif depth in partner:
             assert abs(partner[depth] - depth) <= tolerance
         else:
-            # Every label in reach went to, or was nearer to, another depth image.
+            # Every label within the tolerance belongs to, or is nearer to, another depth image.
             for label in labels:
                 if abs(label - depth) <= tolerance:
                     others = [other for other in depths if other != depth]
@@ -100,7 +100,7 @@ def test_pairs_are_unique_near_and_exact_where_they_can_be(arrivals, tolerance, 
 
 
 @given(st.lists(st.integers(0, 300), max_size=30), st.integers(0, 100))
-def test_late_is_more_than_the_window_behind_and_the_rest_comes_in_order_and_once(stamps, window):
+def test_late_messages_are_dropped_and_the_others_come_in_order_and_once(stamps, window):
     queue, fates, settled = make_queue(window=window, num_partners=0), [], []
     for stamp in stamps:
         fates.append(queue.add_sensor(stamp, str(stamp)))
@@ -129,13 +129,13 @@ def test_a_label_waits_for_the_nearer_image_that_comes_out_of_order():
     assert [(s.stamp_ns, s.partners) for s in settled] == [(0, (None,)), (37, ("label 19",)), (40, (None,))]
 
 
-def test_a_message_waits_for_its_pose_but_not_for_ever():
+def test_a_message_waits_for_its_pose_up_to_the_pose_gap():
     poses = FakePoses(known_to=90)
     queue = make_queue(poses, window=100, gap=50, num_partners=0)
     for stamp in (80, 100, 240):
         queue.add_sensor(stamp, str(stamp))
     assert queue.pop(final=False).stamp_ns == 80
-    # 240 is more than the window past 100, whose pose may still come.
+    # 240 is more than the window past 100, but the pose of 100 may still arrive.
     assert queue.pop(final=False) is None
     queue.add_sensor(251, "251")
     ready = queue.pop(final=False)
@@ -145,7 +145,7 @@ def test_a_message_waits_for_its_pose_but_not_for_ever():
     np.testing.assert_array_equal(queue.pop(final=False).T_map_sensor, np.eye(4) * 240)
 
 
-def test_what_is_held_does_not_grow_with_the_log():
+def test_the_number_of_held_messages_does_not_grow_with_the_log():
     queue = make_queue(window=100, num_partners=2)
     largest = 0
     for stamp in range(0, 20_000, 10):
@@ -162,7 +162,7 @@ def test_what_is_held_does_not_grow_with_the_log():
     assert largest < 50
 
 
-def test_labels_that_no_message_can_have_are_dropped_in_order():
+def test_labels_out_of_reach_of_every_message_are_dropped():
     queue = make_queue(window=10, tolerance=5)
     for stamp in (0, 3, 50, 52):
         queue.add_partner(0, stamp, str(stamp))
@@ -173,7 +173,7 @@ def test_labels_that_no_message_can_have_are_dropped_in_order():
 
 
 @pytest.mark.parametrize("window", [0, 7])
-def test_of_equal_stamps_the_first_holds_also_once_it_was_given(window):
+def test_the_first_of_equal_stamps_is_kept_even_after_it_was_popped(window):
     queue = make_queue(window=window, num_partners=0)
     fates = [queue.add_sensor(5, name) for name in ("first", "second", "third")]
     assert fates == [Fate.WAITS, Fate.DUPLICATE, Fate.DUPLICATE]
@@ -182,7 +182,7 @@ def test_of_equal_stamps_the_first_holds_also_once_it_was_given(window):
     assert queue.pop(final=True) is None
 
 
-def test_of_equal_partners_the_first_holds():
+def test_the_first_of_partners_with_equal_stamps_is_kept():
     queue = make_queue()
     for name in ("first", "second"):
         queue.add_partner(0, 5, name)
@@ -197,7 +197,7 @@ def test_a_confidence_does_not_take_the_place_of_a_label():
     assert queue.pop(final=True).partners == (None, "confidence")
 
 
-def test_late_ones_do_not_move_the_newest_stamp():
+def test_late_messages_do_not_move_the_newest_stamp():
     queue = make_queue(window=10)
     assert queue.newest_ns is None
     queue.add_sensor(100, "a")
@@ -208,8 +208,8 @@ def test_late_ones_do_not_move_the_newest_stamp():
     assert queue.newest_ns == 120
 
 
-def test_many_messages_in_one_window_take_no_quadratic_time():
-    """A clock that hardly moves: 20,000 messages within the window, all of which wait for the end."""
+def test_many_messages_in_one_window_take_linear_time():
+    """20,000 messages within the window of a slow clock wait for the end."""
     queue = FrameQueue(FakePoses(), reorder_window_ns=10**9, pair_tolerance_ns=100, pose_gap_ns=0, num_partners=1)
     started = time.process_time()
     for index in range(20_000):

@@ -1,4 +1,4 @@
-"""Logs as they should not be, but are: what comes first is broken, out of order, shared or stamped wrongly."""
+"""Irregular logs: first messages that are damaged, out of order, shared or wrongly stamped."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.time import TimeConfig
+from octoreplay.errors import InputError
+from octoreplay.io.robots.discover import discover, resolve
+from octoreplay.io.robots.pose_source import PoseSource
+from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_bodies import TeamBodies
+from octoreplay.io.sensors.labels import class_table_from_names
+from octoreplay.records import CloudFrame, FrameCounts
+from support.log_factory import (
     IDENTITY,
     NAMES,
     SECOND,
@@ -20,28 +31,18 @@ from log_factory import (
     write_mcap,
     write_rows,
 )  # fmt: skip
-from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
-from octoreplay.config.time import TimeConfig
-from octoreplay.errors import InputError
-from octoreplay.io.robots.discover import discover, resolve
-from octoreplay.io.robots.pose_source import PoseSource
-from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.io.robots.team_bodies import TeamBodies
-from octoreplay.io.sensors.labels import class_table_from_names
-from octoreplay.records import FrameCounts
 
 TABLE = class_table_from_names({"r": NAMES})
 START = 100 * SECOND
 DEPTH, LABELS, INFO = "/camera/depth/image_raw", "/camera/labels/image_raw", "/camera/depth/camera_info"
 
 
-def robot_of(*paths, **fields) -> RobotConfig:
+def robot_of(*paths, **fields) -> ResolvedRobot:
     known = {"depth_topic": DEPTH, "label_topic": LABELS, "camera_info_topic": INFO, "pose_topic": "/odom"}
-    return RobotConfig("r", paths, **{**known, **fields})
+    return ResolvedRobot("r", paths, **{**known, **fields})
 
 
-def read(robot: RobotConfig, **time):
+def read(robot: ResolvedRobot, **time):
     with RobotLog(robot, TimeConfig(**time), TABLE) as log:
         return [(frame.stamp_ns - START) / SECOND for frame in log.frames()], log.counts
 
@@ -63,7 +64,7 @@ def test_the_order_of_files_and_of_the_first_images_does_not_matter(tmp_path):
 
 
 def restamped(entries, topic, index, stamp_ns):
-    """The messages, one of a topic with another stamp."""
+    """The messages, with another stamp for one message of a topic."""
     chosen = [e for e in entries if e.topic == topic][index]
     value = dataclasses.replace(chosen.value, header=ros2.header(stamp_ns, "camera"))
     return [e._replace(value=value) if e is chosen else e for e in entries]
@@ -76,7 +77,7 @@ def test_one_stamp_of_the_future_does_not_end_a_span(tmp_path):
     assert counts == FrameCounts(used=7, undecodable=1)
 
 
-def test_a_stamp_ahead_that_a_clock_may_have_given_makes_others_late_and_is_named(tmp_path):
+def test_a_valid_stamp_ahead_makes_others_late_and_is_named(tmp_path):
     entries = restamped(robot_entries(num_frames=12), DEPTH, 2, START + 60 * SECOND)
     stamps, counts = read(robot_of(write_mcap(tmp_path / "r.mcap", entries)), duration=2.0)
     assert stamps == [0.0, 0.25]
@@ -84,14 +85,14 @@ def test_a_stamp_ahead_that_a_clock_may_have_given_makes_others_late_and_is_name
     assert "before the newest stamp so far" in counts.first_missing["late"]
 
 
-def test_a_stamp_from_before_the_clock_was_set_is_no_start(tmp_path):
+def test_a_stamp_from_before_the_clock_was_set_is_not_the_start(tmp_path):
     entries = restamped(robot_entries(num_frames=6), DEPTH, 0, 5 * SECOND)
     stamps, _ = read(robot_of(write_mcap(tmp_path / "r.mcap", entries)), duration=0.6)
     assert stamps == [0.25, 0.5, 0.75]
 
 
 @pytest.mark.parametrize("topic", [DEPTH, LABELS, INFO, "/odom", "/tf_static"])
-def test_a_damaged_first_message_costs_no_more_than_itself(tmp_path, topic):
+def test_a_damaged_first_message_loses_itself_only(tmp_path, topic):
     rows = [ros_row(entry) for entry in robot_entries(num_frames=6)]
     extra = next(row for row in rows if row.topic == topic)
     broken = dataclasses.replace(extra, data=extra.data[:-3], log_time_ns=START - SECOND) if dataclasses.is_dataclass(
@@ -102,7 +103,7 @@ def test_a_damaged_first_message_costs_no_more_than_itself(tmp_path, topic):
     assert stamps[-5:] == [0.25, 0.5, 0.75, 1.0, 1.25]
 
 
-def test_one_table_of_labels_serves_all_robots_of_a_log(tmp_path):
+def test_one_label_info_serves_all_robots_of_a_log(tmp_path):
     entries = [e for name in ("ada", "bob") for e in robot_entries(namespace=name) if "label_info" not in e.topic]
     entries.append(Entry("/label_info", "vision_msgs/msg/LabelInfo", ros2.label_info(START, NAMES), START))
     path = write_mcap(tmp_path / "both.mcap", sorted(entries, key=lambda e: e.log_time_ns))
@@ -114,13 +115,13 @@ def test_one_table_of_labels_serves_all_robots_of_a_log(tmp_path):
 
 
 @pytest.mark.parametrize("namespace", ["semantic_bot", "classroom", "depth_7", "confidence"])
-def test_a_namespace_says_nothing_about_its_topics(tmp_path, namespace):
+def test_hints_in_a_namespace_do_not_matter(tmp_path, namespace):
     [robot] = discover([write_mcap(tmp_path / "r.mcap", robot_entries(namespace=namespace))])
     assert robot.depth_topic == f"/{namespace}/camera/depth/image_raw"
     assert robot.label_topic == f"/{namespace}/camera/labels/image_raw"
 
 
-def test_a_transform_of_foxglove_that_is_said_once_holds_beside_moving_ones(tmp_path):
+def test_a_single_foxglove_transform_is_fixed_beside_moving_ones(tmp_path):
     rows = [ros_row(e) for e in robot_entries(poses="none") if e.topic != "/tf_static"]
     still = foxglove_transform("base", "camera", START, (0, 0, 0.5))
     rows.append(foxglove_row("/tf", "FrameTransform", still, START, "json"))
@@ -157,23 +158,24 @@ def test_poses_without_images_are_not_kept(tmp_path, monkeypatch):
     stamps, counts = read(robot_of(path))
     assert (len(stamps), counts.used) == (12, 12)
     assert most[0] < 200
-    # Behind the last image reading goes on for a while, and not to the end.
+    # Reading continues for a while behind the last image, but not to the end.
     assert taken[0] < 600 + 30 + 120
 
 
-def test_bodies_are_there_where_poses_begin_long_before_the_images(tmp_path):
+def test_bodies_are_known_where_poses_begin_long_before_the_images(tmp_path):
     entries = [e for e in robot_entries(num_frames=12) if e.topic != "/odom"] + odometry_entries(-60.0, 10.0)
     path = write_mcap(tmp_path / "r.mcap", sorted(entries, key=lambda e: e.log_time_ns))
     robots = (robot_of(path), dataclasses.replace(robot_of(path, body_box=(-1, -1, -1, 1, 1, 1)), robot_id="b"))
     with TeamBodies(robots, TimeConfig()) as bodies:
         for tick in range(1, 4):
             bodies.advance(START + (tick - 1) * SECOND, START + tick * SECOND)
-            [box] = bodies.seen_by(0, START + tick * SECOND - SECOND // 2)
+            frame = CloudFrame("r", START + tick * SECOND - SECOND // 2, np.zeros((1, 3), np.float32), None, np.eye(4))
+            [box] = bodies.add_to(0, frame).boxes
             origin = np.linalg.inv(box.T_box_team)[:3, 3]
             np.testing.assert_allclose(origin, [tick - 0.5, 0, 0], atol=1e-9)
 
 
-def test_a_box_in_a_frame_that_nobody_knows_is_no_box_that_is_left_out(tmp_path):
+def test_a_box_in_an_unknown_frame_is_refused(tmp_path):
     path = write_mcap(tmp_path / "r.mcap", robot_entries())
     with pytest.raises(InputError, match=r"'nonsense'.*name another body_frame"):
         read(robot_of(path, body_box=(-1, -1, -1, 1, 1, 1), body_frame="nonsense"))
@@ -189,7 +191,7 @@ def test_a_field_that_no_cloud_has_is_named(tmp_path):
     assert resolve(RunConfig((dataclasses.replace(robot, label_field=""),))).classes.num_classes == 1
 
 
-def test_what_is_missing_is_named_with_its_first_message(tmp_path):
+def test_missing_poses_are_reported_with_the_first_message(tmp_path):
     entries = [e for e in robot_entries(num_frames=8) if not (e.topic == "/odom" and e.log_time_ns > START + SECOND)]
     _, counts = read(robot_of(write_mcap(tmp_path / "r.mcap", entries)))
     assert counts == FrameCounts(used=5, no_pose=3)

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log_factory import (
+from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.errors import InputError
+from octoreplay.io.containers.logs import open_log
+from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.io.robots.pose_source import PoseSource, is_static_tf, moving_tf_names, tf_topics
+from octoreplay.transforms import inverse, pose_matrix
+from support.log_factory import (
     FOXGLOVE_ENCODINGS,
     IDENTITY,
     SECOND,
@@ -22,12 +28,6 @@ from log_factory import (
     ros_row,
     write_rows,
 )
-from octoreplay.config.robot import RobotConfig
-from octoreplay.errors import InputError
-from octoreplay.io.containers.logs import open_log
-from octoreplay.io.messages.decoders import DamagedMessageError
-from octoreplay.io.robots.pose_source import PoseSource, is_static_tf, moving_tf_names, tf_topics
-from octoreplay.transforms import inverse, pose_matrix
 
 START = 1_700_000_000 * SECOND + 1
 TURN = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
@@ -42,13 +42,13 @@ def entry(topic: str, type_name: str, value, stamp: int) -> Row:
 
 
 def images() -> list[Row]:
-    """A sensor's messages at every stamp."""
+    """Messages of a sensor at every stamp."""
     pixels = np.ones((1, 1), np.uint16)
     return [entry(IMAGE, "sensor_msgs/msg/Image", ros2.image(s, pixels, "16UC1"), s) for s in STAMPS]
 
 
 def position(stamp: int) -> tuple[float, float, float]:
-    """Where the body is: it drives along x at 1 m/s and climbs."""
+    """Position of the body, which drives along x at 1 m/s and climbs."""
     t = (stamp - START) / SECOND
     return t, 2.0, 3.0 + t
 
@@ -66,12 +66,12 @@ def tf(topic: str, *edges, stamps: Sequence[int] = STAMPS) -> list[Row]:
 
 
 def static(parent="base", child="camera", mount=MOUNT, *, stamp=STAMPS[-1] + SECOND) -> list[Row]:
-    """A transform that never changes, said at the end of the log."""
+    """A fixed transform at the end of the log."""
     return [entry("/tf_static", TF, ros2.tf((parent, child, stamp, *mount)), stamp)]
 
 
 class Poses:
-    """A pose source that has been given everything in its log."""
+    """A pose source after all messages of its log."""
 
     def __init__(
         self, tmp_path: Path, rows: Sequence[Row], *, gap_ns=SECOND // 2, use_log_time=False, **fields
@@ -79,10 +79,8 @@ class Poses:
         self.path = write_rows(tmp_path / "r.mcap", rows)
         with ExitStack() as stack:
             log = stack.enter_context(open_log(self.path))
-            robot = RobotConfig("r", (self.path,), depth_topic=IMAGE, **fields)
-            self.source = PoseSource(
-                robot, [log], sensor_topic=IMAGE, sensor_frame="camera", pose_gap_ns=gap_ns, use_log_time=use_log_time
-            )
+            robot = ResolvedRobot("r", (self.path,), depth_topic=IMAGE, **fields)
+            self.source = PoseSource(robot, [log], sensor_frame="camera", pose_gap_ns=gap_ns, use_log_time=use_log_time)
             self.known_at_first = self.source.is_known(STAMPS[0])
             for message in log.messages(self.source.topics):
                 self.source.take(message)
@@ -119,7 +117,7 @@ def test_odometry_of_the_sensor_itself_and_with_slashes_before_its_frames(tmp_pa
     Poses(tmp_path, odometry(child="/camera"), pose_topic="/odom").check(body)
 
 
-def test_a_given_mount_takes_the_place_of_tf(tmp_path):
+def test_a_given_mount_replaces_tf(tmp_path):
     given = (*MOUNT[0], *MOUNT[1])
     Poses(tmp_path, [*odometry(), *static(mount=((9, 9, 9), IDENTITY))], pose_topic="/odom", T_body_sensor=given).check(
         camera
@@ -139,11 +137,11 @@ def test_stamped_poses_with_a_given_mount(tmp_path, kind):
     rows = [row(stamp) for stamp in STAMPS]
     poses = Poses(tmp_path, rows, pose_topic="/pose", T_body_sensor=(*MOUNT[0], *MOUNT[1]))
     poses.check(lambda stamp: pose_matrix(position(stamp), IDENTITY) @ pose_matrix(*MOUNT))
-    with pytest.raises(InputError, match=r"topic '/pose' at .* s: the poses do not name .* give T_body_sensor"):
+    with pytest.raises(InputError, match=r"topic '/pose' at .* s: the poses have no child frame; give T_body_sensor"):
         Poses(tmp_path, [*rows, *static()], pose_topic="/pose")
 
 
-def test_a_transform_as_pose_topic_names_what_it_is_the_pose_of(tmp_path):
+def test_a_transform_as_pose_topic_names_its_child_frame(tmp_path):
     rows = [
         entry(
             "/vicon",
@@ -157,7 +155,7 @@ def test_a_transform_as_pose_topic_names_what_it_is_the_pose_of(tmp_path):
 
 
 def path_rows(lengths: Sequence[int]) -> list[Row]:
-    """A path that has so many poses at each of some messages."""
+    """A path with the given number of poses in each message."""
     poses = [ros2.pose_stamped(s, position(s), TURN, frame_id="") for s in STAMPS]
     return [
         entry("/path", "nav_msgs/msg/Path", ros2.path(s, poses[:length]), s)
@@ -166,7 +164,7 @@ def path_rows(lengths: Sequence[int]) -> list[Row]:
 
 
 @pytest.mark.parametrize("lengths", [[11], range(1, 12), range(11), [0, 0, 11]])
-def test_a_path_is_known_from_the_beginning_and_its_last_message_holds(tmp_path, lengths):
+def test_a_path_is_known_from_the_beginning_and_its_last_message_is_used(tmp_path, lengths):
     rows = path_rows(lengths)
     given = (*MOUNT[0], *MOUNT[1])
     poses = Poses(tmp_path, rows, pose_topic="/path", T_body_sensor=given)
@@ -177,7 +175,7 @@ def test_a_path_is_known_from_the_beginning_and_its_last_message_holds(tmp_path,
     assert poses.source.at(last + 1) is None
 
 
-def test_the_last_path_corrects_those_before(tmp_path):
+def test_the_last_path_replaces_earlier_ones(tmp_path):
     wrong = [ros2.pose_stamped(s, (99, 99, 99), frame_id="map") for s in STAMPS]
     rows = [entry("/path", "nav_msgs/msg/Path", ros2.path(START, wrong), START), *path_rows([0, 11])[1:]]
     Poses(tmp_path, rows, pose_topic="/path", T_body_sensor=(*MOUNT[0], *MOUNT[1])).check(camera)
@@ -229,7 +227,7 @@ def test_a_pose_is_known_once_every_transform_of_its_chain_is(tmp_path):
 
 @pytest.mark.parametrize("encoding", FOXGLOVE_ENCODINGS)
 @pytest.mark.parametrize("several", [True, False])
-def test_foxglove_transforms_with_one_that_is_said_once(tmp_path, encoding, several):
+def test_foxglove_transforms_with_a_single_fixed_one(tmp_path, encoding, several):
     def row(topic: str, *edge) -> Row:
         transform = foxglove_transform(*edge)
         name, fields = ("FrameTransforms", {"transforms": [transform]}) if several else ("FrameTransform", transform)
@@ -242,7 +240,7 @@ def test_foxglove_transforms_with_one_that_is_said_once(tmp_path, encoding, seve
     poses.check(camera)
 
 
-def test_static_topics_are_told_by_name_or_by_what_is_said_once(tmp_path):
+def test_static_topics_are_known_by_name_or_a_single_message(tmp_path):
     def infos(rows: Sequence[Row]):
         with open_log(write_rows(tmp_path / "a.mcap", rows)) as log:
             return {info.name: info for info in log.topics}
@@ -256,7 +254,7 @@ def test_static_topics_are_told_by_name_or_by_what_is_said_once(tmp_path):
     assert moving_tf_names(tf_topics(found.values(), "/r/camera")) == ("/often", "/r/tf")
 
 
-def test_the_tf_of_a_namespace_above_the_sensor_is_its_own(tmp_path):
+def test_the_tf_of_a_namespace_above_the_sensor_is_used_alone(tmp_path):
     rows = [*tf("/a/tf", stamps=STAMPS[:2]), *tf("/b/tf", stamps=STAMPS[:2])]
     with open_log(write_rows(tmp_path / "a.mcap", rows)) as log:
         assert [t.name for t in tf_topics(log.topics, "/a/camera/depth")] == ["/a/tf"]
@@ -292,7 +290,7 @@ def test_a_tum_file_is_exact_to_the_nanosecond_and_known_from_the_beginning(tmp_
     poses = Poses(tmp_path, images(), pose_file=write_tum(tmp_path / "tum.txt"))
     assert poses.source.topics == ()
     assert poses.known_at_first
-    # ``check`` asks one nanosecond before the first pose and after the last.
+    # ``check`` uses one nanosecond before the first pose and after the last.
     poses.check(body)
 
 
@@ -303,7 +301,7 @@ def test_a_file_of_the_bodys_poses_with_a_given_mount(tmp_path):
 
 @pytest.mark.parametrize("use_log_time", [False, True])
 def test_a_kitti_file_has_a_pose_for_every_message_of_the_sensor(tmp_path, use_log_time):
-    # The messages come in another order than their stamps.
+    # The messages are not in stamp order.
     rows = [images()[i] for i in (1, 0, *range(2, 11))]
     rows = [row._replace(log_time_ns=STAMPS[i] + 5) for i, row in enumerate(rows)]
     poses = Poses(tmp_path, rows, pose_file=write_kitti(tmp_path / "kitti.txt"), use_log_time=use_log_time)
@@ -323,7 +321,7 @@ def test_poses_without_a_time_each_are_refused_with_both_counts(tmp_path):
     with pytest.raises(InputError) as caught:
         Poses(tmp_path, images(), pose_file=kitti)
     assert str(caught.value) == (
-        f"{kitti}: has 7 poses, but '{IMAGE}' 11 messages; give pose_times: a file with a time [s] for every pose"
+        f"{kitti}: has 7 poses, but '{IMAGE}' 11 messages; give pose_times: a file with the time [s] of each pose"
     )
     times = tmp_path / "times.txt"
     times.write_text("1\n2\n")
@@ -398,13 +396,13 @@ def test_a_body_frame_that_nothing_joins_is_named(tmp_path):
         (tf("/tf", ("map", "base", position, TURN)), {"pose_topic": "/tf"}, "poses from TF need a map_frame"),
     ],
 )  # fmt: skip
-def test_what_cannot_give_poses_gets_one_sentence(tmp_path, rows, fields, sentence):
+def test_logs_without_poses_are_refused_in_one_sentence(tmp_path, rows, fields, sentence):
     with pytest.raises(InputError, match=f"^{re.escape(str(tmp_path / 'r.mcap'))}: {sentence}") as caught:
         Poses(tmp_path, rows, **{"pose_topic": "/odom", **fields})
     assert "\n" not in str(caught.value)
 
 
-def test_tf_that_never_joins_is_said_once_it_was_read(tmp_path):
+def test_frames_that_tf_does_not_join_are_named_after_reading(tmp_path):
     rows = [*tf("/tf", ("map", "other", position, TURN)), *static()]
     poses = Poses(tmp_path, rows, pose_topic="/tf", map_frame="map")
     assert poses.source.at(STAMPS[2]) is None
@@ -423,5 +421,5 @@ def test_a_message_of_another_type_on_the_pose_topic_is_damage(tmp_path):
     pixels = np.ones((1, 1), np.uint16)
     poses = Poses(tmp_path, [*odometry(), *static()], pose_topic="/odom")
     other = entry("/odom", "sensor_msgs/msg/Image", ros2.image(START, pixels, "16UC1"), START)
-    with pytest.raises(DamagedMessageError, match=r"topic '/odom' at .*: is of type sensor_msgs/msg/Image, no pose"):
+    with pytest.raises(DamagedMessageError, match=r"topic '/odom' at .*: is of type sensor_msgs/msg/Image, not a pose"):
         poses.source.take(other.message())

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_np
 from scipy.spatial.transform import Rotation, Slerp
 
-from log_factory import IDENTITY, ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Transforms, convert
 from octoreplay.io.robots.poses import FrameTree, PoseTrack
 from octoreplay.transforms import normalise
+from support.log_factory import IDENTITY, ros2
 
 MS = 1_000_000
 
@@ -24,7 +24,7 @@ positions = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
 
 
 @pytest.mark.parametrize("bad", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (np.inf, 0, 0, 1)])
-def test_a_quaternion_without_direction_is_no_rotation(bad):
+def test_a_zero_quaternion_is_refused(bad):
     track = PoseTrack(100 * MS)
     assert not track.add(0, (0, 0, 0), bad)
     assert len(track) == 0
@@ -74,7 +74,7 @@ def test_a_gap_is_bridged_up_to_its_limit(distance, is_bridged):
     assert track.at(distance) is not None
 
 
-def test_the_last_of_two_equal_stamps_holds():
+def test_the_last_of_two_equal_stamps_is_kept():
     track = PoseTrack(100)
     for stamp, x in ((0, 0.0), (10, 1.0), (10, 2.0)):
         track.add(stamp, (x, 0, 0), IDENTITY)
@@ -111,14 +111,14 @@ def test_tree_chains_fixed_and_moving_transforms_up_and_down():
     tree = make_tree()
     # odom is turned by 90 degrees about z: its x is the map's y. The base has moved 1.5, the camera is 1 ahead.
     np.testing.assert_allclose(tree.T_a_b("map", "camera", 150 * MS)[:3, 3], (10, 2.5, 0), atol=1e-12)
-    # Across the tree: from the camera to the arm, whose common ancestor is the base.
+    # From the camera to the arm, with the base as common ancestor.
     np.testing.assert_allclose(tree.T_a_b("camera", "arm", 250 * MS)[:3, 3], (-1, 2.5, 0), atol=1e-12)
     for a, b in (("map", "arm"), ("arm", "camera"), ("base", "base")):
         there, back = tree.T_a_b(a, b, 50 * MS), tree.T_a_b(b, a, 50 * MS)
         np.testing.assert_allclose(there @ back, np.eye(4), atol=1e-12)
 
 
-def test_tree_knows_what_is_fixed_where_its_roots_are_and_until_when_it_knows():
+def test_tree_gives_fixed_links_roots_and_the_last_known_stamp():
     tree = make_tree()
     assert tree.root_of("camera") == "map"
     assert tree.root_of("never_heard_of") == "never_heard_of"
@@ -156,7 +156,7 @@ def transforms_of(*edges) -> Transforms:
     return convert("tf2_msgs/msg/TFMessage", ros2.tf(*edges))
 
 
-def test_tree_takes_messages_and_leaves_broken_transforms_out():
+def test_tree_ignores_invalid_transforms_of_messages():
     tree = FrameTree(200 * MS)
     found = transforms_of(("map", "base", 0, (1, 2, 3), IDENTITY), ("map", "dead", 0, (0, 0, 0), (0, 0, 0, 0)))
     tree.add_transforms(found, is_static=False)

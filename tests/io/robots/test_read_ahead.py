@@ -6,13 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from log_factory import NAMES, robot_entries, write_mcap
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.read_ahead import NUM_AHEAD, ReadAhead
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.sensors.labels import class_table_from_names
+from support.log_factory import NAMES, robot_entries, write_mcap
 
 TABLE = class_table_from_names({"r": NAMES})
 
@@ -20,14 +20,14 @@ TABLE = class_table_from_names({"r": NAMES})
 @pytest.fixture
 def robot(tmp_path):
     path = write_mcap(tmp_path / "r.mcap", robot_entries(num_frames=20))
-    return RobotConfig(
+    return ResolvedRobot(
         "r", (path,), depth_topic="/camera/depth/image_raw", label_topic="/camera/labels/image_raw",
         camera_info_topic="/camera/depth/camera_info", pose_topic="/odom",
     )  # fmt: skip
 
 
 class CountedLog(RobotLog):
-    """Counts the frames that were read, and can fail after some."""
+    """A log that counts the frames read, and fails after ``fails_after``."""
 
     num_read = 0
     fails_after = 1000
@@ -52,19 +52,19 @@ def test_the_frames_are_the_logs_own(robot):
         np.testing.assert_array_equal(frame.T_team_sensor, other.T_team_sensor)
 
 
-def test_only_a_few_frames_are_read_ahead_and_leaving_ends_the_thread(robot):
+def test_only_a_few_frames_are_read_ahead_and_closing_ends_the_thread(robot):
     with CountedLog(robot, TimeConfig(), TABLE) as log:
         with ReadAhead(log) as source:
             frames = source.frames()
             next(frames)
             time.sleep(0.3)
-            # One is taken, some wait, and one waits to be put.
+            # One frame is taken, some are queued, and one waits for room.
             assert log.num_read == 1 + NUM_AHEAD + 1
         assert not any(thread.name == "read r" for thread in threading.enumerate())
         assert log.num_read == NUM_AHEAD + 2
 
 
-def test_what_fails_in_the_thread_is_raised_where_frames_are_taken(robot):
+def test_errors_of_the_thread_are_raised_by_the_iterator(robot):
     with CountedLog(robot, TimeConfig(), TABLE) as log, ReadAhead(log) as source:
         log.fails_after = 7
         taken = []
@@ -73,13 +73,13 @@ def test_what_fails_in_the_thread_is_raised_where_frames_are_taken(robot):
     assert log.num_read == 7
 
 
-def test_a_source_that_was_never_asked_can_be_left(robot):
+def test_a_source_that_was_never_used_can_be_closed(robot):
     with RobotLog(robot, TimeConfig(), TABLE) as log, ReadAhead(log):
         pass
 
 
-def test_leaving_ends_a_reading_that_finds_no_frames(robot, monkeypatch):
-    """A log of which nothing is wanted is left at the next message, not at its end."""
+def test_closing_ends_a_read_without_frames(robot, monkeypatch):
+    """Reading ends at the next message after closing, not at the end of the log."""
     seen = []
 
     def messages(self, topics, *_):

@@ -1,4 +1,4 @@
-"""What a robot's log holds, read back with mcap and rosbags alone."""
+"""Contents of a robot's log, read with mcap and rosbags alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
 from octoreplay.records import CameraModel, ClassTable, SemanticClass
-from stored_messages import matrix, pixels, read_messages, stamp_ns
+from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 CAMERA = CameraModel(width=5, height=3, fx=4.0, fy=4.5, cx=2.25, cy=1.5)
 CLASSES = ClassTable((SemanticClass(1, "road", (1, 2, 3), (7, 9)), SemanticClass(2, "tree", (4, 5, 6), (2,))), (255,))
@@ -82,7 +82,7 @@ def test_images_keep_every_pixel(tmp_path, depth, labels, depth_type, depth_enco
     assert stored_depth.header.frame_id == stored_labels.header.frame_id == "r1/camera_optical_frame"
 
 
-def test_a_view_that_is_not_contiguous_is_written_as_it_looks(tmp_path, depth):
+def test_a_view_that_is_not_contiguous_keeps_its_pixels(tmp_path, depth):
     path = write_log(tmp_path / "r1.mcap", depth[:, ::-1], None)
     [(_, stored)] = read_messages(path)["/r1/camera/depth/image_raw"]
     np.testing.assert_array_equal(pixels(stored), depth[:, ::-1])
@@ -209,7 +209,7 @@ def test_a_cloud_needs_coordinates_only_and_may_be_empty(tmp_path):
 )  # fmt: skip
 def test_a_cloud_that_does_not_fit_is_refused(tmp_path, fields):
     with pytest.raises(
-        InputError, match=r"r1\.mcap: topic '/r1/lidar/points': takes clouds in a lidar's log only, whose"
+        InputError, match=r"r1\.mcap: topic '/r1/lidar/points': takes clouds in a lidar's log only; labels"
     ):
         write_cloud(tmp_path / "r1.mcap", **fields)
 

@@ -4,14 +4,14 @@ import random
 
 import pytest
 
-from log_factory import SECOND
 from octoreplay.io.robots.stamp_check import MAX_JUMP_NS, MAX_STAMP_NS, StampCheck
+from support.log_factory import SECOND
 
 START = 1_700_000_000 * SECOND
 
 
 def judged(aheads, topics=None, offset_ns=0) -> list[bool]:
-    """Whether stamps so far ahead of the log's time are believed, message by message."""
+    """Result of the check, message by message, for stamps this far ahead of the log time."""
     check = StampCheck(offset_ns)
     times = [START + index * SECOND for index in range(len(aheads))]
     names = topics or ["/a"] * len(aheads)
@@ -26,18 +26,18 @@ def test_a_stamp_that_moves_by_more_than_an_hour_is_damage():
     ]
 
 
-def test_a_clock_that_is_set_costs_one_message():
+def test_setting_the_clock_loses_one_message():
     boot = 5 * SECOND - START
     assert judged([boot, boot, 0, 0, 0]) == [True, True, False, True, True]
     assert judged([boot, 0, 0]) == [True, False, True]
 
 
-def test_topics_have_clocks_of_their_own():
+def test_topics_are_checked_independently():
     simulated = 10 * SECOND - START
     assert judged([0, simulated, 0, simulated], ["/a", "/b", "/a", "/b"]) == [True] * 4
 
 
-def test_clocks_may_drift_without_end():
+def test_clocks_may_drift_without_limit():
     """A simulation that runs at a tenth of real time, over a month."""
     check = StampCheck(0)
     assert all(check.is_good("/a", i * 300 * SECOND, START + i * 3000 * SECOND) for i in range(1000))
@@ -51,7 +51,7 @@ def test_the_range_is_that_of_ros_with_the_clock_offset_applied(offset_ns):
         assert StampCheck(offset_ns).is_good("/a", stamp - offset_ns, START) is good
 
 
-def test_single_damaged_stamps_are_all_found_and_nothing_else():
+def test_exactly_the_damaged_stamps_are_found():
     rng = random.Random(3)
     aheads = [0, 0]
     while len(aheads) < 200:

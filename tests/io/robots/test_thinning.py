@@ -14,12 +14,12 @@ START = 1_700_000_000 * SECOND
 
 
 def kept(stamps: list[int], start_ns: int = START, **time) -> list[int]:
-    """The stamps that are taken of some, in order."""
+    """The kept ones of some stamps, in order."""
     thinning = Thinning(TimeConfig(**time), start_ns)
     return [stamp for stamp in stamps if thinning.keeps(stamp)]
 
 
-def test_everything_is_kept_unless_told():
+def test_defaults_keep_every_message():
     stamps = [START - 10**15, START - 1, START, START + 1, START + 10**15]
     assert kept(stamps) == stamps
     assert kept(stamps, start=1e-9) == stamps[3:]
@@ -38,11 +38,11 @@ def test_every_counts_from_the_first_message_of_the_span():
     assert kept(stamps, every=3, start=4.0, duration=10.0) == stamps[4:14:3]
 
 
-def test_a_rate_takes_the_first_of_every_period():
+def test_a_rate_keeps_the_first_message_of_every_period():
     stamps = [START + i * SECOND // 10 for i in range(40)]
     assert kept(stamps, rate_limit=2.0) == stamps[::5]
     assert kept(stamps, rate_limit=2.0, start=0.3) == stamps[3::5]
-    # With both, a rate thins what 'every' leaves.
+    # With both, the rate thins the messages that 'every' keeps.
     assert kept(stamps, rate_limit=2.0, every=3) == [stamps[i] for i in (0, 6, 12, 15, 21, 27, 30, 36)]
     assert kept(stamps, rate_limit=1000.0) == stamps
     assert kept(stamps, rate_limit=1e12) == stamps
@@ -51,7 +51,7 @@ def test_a_rate_takes_the_first_of_every_period():
 @given(
     st.lists(st.floats(0.0, 0.3), min_size=1, max_size=120), st.floats(0.5, 30.0), st.floats(0.0, 3.0),
 )  # fmt: skip
-def test_a_rate_holds_whatever_the_jitter_and_leaves_no_period_out(gaps, rate, start):
+def test_jitter_does_not_change_the_rate(gaps, rate, start):
     stamps, now = [], START
     for gap in gaps:
         now += round(gap * SECOND)
@@ -68,7 +68,7 @@ def test_a_rate_holds_whatever_the_jitter_and_leaves_no_period_out(gaps, rate, s
 
 
 @pytest.mark.parametrize(("duration", "is_over"), [(None, False), (1.0, True), (1000.0, False)])
-def test_reading_ends_once_nothing_of_the_span_can_come(duration, is_over):
+def test_reading_ends_after_the_span(duration, is_over):
     thinning = Thinning(TimeConfig(duration=duration), START)
     assert thinning.is_over(START + 100 * SECOND) == is_over
 

@@ -58,11 +58,11 @@ TUM, KITTI = "1 0 0 0 0 0 0 1\n", "1 0 0 0 0 1 0 0 0 0 1 0\n"
         (f"{KITTI}1 0 0 0 0 1 0 0 0 0 1 x\n", " line 2: expects numbers, got '1 0 0 0 0 1 0 0 0 0 1 x'"),
         (f"{KITTI}1 0 0 0 0 1 0 0 0 0 2 0\n", " line 2: its upper left 3x3 part is not a rotation"),
         (f"{KITTI}{KITTI}" + "0 " * 12, " line 3: its upper left 3x3 part is not a rotation"),
-        # A mirror.
+        # A reflection.
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", " line 1: its upper left 3x3 part is not a rotation"),
     ],
 )
-def test_what_cannot_be_read_is_named_with_its_line(tmp_path, text, sentence):
+def test_unreadable_rows_are_named_with_their_line(tmp_path, text, sentence):
     path = tmp_path / "poses.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=f"^{re.escape(str(path) + sentence)}") as caught:
@@ -71,7 +71,7 @@ def test_what_cannot_be_read_is_named_with_its_line(tmp_path, text, sentence):
 
 
 @pytest.mark.parametrize("lost", ["2 0 0 nan 0 0 0 1", "2 0 0 0 0 0 0 0", "2 0 inf 0 0 0 0 1"])
-def test_rows_of_lost_tracking_are_no_poses(tmp_path, lost):
+def test_rows_of_lost_tracking_are_ignored(tmp_path, lost):
     path = tmp_path / "poses.txt"
     path.write_text(f"{TUM}{lost}\n3 1 0 0 0 0 0 1\n")
     found = read_rows(path)
@@ -86,8 +86,8 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm
     st.lists(st.tuples(st.integers(0, 50), st.tuples(*[st.floats(-10, 10)] * 3), quaternions), min_size=1, max_size=12),
     st.integers(-5, 55), st.integers(1, 40),
 )  # fmt: skip
-def test_a_trajectory_is_what_a_track_of_the_same_poses_is(entries, stamp, gap):
-    """In any order, and of two with one stamp the later holds."""
+def test_a_trajectory_equals_a_track_of_the_same_poses(entries, stamp, gap):
+    """Rows in any order; of two with the same stamp the later one is kept."""
     track = PoseTrack(gap)
     for entry in entries:
         assert track.add(*entry)
@@ -102,7 +102,7 @@ def test_a_trajectory_is_what_a_track_of_the_same_poses_is(entries, stamp, gap):
             np.testing.assert_allclose(matrix, expected, atol=1e-9)
 
 
-def test_the_stamp_of_a_pose_has_that_pose_however_far_the_others_are():
+def test_the_stamp_of_a_pose_has_that_pose_at_any_gap():
     rows = TrajectoryRows(None, np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([IDENTITY, TURN]))
     found = trajectory(np.array([0, 10**12]), rows)
     np.testing.assert_allclose(found.matrix_at(10**12, 5), pose_matrix((4, 5, 6), TURN))

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from log_factory import Factory
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Calibration, convert
 from octoreplay.io.sensors.cameras import FISHEYE_MODELS, POLYNOMIAL_MODELS, camera_model
 from octoreplay.records import CameraModel
+from support.log_factory import Factory
 
 HERE = "a.mcap: topic '/camera_info' at 1.000 s"
 K = (70.0, 0, 31, 0, 71, 23, 0, 0, 1)
@@ -24,7 +24,7 @@ def calibration(*, ros1: bool = False, size=(64, 48), **fields) -> Calibration:
 
 
 def polynomial(x, y, D):
-    """Where a ray's slopes fall on the image plane: OpenCV's calib3d, with up to 12 coefficients."""
+    """Image-plane position of a ray: OpenCV's calib3d, with up to 12 coefficients."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = np.pad(D, (0, 12 - len(D)))
     r2 = x * x + y * y
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
@@ -35,7 +35,7 @@ def polynomial(x, y, D):
 
 
 def fisheye(x, y, D):
-    """The same for Kannala and Brandt's model as OpenCV's fisheye module has it."""
+    """The same for Kannala and Brandt's model as in OpenCV's fisheye module."""
     r = np.hypot(x, y)
     theta = np.arctan(r)
     scale = np.divide(
@@ -56,7 +56,7 @@ def test_without_p_or_distortion_the_camera_is_k(ros1, is_rectified):
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_a_rectified_image_is_seen_by_p_and_has_no_distortion(ros1):
+def test_a_rectified_image_uses_p_without_distortion(ros1):
     info = calibration(ros1=ros1, d=(0.3, 0.1, 0, 0, 0), p=P)
     model = camera_model(info, HERE, is_rectified=True)
     assert model == CameraModel(64, 48, 60.0, 61.0, 30.0, 22.0)
@@ -115,7 +115,7 @@ slopes = st.tuples(st.floats(-0.8, 0.8), st.floats(-0.8, 0.8))
 
 
 def check_round_trip(model_name: str, project, D, slope) -> None:
-    """The pixel that a ray falls on has the ray's slopes: K is chosen so that the ray falls on pixel (2, 1)."""
+    """The pixel of a ray has the ray's slopes; K is chosen so that the ray falls on pixel (2, 1)."""
     a, b = project(np.array(slope[0]), np.array(slope[1]), D)
     k = (300.0, 0, 2 - 300.0 * float(a), 0, 310.0, 1 - 310.0 * float(b), 0, 0, 1)
     info = calibration(size=(5, 4), k=k, d=D, model=model_name)
@@ -132,7 +132,7 @@ def check_round_trip(model_name: str, project, D, slope) -> None:
 
 @given(st.sampled_from(POLYNOMIAL_MODELS), polynomials, slopes)
 @settings(max_examples=150, deadline=None)
-def test_the_pixel_that_a_ray_falls_on_leads_back_to_it(model_name, D, slope):
+def test_projected_rays_are_recovered(model_name, D, slope):
     check_round_trip(model_name, polynomial, D, slope)
 
 
@@ -141,10 +141,10 @@ def test_the_pixel_that_a_ray_falls_on_leads_back_to_it(model_name, D, slope):
     st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)),
 )  # fmt: skip
 @settings(max_examples=150, deadline=None)
-def test_the_pixel_that_a_ray_falls_on_leads_back_to_it_through_a_fisheye(model_name, D, slope):
+def test_projected_rays_are_recovered_from_a_fisheye(model_name, D, slope):
     theta = np.arctan(np.hypot(*slope))
     distorted = theta * (1 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(D)))
-    # Where the image would be folded the model has no inverse.
+    # The model has no inverse where the image folds.
     grows = all(
         1 + sum((2 * i + 3) * k * t ** (2 * i + 2) for i, k in enumerate(D)) > 0.3 for t in np.linspace(0, theta, 20)
     )
@@ -160,7 +160,7 @@ def test_the_pixel_that_a_ray_falls_on_leads_back_to_it_through_a_fisheye(model_
         ("equidistant", fisheye, (0.02, -0.005, 0.001, -0.0002)),
     ],
 )
-def test_every_pixel_of_an_image_leads_back_to_itself(model_name, project, d):
+def test_the_ray_of_every_pixel_projects_to_it(model_name, project, d):
     info = calibration(size=(64, 48), d=d, model=model_name)
     x, y = camera_model(info, HERE, is_rectified=False).slopes.astype(np.float64)
     columns, rows = np.meshgrid(np.arange(64), np.arange(48))
@@ -170,7 +170,7 @@ def test_every_pixel_of_an_image_leads_back_to_itself(model_name, project, d):
 
 
 def test_pixels_that_no_ray_of_the_lens_model_hits_are_nan():
-    """r (1 - 0.4 r^2) is at most 2/3 sqrt(1 / 1.2), so nothing falls beyond; within, the smaller root is the ray."""
+    """r (1 - 0.4 r^2) is at most 2/3 sqrt(1 / 1.2); beyond there are no rays, within the smaller root is the ray."""
     info = calibration(size=(64, 48), k=(40.0, 0, 31, 0, 40.0, 23, 0, 0, 1), d=(-0.4, 0, 0, 0, 0))
     model = camera_model(info, HERE, is_rectified=False)
     columns, rows = np.meshgrid(np.arange(64), np.arange(48))
@@ -196,7 +196,7 @@ def test_pixels_that_no_ray_of_the_lens_model_hits_are_nan():
 @example((0.3, 0.0, 0.0), (0.0, 0.0, 0.4))
 @settings(max_examples=60, deadline=None)
 def test_a_pixel_has_the_ray_from_within_the_fold_or_none(above, below):
-    """Against the table of a lens's radial factor times r from 0 to where it first falls, or has a pole."""
+    """Compared with a table of the radial factor times r, from 0 up to its first decrease or pole."""
     D = (above[0], above[1], 0, 0, above[2], *below)
     info = calibration(size=(41, 1), k=(20.0, 0, 0, 0, 20.0, 0, 0, 0, 1), d=D, model="rational_polynomial")
     model = camera_model(info, HERE, is_rectified=False)
@@ -212,7 +212,7 @@ def test_a_pixel_has_the_ray_from_within_the_fold_or_none(above, below):
     found = model.slopes[0, 0]
     is_found = np.isfinite(found)
     assert np.nanmax(np.where(is_found, found, 0.0)) <= r[end] + 2e-4
-    # Where the image hardly grows, as at the fold, a small error in pixels is a large one in slope.
+    # Near the fold a small error in pixels is a large error in slope.
     is_steep = np.interp(expected, r[:-1], steps) > 0.2 * (r[1] - r[0])
     np.testing.assert_allclose(found[is_found & is_steep], expected[is_found & is_steep], atol=1e-3)
     assert is_found[is_steep & (expected < 0.6)].all()
@@ -258,7 +258,7 @@ def test_an_unknown_model_is_refused_with_the_known_ones(model, d):
     ],
 )  # fmt: skip
 @pytest.mark.parametrize(("model", "d"), [("plumb_bob", (0.1, 0, 0, 0, 0)), ("equidistant", (0.1, 0, 0, 0))])
-def test_sizes_that_cannot_be_are_refused_without_working_out_rays(fields, model, d):
+def test_impossible_sizes_are_refused_without_computing_rays(fields, model, d):
     with pytest.raises(InputError, match=r"the camera's image cannot be .* pixels; give intrinsics"):
         camera_model(calibration(d=d, model=model, **fields), HERE, is_rectified=False)
 
@@ -268,7 +268,7 @@ def test_sizes_that_cannot_be_are_refused_without_working_out_rays(fields, model
     st.data(),
 )  # fmt: skip
 @settings(max_examples=100, deadline=None)
-def test_any_coefficients_give_a_camera_or_a_sentence(kind, data):
+def test_any_coefficients_give_a_camera_or_an_error(kind, data):
     numbers = st.floats(width=32) | st.sampled_from([0.0, 1e300, -1e300, np.nan, np.inf])
     d = data.draw(st.tuples(*[numbers] * kind[1]))
     try:

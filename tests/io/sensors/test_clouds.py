@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log_factory import Factory, ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Cloud, CloudField, Scan, convert
 from octoreplay.io.sensors.clouds import decode_cloud, decode_scan, label_field
+from support.log_factory import Factory, ros2
 
 HERE = "a.mcap: topic '/points' at 1.000 s"
 KINDS = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
@@ -39,9 +39,7 @@ def with_field(cloud: Cloud, name: str, **changes) -> Cloud:
     st.booleans(), st.sampled_from(KINDS), st.permutations(["x", "y", "z", "intensity", "label", "confidence"]),
     st.booleans(),
 )  # fmt: skip
-def test_points_and_labels_come_out_as_they_went_in(
-    height, width, kind, gap, padding, big_endian, label_kind, order, ros1
-):
+def test_points_and_labels_are_decoded_exactly(height, width, kind, gap, padding, big_endian, label_kind, order, ros1):
     num = height * width
     labels = (np.arange(num) % 100).astype(label_kind)
     sure = (np.arange(num) % 256).astype("u1")
@@ -68,7 +66,7 @@ def test_coordinates_of_mixed_types_are_wide():
     assert points.tolist() == [[1.5, 0.1, -3.0]]
 
 
-def test_rows_that_are_not_finite_or_at_the_sensor_are_left_out_with_what_goes_with_them():
+def test_points_that_are_not_finite_or_at_the_sensor_are_left_out_with_their_fields():
     columns = columns_of(5, label=np.array([5, 6, 7, 8, 9], "u2"), prob=np.array([0, 0.2, 0.4, 0.6, 1], "f4"))
     columns = {name: column.copy() for name, column in columns.items()}
     columns["y"][1], columns["y"][2] = np.nan, np.inf
@@ -94,7 +92,7 @@ def test_a_cloud_without_labels_and_one_without_points():
         assert found.labels.shape == (0,)
 
 
-def test_the_first_known_label_field_is_taken_unless_another_is_wanted():
+def test_the_first_known_label_field_is_used_unless_another_is_wanted():
     assert label_field(["x", "class_id", "semantic"]) == "semantic"
     assert label_field(["x", "class_id", "semantic"], "x") == "x"
     assert label_field(["class_id"], "semantic") is None
@@ -109,12 +107,12 @@ def test_the_first_known_label_field_is_taken_unless_another_is_wanted():
 
 
 @pytest.mark.parametrize("wanted", ["wanted_labels", "wanted_confidences"])
-def test_a_wanted_field_must_be_there(wanted):
+def test_a_wanted_field_must_exist(wanted):
     with pytest.raises(InputError, match=r"^a\.mcap: .* no usable field 'kind'; its fields are x, y, z, label"):
         decode_cloud(cloud_of(columns_of(1, label=np.ones(1, "u1"))), HERE, **{wanted: "kind"})
 
 
-def test_labels_that_are_no_numbers_or_beyond_all_numbers_are_minus_one():
+def test_labels_that_are_nan_or_out_of_range_are_minus_one():
     odd = np.array([np.nan, 3, np.inf, -np.inf, 1e30, -2], "f4")
     assert decode_cloud(cloud_of(columns_of(6, label=odd)), HERE).labels.tolist() == [-1, 3, -1, -1, -1, -2]
     assert decode_cloud(cloud_of(columns_of(1, label=np.array([1e300]))), HERE).labels.tolist() == [-1]
@@ -133,7 +131,7 @@ def test_confidences_are_255ths():
 @pytest.mark.parametrize("big_endian", [False, True])
 @pytest.mark.parametrize("gap", [0, 3])
 def test_packed_colours_are_unpacked_as_pcl_packs_them(name, kind, big_endian, gap):
-    """PCL: a << 24 | r << 16 | g << 8 | b, and where the field is a float these are its bits."""
+    """PCL: a << 24 | r << 16 | g << 8 | b, as an integer or as the bits of a float."""
     red, green, blue, alpha = (np.array(c, np.uint32) for c in ([1, 250], [2, 128], [3, 0], [255, 0x7F]))
     packed = (alpha << 24 | red << 16 | green << 8 | blue).view(kind)
     cloud = cloud_of(columns_of(2, **{name: packed}), big_endian=big_endian, gap=gap)
@@ -160,7 +158,7 @@ def test_missing_and_odd_coordinates_are_refused():
             decode_cloud(with_field(cloud_of(columns_of(2)), "y", **changes), HERE)
 
 
-def test_a_field_that_cannot_be_used_is_no_label_unless_it_is_wanted():
+def test_an_unusable_field_is_ignored_unless_it_is_wanted():
     cloud = with_field(cloud_of(columns_of(2, label=np.ones(2, "u4"), prob=np.ones(2, "u1"))), "label", count=2)
     cloud = with_field(cloud, "prob", kind="")
     found = decode_cloud(cloud, HERE)
@@ -194,10 +192,10 @@ HUGE = 2**32 - 1
         {"row_step": 1, "height": 40_000, "width": 1},
     ],
 )  # fmt: skip
-def test_sizes_that_cannot_be_are_damage_and_take_no_memory(changes):
+def test_impossible_sizes_are_damage_and_take_no_memory(changes):
     cloud = cloud_of(columns_of(6000), height=2)
     tracemalloc.start()
-    with pytest.raises(DamagedMessageError, match=r"^a\.mcap: .* are announced"):
+    with pytest.raises(DamagedMessageError, match=r"^a\.mcap: .* are expected"):
         decode_cloud(dataclasses.replace(cloud, **changes), HERE)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -219,7 +217,7 @@ sizes = st.integers(0, 5) | st.integers(0, 40) | st.sampled_from([HUGE, 1 << 31,
                        st.integers(1, 2)), max_size=7),
 )  # fmt: skip
 @settings(max_examples=400)
-def test_any_cloud_gives_points_or_a_sentence(data, height, width, point_step, row_step, big_endian, fields):
+def test_any_cloud_gives_points_or_an_error(data, height, width, point_step, row_step, big_endian, fields):
     fields = tuple(CloudField(*field) for field in fields)
     for wanted in (None, "rgb"):
         cloud = Cloud(0, "", height, width, fields, big_endian, point_step, row_step, data)
@@ -250,7 +248,7 @@ def test_ranges_that_carry_no_information_are_left_out():
     ranges = [np.nan, 0.49, 0.5, np.inf, 10.0, 10.1, -np.inf, -3, 0.0]
     found = decode_scan(scan_of(ranges, angle_increment=0.0))
     np.testing.assert_array_equal(found.points, [[0.5, 0, 0], [10, 0, 0]])
-    # Without a limit nothing at the sensor itself is a point either.
+    # Without a limit, a range of 0 is no point either.
     found = decode_scan(scan_of([0.0, -1.0, 1e-3, np.inf], angle_increment=0.0, range_min=0.0, range_max=math.inf))
     np.testing.assert_array_equal(found.points, [[1e-3, 0, 0]])
     assert decode_scan(scan_of([1.0], range_max=np.nan)).points.shape == (0, 3)
@@ -258,13 +256,13 @@ def test_ranges_that_carry_no_information_are_left_out():
 
 
 def test_a_recorded_range_limit_includes_itself():
-    """Both are float32 in the message, so that nothing is lost between them."""
+    """Limit and range are float32 in the message, so that the comparison is exact."""
     scan = convert("sensor_msgs/msg/LaserScan", ros2.scan(0, [0.1, 0.7], limits=(0.1, 0.7)))
     assert len(decode_scan(scan).points) == 2
 
 
 def test_clouds_of_more_points_than_memory_are_refused():
-    """Points of one byte: a chunk of zeros becomes hundreds of times as many bytes as it takes in the file."""
+    """Points of one byte: a compressed chunk of zeros expands by a factor of hundreds."""
     fields = tuple(CloudField(name, 0, "u1") for name in "xyz")
     size = (1 << 26) + 1
     cloud = Cloud(5, "lidar", 1, size, fields, False, 1, size, bytes(size))

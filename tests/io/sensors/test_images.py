@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log_factory import ros2
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import CompressedImage, Image, convert
@@ -25,6 +24,7 @@ from octoreplay.io.sensors.images import (
     decode_labels,
     encoding_and_size,
 )
+from support.log_factory import ros2
 
 HERE = "a.mcap: topic '/x' at 1.000 s"
 KINDS = {
@@ -55,7 +55,7 @@ def pixels_of(kind: str, height: int, width: int) -> np.ndarray:
 
 
 def colors(height: int = 5, width: int = 6) -> np.ndarray:
-    """Red, green, blue and alpha, all different."""
+    """Pixels with different values of red, green, blue and alpha."""
     return (
         np.random.default_rng(3).permutation(np.arange(height * width * 4) % 251).astype("u1").reshape(height, width, 4)
     )
@@ -73,7 +73,7 @@ def saved(image: PIL.Image.Image, form: str, **options) -> bytes:
 
 
 def png_head(width: int, height: int) -> bytes:
-    """A PNG that announces a size and holds almost nothing."""
+    """PNG whose header gives a size and that holds almost no data."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
@@ -87,7 +87,7 @@ def png_head(width: int, height: int) -> bytes:
 
 
 @given(st.sampled_from(sorted(DEPTH_ENCODINGS)), st.integers(1, 7), st.integers(1, 9), st.integers(0, 5), st.booleans())
-def test_depth_comes_out_as_it_went_in(encoding, height, width, padding, big_endian):
+def test_depth_is_decoded_exactly(encoding, height, width, padding, big_endian):
     pixels = pixels_of(KINDS[encoding], height, width)
     image, unit = decode_depth(raw(pixels, encoding, padding=padding, big_endian=big_endian), HERE)
     assert unit == {"u2": 0.001, "f4": 1.0}[KINDS[encoding]]
@@ -99,7 +99,7 @@ def test_depth_comes_out_as_it_went_in(encoding, height, width, padding, big_end
 
 
 @given(st.sampled_from(sorted(set(LABEL_ENCODINGS) & set(KINDS))), st.integers(0, 5), st.booleans())
-def test_labels_come_out_as_they_went_in(encoding, padding, big_endian):
+def test_labels_are_decoded_exactly(encoding, padding, big_endian):
     pixels = pixels_of(KINDS[encoding], 5, 6)
     labels = decode_labels(raw(pixels, encoding, padding=padding, big_endian=big_endian), HERE)
     assert labels.pixels.dtype == pixels.dtype
@@ -110,7 +110,7 @@ def test_labels_come_out_as_they_went_in(encoding, padding, big_endian):
 
 @pytest.mark.parametrize("encoding", sorted(COLOR_ORDERS))
 @pytest.mark.parametrize("padding", [0, 3])
-def test_colours_are_red_green_blue_whatever_their_order(encoding, padding):
+def test_colours_are_rgb_for_every_channel_order(encoding, padding):
     stored = np.ascontiguousarray(colors()[..., COLOR_ORDERS[encoding]])
     message = dataclasses.replace(raw(stored.reshape(5, -1), encoding, padding=padding), width=6)
     labels = decode_labels(message, HERE)
@@ -150,7 +150,7 @@ def test_the_last_row_may_lack_its_padding():
 
 @pytest.mark.parametrize("unit", [None, 0.01])
 @pytest.mark.parametrize("encoding", ["rgb8", "yuv422", "16SC1", "32SC1", "bayer_rggb8", "", "64FC1"])
-def test_other_encodings_hold_no_depth_whatever_the_unit(encoding, unit):
+def test_other_encodings_hold_no_depth_with_any_unit(encoding, unit):
     message = dataclasses.replace(raw(pixels_of("u1", 3, 24), "mono8"), encoding=encoding, width=2)
     with pytest.raises(InputError, match=f"'{encoding}' holds no depth; 16UC1, mono16, 32FC1, PNG and compressedDepth"):
         decode_depth(message, HERE, unit)
@@ -164,15 +164,15 @@ def test_other_encodings_hold_no_labels(encoding):
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
-def test_eight_bits_hold_depth_where_their_unit_is_given(encoding):
-    with pytest.raises(InputError, match="8 bits where depth_unit is given"):
+def test_eight_bits_hold_depth_with_a_given_unit(encoding):
+    with pytest.raises(InputError, match="8 bits with depth_unit"):
         decode_depth(raw(pixels_of("u1", 3, 4), encoding), HERE)
     image, unit = decode_depth(raw(pixels_of("u1", 3, 4), encoding), HERE, 0.05)
     assert (image.dtype, unit) == (np.uint8, 0.05)
     np.testing.assert_array_equal(image, pixels_of("u1", 3, 4))
 
 
-def test_a_given_unit_takes_the_place_of_the_encodings():
+def test_a_given_unit_replaces_the_encodings():
     assert decode_depth(raw(pixels_of("u2", 3, 4), "16UC1"), HERE, 0.0002)[1] == 0.0002
     assert decode_depth(encoded(png(pixels_of("u2", 3, 4))), HERE, 0.0002)[1] == 0.0002
 
@@ -182,7 +182,7 @@ def test_a_given_unit_takes_the_place_of_the_encodings():
     [("height", 0), ("width", 0), ("step", 7), ("height", 1000), ("width", 2**32 - 1), ("step", 2**32 - 1)],
 )
 @pytest.mark.parametrize("read", [decode_depth, decode_labels, decode_confidences])
-def test_sizes_that_cannot_be_are_damage(read, field, value):
+def test_impossible_sizes_are_damage(read, field, value):
     message = dataclasses.replace(raw(pixels_of("u2", 3, 4), "16UC1"), **{field: value})
     with pytest.raises(DamagedMessageError):
         read(message, HERE)
@@ -260,7 +260,7 @@ def test_colours_of_16_bits_are_no_labels():
 
 
 def compressed_depth(png_bytes: bytes, a: float = 0.0, b: float = 0.0) -> bytes:
-    """compressed_depth_image_transport's bytes: a number of its format, two parameters, a PNG."""
+    """Bytes of compressed_depth_image_transport: format number, two parameters, a PNG."""
     return struct.pack("<iff", 0, a, b) + png_bytes
 
 
@@ -277,7 +277,7 @@ def test_compressed_depth_of_16_bits_is_a_png_after_12_bytes(height, width):
 @pytest.mark.parametrize("form", ["32FC1; compressedDepth", "32FC1; compressedDepth png"])
 @pytest.mark.parametrize("quantisation", [50.0, 100.0])
 def test_compressed_depth_of_floats_is_quantised_inverse_depth(form, quantisation):
-    """The encoder as the transport documents it: A = q (q + 1), B = 1 - A / max, value = A / depth + B."""
+    """Encoder of the transport: A = q (q + 1), B = 1 - A / max, value = A / depth + B."""
     depth_max = 10.0
     depth = np.linspace(0.6, 9.9, 63, dtype=np.float32).reshape(7, 9)
     a = quantisation * (quantisation + 1.0)
@@ -289,7 +289,7 @@ def test_compressed_depth_of_floats_is_quantised_inverse_depth(form, quantisatio
     found, unit = decode_depth(message, HERE)
     assert (found.dtype, unit) == (np.float32, 1.0)
     assert np.isnan(found[2, 3])
-    # Half a step of the value is depth^2 / (2 A) of depth; a little more for float32.
+    # Half a step of the value is depth^2 / (2 A) in depth, plus the rounding of float32.
     error = np.abs(found - depth)
     error[2, 3] = 0.0
     assert (error <= depth.astype(np.float64) ** 2 / (2 * a) * 1.01 + 1e-5).all()
@@ -302,7 +302,7 @@ def test_odd_parameters_of_compressed_depth_give_odd_depth_without_warnings(para
     assert decode_depth(message, HERE)[0].shape == (3, 4)
 
 
-def test_compressed_depth_that_is_none():
+def test_empty_or_unsupported_compressed_depth():
     with pytest.raises(DamagedMessageError, match="the compressed depth image is empty"):
         decode_depth(encoded(b"\0" * 12, "16UC1; compressedDepth png"), HERE)
     with pytest.raises(DamagedMessageError, match="image cannot be decoded"):
@@ -323,14 +323,14 @@ def test_too_large_images_are_refused_before_they_are_decoded(size):
 
 
 @pytest.mark.parametrize("size", [(8000, 8000), (60_000, 1000)])
-def test_room_is_only_made_for_pixels_that_the_bytes_can_hold(monkeypatch, size):
+def test_memory_is_allocated_only_for_pixels_that_the_bytes_can_hold(monkeypatch, size):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("made room"))
     for read in (decode_depth, decode_labels, decode_confidences):
         with pytest.raises(DamagedMessageError, match="cannot be decoded"):
             read(encoded(png_head(*size)), HERE)
 
 
-def test_images_of_one_value_are_decoded_however_small_their_files():
+def test_images_of_one_value_are_decoded_from_small_files():
     for pixels in (np.zeros((2000, 3000), np.uint16), np.zeros((2000, 3000), np.uint8)):
         np.testing.assert_array_equal(decode_labels(encoded(png(pixels)), HERE).pixels, pixels)
     single_bits = saved(PIL.Image.fromarray(np.zeros((4000, 6000), bool)), "PNG")
@@ -338,7 +338,7 @@ def test_images_of_one_value_are_decoded_however_small_their_files():
     for quality in (1, 95):
         jpeg = saved(PIL.Image.fromarray(np.zeros((2000, 3000), np.uint8)), "JPEG", quality=quality, progressive=True)
         assert decode_depth(encoded(jpeg, "jpeg"), HERE, 0.1)[0].shape == (2000, 3000)
-        with pytest.raises(InputError, match="a lossy image of ids holds no labels"):
+        with pytest.raises(InputError, match="lossy compression changes label ids"):
             decode_labels(encoded(jpeg, "jpeg"), HERE)
 
 
@@ -386,7 +386,7 @@ def test_garbage_is_damage(garbage, magic):
 # --- confidences -----------------------------------------------------------------------------------------------------
 
 
-def test_confidences_are_255ths_of_whatever_the_largest_value_is():
+def test_confidences_are_255ths_of_the_types_largest_value():
     bytes_ = np.array([[0, 1, 255]], "u1")
     np.testing.assert_array_equal(decode_confidences(raw(bytes_, "mono8"), HERE), bytes_)
     words = np.array([[0, 257, 129, 65535]], "u2")

@@ -27,13 +27,13 @@ MEANING = {0: 1, 3: 1, 40000: 2, 100000: 3, 9: 0, 255: 0, 65535: 0}
     st.sampled_from(["u1", "u2", "i2", "i4", "i8"]),
     st.lists(st.sampled_from([0, 3, 9, 255, 40000, 65535, 100000, 5, 77, 300, -1, -5, 2**31 - 1]), max_size=30),
 )
-def test_every_raw_label_means_what_the_table_says(kind, values):
+def test_raw_labels_map_to_the_classes_of_the_table(kind, values):
     limits = np.iinfo(kind)
     raw = np.array([v for v in values if limits.min <= v <= limits.max], kind)
     lookup = LabelLookup(TABLE)
     class_ids = lookup.class_ids(raw, "here")
     assert class_ids.dtype == np.uint8
-    # Above 16 bits are instances.
+    # Bits above the lowest 16 are instance ids.
     meaning = {v: MEANING.get(v, MEANING.get(v & 0xFFFF) if v > 0xFFFF else None) for v in raw.tolist()}
     assert class_ids.tolist() == [meaning[v] or 0 for v in raw.tolist()]
     unknown = [v for v in raw.tolist() if meaning[v] is None and v != -1 and (v <= 0xFFFF or v & 0xFFFF != 0xFFFF)]
@@ -41,7 +41,7 @@ def test_every_raw_label_means_what_the_table_says(kind, values):
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "i4"])
-def test_shape_is_kept_and_unknown_ones_add_up(kind):
+def test_the_shape_is_kept_and_unknown_labels_are_counted(kind):
     lookup = LabelLookup(TABLE)
     raw = np.array([[3, 8, 8], [8, 3, 0]], kind)
     for _ in range(2):
@@ -85,7 +85,7 @@ def test_tables_that_cannot_be_united_are_refused(names, sentence):
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "i8"])
-def test_images_and_points_of_ids_mean_the_same(kind):
+def test_ids_of_images_and_points_map_to_the_same_classes(kind):
     raw = np.array([[3, 8, 9], [0, 0, 255]], kind)
     lookup = LabelLookup(TABLE)
     np.testing.assert_array_equal(lookup.of_image(LabelImage(raw), "here"), [[1, 0, 0], [1, 1, 0]])
@@ -128,7 +128,7 @@ def number(color):
 
 
 @given(st.lists(st.sampled_from([*COLOR_MEANING, (9, 9, 9), (0, 100, 200), (200, 100, 1), (255, 0, 0)]), max_size=40))
-def test_every_colour_means_what_the_table_says(colors):
+def test_colours_map_to_the_classes_of_the_table(colors):
     lookup = COLOR_LOOKUP
     lookup.unknown_colors = {}
     class_ids = lookup.class_ids_of_colors(np.array(colors, np.uint8).reshape(-1, 3), "here", is_lossy=False)
@@ -149,7 +149,7 @@ def test_colours_of_images_keep_their_shape_and_memory_order():
 
 
 def nearest_class(color):
-    """The obvious way: the class of the nearest colour, where it is nearer than half-way to the next and than 40."""
+    """Naive version: the class of the nearest colour within half of its distance to the next one and within 40."""
     distance = {known: math.dist(color, known) for known in COLOR_MEANING}
     for known, class_id in COLOR_MEANING.items():
         least = min(math.dist(known, other) for other in COLOR_MEANING if other != known)
@@ -159,7 +159,7 @@ def nearest_class(color):
     return None
 
 
-def test_lossy_colours_are_the_nearest_ones_up_to_half_way():
+def test_lossy_colours_match_within_half_of_the_distance_to_the_next():
     rng = np.random.default_rng(3)
     known = np.array(list(COLOR_MEANING))
     near = known[rng.integers(len(known), size=4000)] + rng.integers(-45, 46, (4000, 3)) * rng.random((4000, 1))
@@ -196,16 +196,16 @@ def test_a_photograph_does_not_fill_the_memory_with_colours():
     [
         (
             ClassTable((SemanticClass(1, "road", (1, 2, 255), ()), SemanticClass(2, "tower", (1, 2, 255), ()))),
-            "#0102ff means both 'road' and 'tower'; join them with merge_classes",
+            "#0102ff is both 'road' and 'tower'; join them with merge_classes",
         ),
-        (ClassTable((SemanticClass(1, "a", (1, 2, 3), ()),), (), ((1, 2, 3),)), "#010203 means 'a' and is ignored"),
+        (ClassTable((SemanticClass(1, "a", (1, 2, 3), ()),), (), ((1, 2, 3),)), "#010203 is both 'a' and ignored"),
         (
             ClassTable((SemanticClass(1, "a", (1, 2, 3), (), ()),)),
-            "no class has one; give every class",
+            "no class has a colour; give every class",
         ),
     ],
 )
-def test_colours_that_tell_no_classes_apart_are_refused_when_they_are_needed(table, sentence):
+def test_ambiguous_colours_are_refused_when_they_are_used(table, sentence):
     lookup = LabelLookup(table)
     assert lookup.class_ids(np.array([255], np.uint8), "here").tolist() == [0]
     for is_lossy in (False, True):
@@ -213,7 +213,7 @@ def test_colours_that_tell_no_classes_apart_are_refused_when_they_are_needed(tab
             lookup.class_ids_of_colors(np.zeros((1, 3), np.uint8), "here", is_lossy=is_lossy)
 
 
-def test_strict_refuses_unknown_colours_but_not_what_compression_made():
+def test_strict_refuses_unknown_colours_of_lossless_images_only():
     lookup = LabelLookup(COLORS, strict=True)
     image = np.array([(200, 100, 0), (1, 10, 171)], np.uint8)
     with pytest.raises(InputError, match=r"^here: colour #010aab is not in the class table; add it to a class's"):
@@ -222,6 +222,6 @@ def test_strict_refuses_unknown_colours_but_not_what_compression_made():
     assert lookup.unknown_colors == {0x0000A0: 1}
 
 
-def test_colours_of_a_label_info_are_made_up():
+def test_colours_of_a_label_info_match_no_image():
     table = class_table_from_names({"a": {1: "ground", 2: "tree"}})
     assert [item.raw_colors for item in table.classes] == [(), ()]

@@ -1,3 +1,4 @@
-"""Tables of classes: those of well-known data sets (the CSV files here; SOURCES.md says where they are from), files of
-other mapping tools, and what a team makes of a table by merging and ignoring.
+"""Class tables of well-known data sets and of other mapping tools, and edits of class tables.
+
+The CSV files are the built-in tables; SOURCES.md lists their sources.
 """

@@ -1,4 +1,4 @@
-"""Lists of labels, one row each, and the class tables that they make: built in, Hydra's and Kimera-Semantics'."""
+"""Rows of label lists (built-in, Hydra, Kimera-Semantics) and the class tables made from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BUILT_IN = ("semantickitti", "cityscapes", "coco-stuff", "ade20k", "nyu40")
 """Names of the tables that come with octoreplay; docs/classes.md lists their sources."""
 
 UNLABELLED_NAMES = frozenset({"unlabeled", "unlabelled", "unknown", "ignore", "ignored", "void", "invalid"})
-"""Names that mean 'no usable label' in any spelling of capitals."""
+"""Names of labels without a class, in lower case."""
 
 _KIMERA_HEADER = "name,red,green,blue,alpha,id"
 _KIMERA_UNKNOWN = 0
@@ -24,7 +24,7 @@ _WHITE = (255, 255, 255)
 
 @dataclass(frozen=True)
 class LabelRow:
-    """One raw label, or a further colour of it: what it is called, its colour if it has one, and if it is ignored."""
+    """One raw label with its name, its colour if any, and whether it is ignored; a label may have several rows."""
 
     raw_label: int
     name: str
@@ -33,7 +33,7 @@ class LabelRow:
 
 
 def built_in_rows(name: str) -> tuple[LabelRow, ...]:
-    """The rows of a table of ``BUILT_IN``, in the order of their raw labels."""
+    """Return the rows of a built-in table, in the order of their raw labels."""
     text = resources.files(__package__).joinpath(f"{name}.csv").read_text(encoding="utf-8")
     return tuple(
         LabelRow(int(row["id"]), row["name"], _color((row["r"], row["g"], row["b"])), row["ignored"] == "1")
@@ -42,9 +42,9 @@ def built_in_rows(name: str) -> tuple[LabelRow, ...]:
 
 
 def hydra_rows(content: Mapping[str, Any]) -> tuple[LabelRow, ...]:
-    """The rows of a Hydra label space: ``label_names``, of which dynamic and invalid labels are ignored.
+    """Return the rows of a Hydra label space; its dynamic and invalid labels are ignored.
 
-    Raises ConfigError where the mapping is no label space.
+    Raises ConfigError if the mapping is not a label space.
     """
     entries = content["label_names"]
     if not isinstance(entries, list) or not all(map(_is_named, entries)):
@@ -63,7 +63,7 @@ def _is_named(entry: Any) -> bool:
 
 
 def _whole_numbers(content: Mapping[str, Any], key: str) -> Sequence[int]:
-    """A list of labels. Raises ConfigError where it holds something else."""
+    """List of labels at a key. Raises ConfigError if it holds anything else than whole numbers."""
     values = content.get(key) or ()
     if not isinstance(values, list | tuple) or not all(type(value) is int for value in values):
         raise ConfigError(f"{key}: expects whole numbers")
@@ -71,10 +71,10 @@ def _whole_numbers(content: Mapping[str, Any], key: str) -> Sequence[int]:
 
 
 def kimera_rows(text: str) -> tuple[LabelRow, ...]:
-    """The rows of a Kimera-Semantics palette: CSV with the columns name, red, green, blue, alpha, id.
+    """Return the rows of a Kimera-Semantics palette: CSV with the columns name, red, green, blue, alpha, id.
 
-    Its ids are the labels: the objects of one id are one class, named by the first of them. Id 0 and white are its
-    unknown label. Raises ConfigError where the text is no palette.
+    The ids are the labels. All objects of one id are one class with the name of the first. Id 0 and white mean
+    unknown. Raises ConfigError if the text is not a palette.
     """
     lines = text.splitlines()
     if not lines or lines[0].strip() != _KIMERA_HEADER:
@@ -84,7 +84,7 @@ def kimera_rows(text: str) -> tuple[LabelRow, ...]:
     for index, line in enumerate(lines[1:]):
         if not line.strip():
             continue
-        # Names may hold commas, in quotes or not; what follows them are five numbers.
+        # A name may contain commas, quoted or not. Five numbers follow it.
         name, *numbers = line.rsplit(",", 5)
         name, color = name.strip('"'), _color(numbers[:3])
         if color is None or not _is_number(numbers[-1]):
@@ -97,29 +97,29 @@ def kimera_rows(text: str) -> tuple[LabelRow, ...]:
 
 
 def _is_number(text: str) -> bool:
-    """True for a whole number of a size that labels have."""
+    """True for a whole number in the range of labels."""
     return text.strip().isdecimal() and len(text) < 20
 
 
 def _color(texts: Sequence[str]) -> Color | None:
-    """A colour from three texts; None where they are not three whole numbers from 0 to 255."""
+    """Colour from three texts; None unless they are three whole numbers from 0 to 255."""
     if len(texts) != 3 or not all(_is_number(text) and int(text) <= 255 for text in texts):
         return None
     return int(texts[0]), int(texts[1]), int(texts[2])
 
 
 def table_of_rows(rows: Iterable[LabelRow], palette: Sequence[Color]) -> ClassTable:
-    """The class table of some rows: rows of one name are one class, in the order in which the names come first.
+    """Return the class table of some rows. Rows of one name are one class; classes are ordered by first occurrence.
 
-    A class without a colour takes one of ``palette``, and no colour in an image means it. A colour that a class shares
-    with an ignored label means the class. Raises ConfigError where one raw label has two names.
+    A class without a colour gets one of ``palette`` and no raw colours. A colour shared by a class and an ignored
+    label belongs to the class. Raises ConfigError for a raw label with two names.
     """
     rows = tuple(rows)
     names: dict[int, str] = {}
     members: dict[str, list[LabelRow]] = {}
     for row in rows:
         if names.setdefault(row.raw_label, row.name) != row.name:
-            raise ConfigError(f"raw label {row.raw_label} means both '{names[row.raw_label]}' and '{row.name}'")
+            raise ConfigError(f"raw label {row.raw_label} belongs to both '{names[row.raw_label]}' and '{row.name}'")
         if not _is_unlabelled(row):
             members.setdefault(row.name, []).append(row)
     classes = tuple(
@@ -127,26 +127,26 @@ def table_of_rows(rows: Iterable[LabelRow], palette: Sequence[Color]) -> ClassTa
         for index, (name, found) in enumerate(members.items())
     )
     ignored = [row for row in rows if _is_unlabelled(row)]
-    meant = {color for item in classes for color in item.raw_colors}
+    class_colors = {color for item in classes for color in item.raw_colors}
     return ClassTable(
         classes,
         tuple(dict.fromkeys(row.raw_label for row in ignored)),
-        tuple(color for color in dict.fromkeys(_colors(ignored)) if color not in meant),
+        tuple(color for color in dict.fromkeys(_colors(ignored)) if color not in class_colors),
     )
 
 
 def _is_unlabelled(row: LabelRow) -> bool:
-    """True where a row's label is ignored, also by its name."""
+    """True if a row's label is ignored, by its flag or its name."""
     return row.is_ignored or row.name.strip().lower() in UNLABELLED_NAMES
 
 
 def _colors(rows: Iterable[LabelRow]) -> Iterator[Color]:
-    """The colours of some rows."""
+    """Colours of the rows that have one."""
     return (row.color for row in rows if row.color is not None)
 
 
 def _class_of_rows(class_id: int, name: str, rows: Sequence[LabelRow], default: Color) -> SemanticClass:
-    """One class from its rows."""
+    """Class made of its rows."""
     colors = tuple(dict.fromkeys(_colors(rows)))
     raw_labels = tuple(sorted({row.raw_label for row in rows}))
     return SemanticClass(class_id, name, colors[0] if colors else default, raw_labels, colors)

@@ -1,1 +1,1 @@
-"""Folders of other people's data, written as logs."""
+"""Import of public datasets' folders as logs."""

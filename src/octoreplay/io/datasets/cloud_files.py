@@ -1,4 +1,4 @@
-"""Files of one point cloud: PCD, PLY and KITTI's ``.bin`` with ``.label``."""
+"""Point cloud files: PCD, PLY and KITTI's ``.bin`` with ``.label``."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from octoreplay.io.datasets.ply_files import raw_labels, read_ply
 from octoreplay.io.sensors.clouds import LABEL_FIELDS
 
 FORMATS = {".pcd": "PCD", ".ply": "PLY", ".bin": "KITTI"}
-"""What files with these endings are."""
+"""Format of each file suffix."""
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _KITTI_COLUMNS = ("x", "y", "z", "intensity")
-_REMEDY = "fetch it again or take it out of the folder"
+_REMEDY = "fetch it again or remove it from the folder"
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """The P points of a file as they are there: (P, 3) float32 or float64 metres, rows that are not finite too.
+    """Points (P, 3) of a file, float32 or float64 metres, including rows that are not finite.
 
-    ``labels`` is (P,) uint32 raw labels, 65535 for what is no label; ``rgb`` (P,) uint32 0x00RRGGBB; ``intensity``
-    (P,) float32; each None where the file has none. ``num_extra_columns`` of the file have no name and were not read.
+    ``labels`` is (P,) uint32 raw labels, 65535 where invalid; ``rgb`` (P,) uint32 0x00RRGGBB; ``intensity`` (P,)
+    float32; each None where the file has none. ``num_extra_columns`` columns have no name and were not read.
     """
 
     points: npt.NDArray[Any]
@@ -39,9 +39,9 @@ class Cloud:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The cloud of a file, which its ending tells the format of.
+    """Return the cloud of a file; the suffix gives the format.
 
-    Raises InputError where it is damaged, cut or has no fields x, y and z.
+    Raises InputError where the file is damaged, cut or has no fields x, y and z.
     """
     suffix = path.suffix.lower()
     if suffix == ".pcd":
@@ -51,11 +51,11 @@ def read_cloud(path: Path) -> Cloud:
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise InputError(
-            f"{path}: has no field '{missing[0]}' of one number a point; its fields are {', '.join(columns)}"
+            f"{path}: has no field '{missing[0]}' with one number per point; its fields are {', '.join(columns)}"
         )
     kind = np.result_type(np.float32, *(columns[name].dtype for name in "xyz" if columns[name].dtype.kind == "f"))
     label_field = next((name for name in LABEL_FIELDS if name in columns), None)
-    # A damaged number may be none at all, or too large for its new type; neither is worth a warning of its own.
+    # Damaged numbers may be NaN or too large for the type; numpy must not warn of them.
     with np.errstate(over="ignore", invalid="ignore"):
         return Cloud(
             np.stack([columns[name] for name in "xyz"], axis=1).astype(kind),
@@ -67,21 +67,21 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def read_kitti_labels(path: Path, num_points: int) -> npt.NDArray[np.uint32]:
-    """The labels (P,) of a KITTI ``.label`` file: the low 16 bits of each number; the high ones name the instance.
+    """Return the labels (P,) of a KITTI ``.label`` file: the low 16 bits of each number, without the instance bits.
 
-    Raises InputError where it is not as long as its cloud of ``num_points``.
+    Raises InputError where the file does not hold ``num_points`` labels.
     """
     data = _read_bytes(path)
     if len(data) != 4 * num_points:
         raise InputError(
             f"{path}: holds {len(data) / 4:g} labels of 4 bytes, but its cloud has {num_points} points; it is cut, or "
-            "of another cloud"
+            "belongs to another cloud"
         )
     return np.frombuffer(data, "<u4") & np.uint32(0xFFFF)
 
 
 def _read_ply(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """The properties of the element 'vertex', in the machine's byte order."""
+    """Properties of the element 'vertex', in native byte order."""
     ply = read_ply(path, _REMEDY)
     points = ply["vertex"].data
     return {
@@ -92,18 +92,19 @@ def _read_ply(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def _read_kitti(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """x, y, z and intensity of KITTI's Velodyne."""
+    """Columns x, y, z and intensity of a KITTI file."""
     data = _read_bytes(path)
     if path.name.lower().endswith(".pcd.bin") or len(data) % 16:
         raise InputError(
             f"{path}: {len(data)} bytes are not KITTI's points of 16 bytes (x y z intensity as float32); it is cut, or "
-            "of another layout such as that of nuScenes: write it as PCD or PLY"
+            "has another layout such as that of nuScenes: convert it to PCD or PLY"
         )
     points = np.frombuffer(data, "<f4").reshape(-1, 4)
     return {name: points[:, k] for k, name in enumerate(_KITTI_COLUMNS)}
 
 
 def _read_bytes(path: Path) -> bytes:
+    """Content of a file. Raises InputError where it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -111,7 +112,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _rgb(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.uint32] | None:
-    """Colours packed as 0x00RRGGBB: of PCL's field rgb or rgba, whose bits they are, or of three fields of a byte."""
+    """Colours 0x00RRGGBB from the bits of PCL's field rgb or rgba, or from three uint8 fields; None without colours."""
     for name in ("rgb", "rgba"):
         if name in columns and columns[name].dtype.itemsize == 4:
             return np.ascontiguousarray(columns[name]).view(np.uint32) & np.uint32(0xFFFFFF)

@@ -1,8 +1,9 @@
-"""Folders of point clouds with poses, turned into ordinary logs.
+"""Import of folders of point clouds with poses.
 
-Clouds are PCD, PLY or KITTI's ``.bin``, of one kind in a folder. Labels are a field of the cloud or KITTI's ``.label``
-files. Poses are a table (TUM, KITTI), a 4x4 matrix beside every cloud, or the VIEWPOINT of PCD files. Times are a
-table, numbers in the files' names, or a rate.
+- Clouds: PCD, PLY or KITTI's ``.bin``, one format per folder.
+- Labels: a field of the cloud, or KITTI's ``.label`` files.
+- Poses: a table (TUM, KITTI), a 4x4 matrix beside every cloud, or the VIEWPOINT of PCD files.
+- Times: a table, numbers in the file names, or a rate.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, TypeVar
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +22,16 @@ from octoreplay.errors import InputError
 from octoreplay.io.datasets.cloud_files import FORMATS, read_cloud, read_kitti_labels
 from octoreplay.io.datasets.frames_folder import (
     check_choice,
+    check_folder,
     chosen_frames,
+    entries_of_chosen,
+    files_in,
     frame_stamps,
     natural_order,
     read_times,
     robot_name,
     unfinished,
+    write_frames,
 )
 from octoreplay.io.datasets.pcd import read_viewpoint
 from octoreplay.io.datasets.pose_files import PoseReader, PoseTable, matrix_reader, read_poses
@@ -37,12 +42,11 @@ from octoreplay.records import ClassTable, Float64Array
 from octoreplay.transforms import pose_matrix, rotation_to_quaternion
 
 CloudFrameName: TypeAlias = Literal["sensor", "world"]
-"""What a cloud's points are given in: the sensor's frame, or the one that the poses are given in."""
+"""Frame of a cloud's points: the sensor's frame, or the frame that the poses are given in."""
 
-_T = TypeVar("_T")
 _VIEWPOINT = "VIEWPOINT"
-# Numbers in file names that are times: seconds_nanoseconds; seconds with a fraction; a whole number of seconds,
-# milliseconds, microseconds or nanoseconds since 1970, which any time after 2001 gives 10, 13, 16 or 19 digits.
+# Times in file names: seconds_nanoseconds; seconds with a fraction; seconds, milliseconds, microseconds or nanoseconds
+# since 1970, which have 10, 13, 16 or 19 digits after 2001.
 _SECONDS_AND_NANOSECONDS = re.compile(r"(?<!\d)([1-9]\d{8,9})_(\d{9})(?!\d)")
 _SECONDS = re.compile(r"(?<![\d.])\d+\.\d+(?![\d.])")
 _EPOCH = re.compile(r"(?<!\d)[1-9](?:\d{9}|\d{12}|\d{15}|\d{18})(?!\d)")
@@ -50,11 +54,11 @@ _EPOCH = re.compile(r"(?<!\d)[1-9](?:\d{9}|\d{12}|\d{15}|\d{18})(?!\d)")
 
 @dataclass(frozen=True)
 class CloudImportSummary:
-    """What was imported.
+    """Summary of an import.
 
-    ``poses`` says where they come from, ``frame`` what the points were taken to be given in. ``num_without_pose``
-    clouds were left out because their pose is missing or not finite, ``num_empty`` because no point of theirs is
-    finite; ``num_points`` were written. ``warnings`` are sentences.
+    ``poses`` is the source of the poses, ``frame`` the frame of the points. Clouds were left out because their pose is
+    missing or not finite (``num_without_pose``) or because they have no finite point (``num_empty``). ``num_frames``
+    clouds with ``num_points`` points were written. ``warnings`` are sentences.
     """
 
     path: Path
@@ -73,7 +77,7 @@ class CloudImportSummary:
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """Where the poses come from: a table and its file, or else a reader for each chosen cloud."""
+    """Source of the poses: a table and its file, or a reader for each chosen cloud."""
 
     name: str
     file: Path
@@ -83,7 +87,7 @@ class _Poses:
 
 @dataclass(frozen=True, eq=False)
 class _Times:
-    """The chosen clouds' own stamps, where they have any; ``are_of_poses`` where they are those of their poses."""
+    """Stamps of the chosen clouds, None without any; ``are_of_poses`` where they are the stamps of their poses."""
 
     source: Path
     stamps: list[int] | None
@@ -108,19 +112,20 @@ def import_clouds(
 ) -> CloudImportSummary:
     """Write the point clouds and poses of a folder as one robot's log (MCAP).
 
-    Clouds ``first`` to ``last`` (both included, counted from 0 in the folder's order) are taken, of them each
-    ``every``-th. They are stamped from 0 on at ``rate`` Hz; or with the seconds of the text file ``times``, one line
-    for each cloud of the folder or for each one taken; or, without either, with those of ``times.txt`` here or one
-    folder up, with the stamps in their names, or with those of a TUM file of poses that has a line for each.
-    ``poses`` is a TUM or KITTI file (``pose_files.read_poses``); without it they are found: matrices in
-    ``NAME.pose.txt`` beside the clouds, ``poses.txt`` here or one folder up, VIEWPOINT of PCD files.
-    ``frame`` says what the points are given in; None is the sensor's frame, but with VIEWPOINT the world's.
-    ``labels`` is a folder of KITTI ``.label`` files named like the clouds; ``labels/`` beside the clouds' folder is
-    found. ``class_table`` names the labels. The log's name gives ``robot_id`` where it is None. Points that are not
-    finite are left out. One cloud at a time is held; the same input gives the same bytes.
+    - Choice: every ``every``-th cloud from ``first`` to ``last`` (included), counted from 0 in the folder's order.
+    - Stamps: from 0 at ``rate`` Hz; or the seconds in the text file ``times``, one line per cloud of the folder or per
+      chosen cloud; or, without both, those of ``times.txt`` here or one folder up, the stamps in the file names, or
+      those of a TUM file of poses with one line per cloud.
+    - Poses: ``poses``, a TUM or KITTI file (``pose_files.read_poses``); or, without it, matrices in ``NAME.pose.txt``
+      beside the clouds, ``poses.txt`` here or one folder up, or VIEWPOINT of PCD files.
+    - Points: ``frame`` is the frame they are given in; None is the sensor's frame, with VIEWPOINT the world's. Points
+      that are not finite are left out.
+    - Labels: ``labels`` is a folder of KITTI ``.label`` files named like the clouds (default: ``labels/`` beside the
+      clouds' folder). ``class_table`` names the labels.
+    - ``robot_id`` defaults to the log's file name.
 
-    Raises InputError for what is missing or damaged, ConfigError for options that do not fit, OutputError where the log
-    cannot be written; then nothing is left behind.
+    One cloud at a time is in memory. The same input gives the same bytes. Raises InputError for missing or damaged
+    files, ConfigError for options that do not fit, OutputError where the log cannot be written; then no file is left.
     """
     check_choice(rate, times, first, every)
     robot_id = robot_name(robot_id, output)
@@ -150,7 +155,7 @@ def import_clouds(
 
 @dataclass
 class _Import:
-    """One import under way, and what it counts."""
+    """One import in progress, with its counts."""
 
     paths: Sequence[Path]
     stamps: Sequence[int]
@@ -170,14 +175,7 @@ class _Import:
     ) -> None:
         """Write the log."""
         with RobotLogWriter(path, robot_id, None, class_table, T_body_sensor=np.eye(4), start_ns=self.stamps[0]) as log:
-            for index, (stamp_ns, read_pose) in enumerate(zip(self.stamps, self.readers, strict=True)):
-                T_map_sensor = read_pose()
-                if T_map_sensor is None:
-                    self.num_without_pose += 1
-                else:
-                    self._write_cloud(log, index, stamp_ns, T_map_sensor)
-                if progress is not None:
-                    progress((index + 1) / len(self.paths))
+            self.num_without_pose = write_frames(self.stamps, self.readers, partial(self._write_cloud, log), progress)
 
     def _write_cloud(self, log: RobotLogWriter, index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:
         """Write one cloud with its pose."""
@@ -188,10 +186,10 @@ class _Import:
         label_file = self.label_files[index]
         labels = cloud.labels if label_file is None else read_kitti_labels(label_file, len(cloud.points))
         points = cloud.points
-        # What is not finite stays so, and what float32 cannot hold becomes so; it is left out below.
+        # Points that are not finite, or overflow float32, are left out below.
         with np.errstate(over="ignore", invalid="ignore"):
             if self.is_in_world:
-                # By the rotation that the log holds: a matrix in a text is one only as far as its digits go.
+                # The rotation of the log's quaternion is exactly orthogonal; a matrix from a text file is rounded.
                 rotation = pose_matrix((0.0, 0.0, 0.0), rotation_to_quaternion(T_map_sensor[:3, :3]))[:3, :3]
                 points = (points - T_map_sensor[:3, 3]) @ rotation
             points = points.astype(np.float32)
@@ -214,17 +212,17 @@ class _Import:
     def _labels(
         self, path: Path, labels: npt.NDArray[np.uint32] | None, usable: npt.NDArray[np.bool_]
     ) -> npt.NDArray[np.uint32] | None:
-        """The labels to write: for every cloud where the log has any, since readers look at the first cloud only."""
+        """Labels to write: for every cloud where the log has any, since readers examine the first cloud only."""
         if self.is_labelled is None:
             self.is_labelled = labels is not None or any(self.label_files)
         if labels is not None and not self.is_labelled:
-            raise InputError(f"{path}: has labels, but the clouds before it have none; start with it by 'first'")
+            raise InputError(f"{path}: has labels, but the clouds before it have none; choose it as 'first'")
         if labels is None:
             return np.full(np.count_nonzero(usable), UNLABELLED[1], np.uint32) if self.is_labelled else None
         return labels[usable]
 
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of clouds that were taken nevertheless."""
+        """Sentences on clouds that were imported in part."""
         if not self.with_extra_columns:
             return ()
         others = len(self.with_extra_columns) - 1
@@ -233,9 +231,9 @@ class _Import:
 
 
 def _nothing_usable(folder: Path, job: _Import, found: _Poses, own: _Times) -> str:
-    """Why no cloud could be written."""
+    """Error for an import without a cloud."""
     if job.num_empty:
-        return f"{folder}: none of the {job.num_empty} clouds with a pose has a point that is finite"
+        return f"{folder}: none of the {job.num_empty} clouds with a pose has a finite point"
     sentence = f"{folder}: none of the {len(job.paths)} clouds has a usable pose in {found.name}"
     stamps = None if found.table is None else found.table.stamps
     if not stamps or not own.stamps:
@@ -250,40 +248,29 @@ def _nothing_usable(folder: Path, job: _Import, found: _Poses, own: _Times) -> s
 
 
 def _find_clouds(folder: Path) -> list[Path]:
-    """The folder's clouds, or those of its ``velodyne/``, in the order of the numbers or times in their names."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder")
+    """Clouds of the folder, or of its ``velodyne/``, in the order of the numbers or times in their names."""
+    check_folder(folder)
     for place in (folder, folder / "velodyne"):
-        clouds = [p for p in _files(place) if p.suffix.lower() in FORMATS]
+        clouds = [p for p in files_in(place) if p.suffix.lower() in FORMATS]
         kinds = sorted({path.suffix.lower() for path in clouds})
         if len(kinds) > 1:
-            raise InputError(f"{place}: holds {' and '.join(kinds)} files; leave the clouds of one kind in it")
+            raise InputError(f"{place}: holds {' and '.join(kinds)} files; keep clouds of one format in it")
         if clouds:
             clouds.sort(key=natural_order)
             stamps = _name_stamps(clouds)
             return clouds if stamps is None else [path for _, path in sorted(zip(stamps, clouds, strict=True))]
-    endings = sorted({path.suffix for path in _files(folder) if path.suffix})
-    there = f"; the folder holds {', '.join(endings[:6])} files" if endings else ""
-    raise InputError(f"{folder}: no clouds found; looked for {', '.join(FORMATS)}, also in velodyne/{there}")
-
-
-def _files(folder: Path) -> list[Path]:
-    """The files of a folder that are not hidden; none where it is not there."""
-    try:
-        return [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
+    endings = sorted({path.suffix for path in files_in(folder) if path.suffix})
+    found = f"; the folder holds {', '.join(endings[:6])} files" if endings else ""
+    raise InputError(f"{folder}: no clouds found; looked for {', '.join(FORMATS)}, also in velodyne/{found}")
 
 
 def _find_labels(paths: Sequence[Path], labels: Path | None) -> list[Path | None]:
-    """The label file of every cloud, where it has one."""
+    """Label file of every cloud, None where it has none."""
     folder = paths[0].parent.parent / "labels" if labels is None else labels
-    by_name = {path.stem: path for path in _files(folder) if path.suffix.lower() == ".label"}
+    by_name = {path.stem: path for path in files_in(folder) if path.suffix.lower() == ".label"}
     matched = [by_name.get(path.stem) for path in paths]
     if labels is not None and not any(matched):
-        raise InputError(f"{labels}: holds no .label file that is named like a cloud such as '{paths[0].name}'")
+        raise InputError(f"{labels}: holds no .label file with the name of a cloud such as '{paths[0].name}'")
     return matched
 
 
@@ -291,7 +278,7 @@ def _find_labels(paths: Sequence[Path], labels: Path | None) -> list[Path | None
 
 
 def _find_poses(paths: Sequence[Path], given: Path | None) -> _Poses:
-    """The poses: a given file, matrices beside the clouds, ``poses.txt``, or VIEWPOINT."""
+    """Source of the poses: a given file, matrices beside the clouds, ``poses.txt``, or VIEWPOINT."""
     folder = paths[0].parent
     if given is not None:
         return _tabled(given)
@@ -307,7 +294,7 @@ def _find_poses(paths: Sequence[Path], given: Path | None) -> _Poses:
             "up; give a file of poses"
         )
     viewpoints = [read_viewpoint(path) for path in paths]
-    # What writers put there that know nothing of poses.
+    # Writers without poses store the identity.
     is_unset = [T is None or np.array_equal(T, np.eye(4)) for T in viewpoints]
     if all(T is None for T in viewpoints) or (len(paths) > 1 and all(is_unset)):
         raise InputError(f"{folder}: no poses found, and the VIEWPOINT of every cloud is unset; give a file of poses")
@@ -315,42 +302,31 @@ def _find_poses(paths: Sequence[Path], given: Path | None) -> _Poses:
 
 
 def _tabled(path: Path) -> _Poses:
+    """Poses of a table."""
     table = read_poses(path)
     return _Poses(f"{path.name} ({table.name})", path, table)
 
 
 def _constant(T_map_sensor: Float64Array | None) -> PoseReader:
-    """Gives a pose that is known."""
+    """Reader of a known pose."""
     return lambda: T_map_sensor
 
 
 def _readers(found: _Poses, own: _Times, chosen: range, total: int) -> Sequence[PoseReader]:
-    """Where the pose of each chosen cloud comes from."""
+    """Pose reader of each chosen cloud."""
     table = found.table
     if table is None:
         return found.readers
     if table.stamps is None or own.are_of_poses or own.stamps is None:
-        return [_constant(T) for T in _of_chosen(table.poses, chosen, total, found.file)]
+        return [_constant(T) for T in entries_of_chosen(table.poses, "poses", chosen, total, found.file)]
     return [partial(table.at, stamp_ns) for stamp_ns in own.stamps]
-
-
-def _of_chosen(rows: Sequence[_T], chosen: range, total: int, path: Path) -> list[_T]:
-    """The rows of the chosen clouds, of a file that holds one for each cloud of the folder, or for each chosen one."""
-    if len(rows) == total:
-        return [rows[k] for k in chosen]
-    if len(rows) == len(chosen):
-        return list(rows)
-    raise InputError(
-        f"{path}: has {len(rows)} poses; the folder has {total} clouds, of which {len(chosen)} are taken; give a line "
-        "for each, choose clouds with first, last and every, or give times to find poses of a TUM file by"
-    )
 
 
 # --- times -----------------------------------------------------------------------------------------------------------
 
 
 def _find_times(clouds: Sequence[Path], chosen: range, given: Path | None, found: _Poses, *, has_rate: bool) -> _Times:
-    """The clouds' own times: a given file, ``times.txt``, their names, or those of a TUM row for each."""
+    """Stamps of the clouds: a given file, ``times.txt``, the file names, or a TUM file with one row per cloud."""
     folder = clouds[0].parent
     pose_stamps = None if found.table is None else found.table.stamps
     if has_rate and pose_stamps is None:
@@ -362,19 +338,21 @@ def _find_times(clouds: Sequence[Path], chosen: range, given: Path | None, found
     if names is not None:
         return _Times(folder, [names[k] for k in chosen])
     if pose_stamps is not None:
-        return _Times(found.file, _of_chosen(pose_stamps, chosen, len(clouds), found.file), are_of_poses=True)
+        return _Times(
+            found.file, entries_of_chosen(pose_stamps, "poses", chosen, len(clouds), found.file), are_of_poses=True
+        )
     return _Times(folder, None)
 
 
 def _name_stamps(clouds: Sequence[Path]) -> list[int] | None:
-    """Stamps from the clouds' names; None unless every name holds one, and no two the same."""
+    """Stamps in the clouds' names; None unless every name holds one and all differ."""
     stamps = [_name_stamp(path.stem) for path in clouds]
     found = [stamp for stamp in stamps if stamp is not None]
     return found if len(set(found)) == len(clouds) else None
 
 
 def _name_stamp(name: str) -> int | None:
-    """The one time that a name holds, in nanoseconds."""
+    """Time in a name [ns]; None unless there is exactly one."""
     pairs = _SECONDS_AND_NANOSECONDS.findall(name)
     if len(pairs) == 1:
         return int(pairs[0][0]) * 1_000_000_000 + int(pairs[0][1])

@@ -1,27 +1,32 @@
-"""What every folder of frames needs to become a log: an order, a choice of frames, their times, and the log's name."""
+"""Import of a folder of frames: their order, choice, stamps, the robot's name, and the loop that writes the log."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 from octoreplay.errors import ConfigError, InputError, OutputError
+from octoreplay.io.datasets.pose_files import PoseReader
 from octoreplay.io.text_tables import rows, seconds_to_ns
+from octoreplay.records import Float64Array
+
+T = TypeVar("T")
 
 _END_OF_TIME_NS = 2**31 * 1_000_000_000
 
 
 def natural_order(path: Path) -> tuple[list[tuple[bool, int, str]], str]:
-    """Sorts files by the numbers in their names, so that 10 comes after 9."""
+    """Return the sort key of a file by the numbers in its name, so that 10 comes after 9."""
     parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
     return [(False, int(part), "") if part[0] in "0123456789" else (True, 0, part) for part in parts], path.name
 
 
 def check_choice(rate: float | None, times: Path | None, first: int, every: int) -> None:
-    """Raise ConfigError for a choice of times or frames that makes no sense whatever the folder holds."""
+    """Raise ConfigError for a choice of times or frames that is invalid for every folder."""
     if rate is not None and times is not None:
         raise ConfigError("rate and times: give one of them, not both")
     if rate is not None and not 0 < rate <= 1e6:
@@ -33,9 +38,9 @@ def check_choice(rate: float | None, times: Path | None, first: int, every: int)
 
 
 def chosen_frames(folder: Path, total: int, first: int, last: int | None, every: int) -> range:
-    """The numbers of the frames ``first`` to ``last``, both included, of them each ``every``-th.
+    """Return the numbers of every ``every``-th frame from ``first`` to ``last`` (included).
 
-    Raises ConfigError where none of the folder's ``total`` frames is among them.
+    Raises ConfigError where none of the folder's ``total`` frames is chosen.
     """
     chosen = range(first, total if last is None else min(last + 1, total), every)
     if not chosen:
@@ -44,7 +49,7 @@ def chosen_frames(folder: Path, total: int, first: int, last: int | None, every:
 
 
 def robot_name(robot_id: str | None, output: Path) -> str:
-    """The robot's id: the given one, else the log's file name made good for topic names. Raises ConfigError."""
+    """Return the given robot id, else the log's file name in characters that topics allow. Raises ConfigError."""
     if robot_id is None:
         name = re.sub(r"[^A-Za-z0-9_]+", "_", output.stem).strip("_") or "robot"
         return f"robot_{name}" if name[0].isdigit() else name
@@ -54,25 +59,75 @@ def robot_name(robot_id: str | None, output: Path) -> str:
 
 
 def read_times(path: Path, chosen: range, total: int) -> list[int]:
-    """Stamps [ns] of the chosen frames from a text file of seconds: a line for each frame, or for each chosen one.
+    """Return the stamps [ns] of the chosen frames from a text file with a time in seconds per line.
 
-    Raises InputError where the file has another number of lines or a line is no time.
+    Raises InputError where a line is not a time, and as ``entries_of_chosen`` does.
     """
     stamps = [seconds_to_ns(where, fields[0]) for where, fields in rows(path)]
-    if len(stamps) == total:
-        return [stamps[k] for k in chosen]
-    if len(stamps) == len(chosen):
-        return stamps
+    return entries_of_chosen(stamps, "times", chosen, total, path)
+
+
+def entries_of_chosen(entries: Sequence[T], what: str, chosen: range, total: int, path: Path) -> list[T]:
+    """Return the chosen frames' entries of a file with one entry per frame of the folder or per chosen frame.
+
+    Raises InputError where the file has another number of entries.
+    """
+    if len(entries) == total:
+        return [entries[k] for k in chosen]
+    if len(entries) == len(chosen):
+        return list(entries)
     raise InputError(
-        f"{path}: has {len(stamps)} times; the folder has {total} frames, of which {len(chosen)} are taken"
+        f"{path}: has {len(entries)} {what}; the folder has {total} frames, {len(chosen)} of them chosen; give one "
+        "line for each, or choose frames with first, last and every"
     )
 
 
-def frame_stamps(source: Path, own: Sequence[int] | None, rate: float | None, count: int) -> list[int]:
-    """Stamps [ns] of ``count`` frames: from 0 on at ``rate`` Hz, or without a rate their own.
+def files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are not hidden; none where it does not exist.
 
-    Raises ConfigError where there is neither; InputError, which begins with ``source``, for stamps that do not ascend,
-    are negative or reach past what ROS messages hold.
+    Raises InputError where it cannot be read.
+    """
+    try:
+        return [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
+
+
+def check_folder(folder: Path) -> None:
+    """Raise InputError where a path is not a folder."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder")
+
+
+def write_frames(
+    stamps: Sequence[int],
+    readers: Sequence[PoseReader],
+    write: Callable[[int, int, Float64Array], None],
+    progress: Callable[[float], None] | None,
+) -> int:
+    """Call ``write(index, stamp_ns, T_map_sensor)`` for each frame with a pose; return the number without a pose.
+
+    ``progress`` is called after every frame with the finished share, 0 to 1.
+    """
+    num_without_pose = 0
+    for index, (stamp_ns, read_pose) in enumerate(zip(stamps, readers, strict=True)):
+        T_map_sensor = read_pose()
+        if T_map_sensor is None:
+            num_without_pose += 1
+        else:
+            write(index, stamp_ns, T_map_sensor)
+        if progress is not None:
+            progress((index + 1) / len(stamps))
+    return num_without_pose
+
+
+def frame_stamps(source: Path, own: Sequence[int] | None, rate: float | None, count: int) -> list[int]:
+    """Return the stamps [ns] of ``count`` frames: from 0 at ``rate`` Hz, or without a rate their ``own``.
+
+    Raises ConfigError without both; InputError, which begins with ``source``, for stamps that do not ascend, are
+    negative or exceed the range of ROS messages.
     """
     if rate is None and own is None:
         raise ConfigError(f"{source}: the frames have no times; give a rate or a file of times")
@@ -82,15 +137,15 @@ def frame_stamps(source: Path, own: Sequence[int] | None, rate: float | None, co
     if stamps[0] < 0:
         raise InputError(f"{source}: times must not be negative")
     if stamps[-1] >= _END_OF_TIME_NS:
-        raise InputError(f"{source}: times must be below 2^31 s, which is all that ROS messages hold")
+        raise InputError(f"{source}: times must be below 2^31 s, the limit of ROS messages")
     return stamps
 
 
 @contextmanager
 def unfinished(output: Path) -> Iterator[Path]:
-    """A name to write the log under; it becomes ``output`` at the end, and is removed after any error.
+    """Yield a path to write the log to; it is renamed to ``output`` at the end, and removed after any error.
 
-    Raises OutputError in place of an OSError.
+    An OSError becomes an OutputError.
     """
     partial = output.with_name(f"{output.stem}.partial.mcap")
     try:

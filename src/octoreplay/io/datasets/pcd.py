@@ -15,19 +15,19 @@ from octoreplay.records import Float64Array
 from octoreplay.transforms import transform_of
 
 _LONGEST_HEADER = 100
-"""Lines in which 'DATA' must come."""
+"""Largest number of header lines up to 'DATA'."""
 _LONGEST_LINE = 65536
 _LARGEST_COUNT = 1000
 _FORMATS = {
     ("F", 4): "<f4", ("F", 8): "<f8", ("I", 1): "i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
     ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
 }  # fmt: skip
-_REMEDY = "fetch it again or take it out of the folder"
+_REMEDY = "fetch it again or remove it from the folder"
 
 
 @dataclass(frozen=True)
 class _Field:
-    """A field of a point: ``count`` numbers of one NumPy format."""
+    """Field of a point: ``count`` numbers of one NumPy format."""
 
     name: str
     number_format: str
@@ -36,7 +36,7 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """What a file says of itself; ``data`` is ascii, binary or binary_compressed."""
+    """Header of a file; ``data`` is ascii, binary or binary_compressed."""
 
     fields: tuple[_Field, ...]
     num_points: int
@@ -45,15 +45,15 @@ class _Header:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """One point as binary files hold it; fields are named by their number, since names may repeat."""
+        """Layout of one point in binary files; fields are named by their number, since names may repeat."""
         return np.dtype([(str(k), field.number_format, (field.count,)) for k, field in enumerate(self.fields)])
 
 
 def read_pcd(path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
-    """The fields of a PCD file, (P,) each in the type that its header gives, and the number of extra columns.
+    """Return the fields of a PCD file, (P,) each in the type of the header, and the number of extra columns.
 
-    Rows of an ascii file may have more columns than the header names; those after the named ones are not read. Fields
-    of several numbers are left out. Raises InputError where the file is damaged, cut, or not as long as it says.
+    Rows of an ascii file may have more columns than the header names; these extra columns are not read. Fields of
+    several numbers are left out. Raises InputError where the file is damaged or cut.
     """
     try:
         with path.open("rb") as file:
@@ -69,7 +69,7 @@ def read_pcd(path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
 
 
 def read_viewpoint(path: Path) -> Float64Array | None:
-    """T_map_sensor, (4, 4), from a file's VIEWPOINT (x y z qw qx qy qz); None without a usable one.
+    """Return T_map_sensor (4, 4) of a file's VIEWPOINT (x y z qw qx qy qz); None without a usable one.
 
     Raises InputError where the header is damaged.
     """
@@ -91,7 +91,7 @@ def read_viewpoint(path: Path) -> Float64Array | None:
 
 
 def _read_header(file: BinaryIO, path: Path) -> _Header:
-    """The header; the file stands at its data afterwards."""
+    """Header of a file, which is then positioned at its data."""
     entries: dict[str, list[str]] = {}
     for _ in range(_LONGEST_HEADER):
         words = file.readline(_LONGEST_LINE).decode("ascii", "replace").split("#", 1)[0].split()
@@ -99,11 +99,11 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             entries[words[0].upper()] = words[1:]
         if "DATA" in entries:
             return _header(entries, path)
-    raise InputError(f"{path}: is no PCD file, or cut: its header has no line 'DATA'; {_REMEDY}")
+    raise InputError(f"{path}: is not a PCD file, or is cut: its header has no line 'DATA'; {_REMEDY}")
 
 
 def _header(entries: dict[str, list[str]], path: Path) -> _Header:
-    """The header of its lines."""
+    """Header from the words of its lines."""
     names = entries.get("FIELDS") or entries.get("COLUMNS") or []
     counts = _integers(entries, "COUNT", path) or [1] * len(names)
     sizes, types = _integers(entries, "SIZE", path), entries.get("TYPE", [])
@@ -113,7 +113,7 @@ def _header(entries: dict[str, list[str]], path: Path) -> _Header:
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         number_format = _FORMATS.get((kind.upper(), size))
         if number_format is None or not 1 <= count <= _LARGEST_COUNT:
-            raise InputError(f"{path}: its field '{name}' has the unknown type {kind} of {count} times {size} bytes")
+            raise InputError(f"{path}: its field '{name}' has the unknown type {kind} with {count} x {size} bytes")
         fields.append(_Field(name, number_format, count))
     data = " ".join(entries["DATA"]).lower()
     if data not in ("ascii", "binary", "binary_compressed"):
@@ -122,7 +122,7 @@ def _header(entries: dict[str, list[str]], path: Path) -> _Header:
 
 
 def _num_points(entries: dict[str, list[str]], path: Path) -> int:
-    """The number of points, which the header may say twice."""
+    """Number of points from POINTS and WIDTH x HEIGHT, which must agree."""
     points = _integers(entries, "POINTS", path)
     size = _integers(entries, "WIDTH", path) + _integers(entries, "HEIGHT", path)
     area = [size[0] * size[1]] if len(size) == 2 else []
@@ -132,7 +132,7 @@ def _num_points(entries: dict[str, list[str]], path: Path) -> int:
 
 
 def _viewpoint(entries: dict[str, list[str]], path: Path) -> tuple[float, ...] | None:
-    """The seven numbers of VIEWPOINT."""
+    """The seven numbers of VIEWPOINT; None without the line."""
     words = entries.get("VIEWPOINT")
     if words is None:
         return None
@@ -146,7 +146,7 @@ def _viewpoint(entries: dict[str, list[str]], path: Path) -> tuple[float, ...] |
 
 
 def _integers(entries: dict[str, list[str]], name: str, path: Path) -> list[int]:
-    """The integers of one line; none where it is missing."""
+    """Integers of one line; empty where it is missing."""
     try:
         return [int(word) for word in entries.get(name, [])]
     except ValueError:
@@ -157,11 +157,11 @@ def _integers(entries: dict[str, list[str]], name: str, path: Path) -> list[int]
 
 
 def _ascii(data: bytes, header: _Header, path: Path) -> tuple[dict[str, npt.NDArray[Any]], int]:
-    """The fields of rows of numbers."""
+    """Fields of rows of numbers, and the number of extra columns."""
     rows = [line for line in data.decode("ascii", "replace").splitlines() if line.strip()]
     if len(rows) != header.num_points:
         raise InputError(
-            f"{path}: is cut or damaged: its header announces {header.num_points} points, but it has {len(rows)} rows;"
+            f"{path}: is cut or damaged: its header gives {header.num_points} points, but it has {len(rows)} rows;"
             f" {_REMEDY}"
         )
     num_columns = sum(field.count for field in header.fields)
@@ -173,7 +173,7 @@ def _ascii(data: bytes, header: _Header, path: Path) -> tuple[dict[str, npt.NDAr
         raise InputError(f"{path}: is cut or damaged: {_bad_row(rows)}; {_REMEDY}") from None
     if table.shape[1] < num_columns:
         raise InputError(
-            f"{path}: its header announces {num_columns} columns, but its rows have {table.shape[1]}; {_REMEDY}"
+            f"{path}: its header gives {num_columns} columns, but its rows have {table.shape[1]}; {_REMEDY}"
         )
     columns, first = {}, 0
     for field in header.fields:
@@ -184,7 +184,7 @@ def _ascii(data: bytes, header: _Header, path: Path) -> tuple[dict[str, npt.NDAr
 
 
 def _bad_row(rows: list[str]) -> str:
-    """Which row is not as the first one is."""
+    """Clause on the first row that differs from row 1."""
     length = len(rows[0].split())
     for number, row in enumerate(rows, start=1):
         words = row.split()
@@ -198,7 +198,7 @@ def _bad_row(rows: list[str]) -> str:
 
 
 def _typed(values: Float64Array, number_format: str) -> npt.NDArray[Any]:
-    """Numbers of a text in the type of their field; they stay float64 where it cannot hold them, as NaN and -1."""
+    """Numbers in the type of their field; float64 where it cannot hold them, such as NaN or -1."""
     kind = np.dtype(number_format)
     with np.errstate(over="ignore", invalid="ignore"):
         typed = values.astype(kind)
@@ -206,12 +206,12 @@ def _typed(values: Float64Array, number_format: str) -> npt.NDArray[Any]:
 
 
 def _binary(data: bytes, header: _Header, path: Path) -> dict[str, npt.NDArray[Any]]:
-    """The fields of points that lie one after another."""
+    """Fields of points stored one after another."""
     size = header.dtype.itemsize
     # Less than one point may follow: some writers end the file with a line break.
     if not 0 <= len(data) - header.num_points * size < size:
         raise InputError(
-            f"{path}: is cut or damaged: its header announces {header.num_points} points of {size} bytes, but it holds "
+            f"{path}: is cut or damaged: its header gives {header.num_points} points of {size} bytes, but it holds "
             f"{len(data)} bytes of data; {_REMEDY}"
         )
     points = np.frombuffer(data, header.dtype, header.num_points)
@@ -219,14 +219,14 @@ def _binary(data: bytes, header: _Header, path: Path) -> dict[str, npt.NDArray[A
 
 
 def _compressed(data: bytes, header: _Header, path: Path) -> dict[str, npt.NDArray[Any]]:
-    """The fields of compressed data, in which each field of all points lies together."""
+    """Fields of compressed data, which stores one field of all points after another."""
     size = header.num_points * header.dtype.itemsize
     packed_size, plain_size = struct.unpack("<II", data[:8]) if len(data) >= 8 else (0, -1)
     plain = _unpack_lzf(data[8 : 8 + packed_size], size) if plain_size == size else None
     if plain is None:
         raise InputError(
             f"{path}: is cut or damaged: its compressed data does not hold the {header.num_points} points that its"
-            f" header announces; {_REMEDY}"
+            f" header gives; {_REMEDY}"
         )
     columns, first = {}, 0
     for field in header.fields:
@@ -238,10 +238,10 @@ def _compressed(data: bytes, header: _Header, path: Path) -> dict[str, npt.NDArr
 
 
 def _unpack_lzf(packed: bytes, size: int) -> bytearray | None:
-    """LZF data (Marc Lehmann's liblzf) unpacked to ``size`` bytes; None where it is damaged.
+    """Unpack LZF data (Marc Lehmann's liblzf) to ``size`` bytes; None where it is damaged.
 
-    A byte below 32 begins as many bytes and one more as they are. Any other begins a copy of what was unpacked before:
-    three bits of length, where 7 means that a byte follows, and 13 bits of distance.
+    A control byte c below 32 precedes c + 1 literal bytes. Any other precedes a copy of unpacked bytes: three bits of
+    length (7: another length byte follows) and 13 bits of distance.
     """
     plain, at = bytearray(), 0
     try:
@@ -261,7 +261,7 @@ def _unpack_lzf(packed: bytes, size: int) -> bytearray | None:
             start = len(plain) - distance
             if start < 0:
                 return None
-            # A copy may reach into itself, which repeats what it began with.
+            # A copy longer than its distance repeats the bytes at its start.
             repeats = (length + 2 + distance - 1) // distance
             plain += (plain[start : start + length + 2] * repeats)[: length + 2]
     except IndexError:

@@ -1,4 +1,4 @@
-"""PLY files as they are there: all elements, and labelled points or triangles."""
+"""PLY files: all elements, and labelled points or triangles."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from octoreplay.io.sensors.labels import UNLABELLED
 from octoreplay.records import Float64Array, Int64Array
 
 _FACE_LISTS = ("vertex_indices", "vertex_index")
-"""What the list of a face's vertices is called."""
+"""Names of the list of a face's vertices."""
 
 
 def read_ply(path: Path, remedy: str) -> Any:
-    """The file as plyfile's PlyData.
+    """Return the file as plyfile's PlyData.
 
     Raises InputError where it cannot be read, is cut or damaged, or has no element 'vertex'; ``remedy`` ends the
-    sentence.
+    message.
     """
     from plyfile import PlyParseError
 
@@ -31,7 +31,7 @@ def read_ply(path: Path, remedy: str) -> Any:
         with path.open("rb") as file:
             is_text = b"format ascii" in file.read(4096)
             file.seek(0)
-            # Binary elements are read at once, but from a true file only; a text needs its lines counted.
+            # plyfile reads binary elements at once from a real file only; the lines of a text file are counted.
             text = file.read() if is_text else b""
             ply = _read_text(text) if is_text else _read_binary(file)
             num_left = _lines(text) - sum(len(element) for element in ply) if is_text else len(file.read().strip())
@@ -40,14 +40,14 @@ def read_ply(path: Path, remedy: str) -> Any:
     except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: is cut or damaged: {error}; {remedy}") from error
     if num_left > 0:
-        raise InputError(f"{path}: is damaged: more follows than its header announces; {remedy}")
+        raise InputError(f"{path}: is damaged: it is longer than its header says; {remedy}")
     if "vertex" not in ply:
-        raise InputError(f"{path}: has no element 'vertex', which points and meshes need; {remedy}")
+        raise InputError(f"{path}: has no element 'vertex'; {remedy}")
     return ply
 
 
 def _read_text(text: bytes) -> Any:
-    """A text file; where a cut leaves no rows, numpy would warn before plyfile finds them missing."""
+    """Read a text file without numpy's warning for missing rows, which plyfile then reports."""
     from plyfile import PlyData
 
     with warnings.catch_warnings():
@@ -56,7 +56,7 @@ def _read_text(text: bytes) -> Any:
 
 
 def _read_binary(file: Any) -> Any:
-    """A binary file; triangles are read at once, faces of other sizes one by one."""
+    """Read a binary file; triangles are read at once, faces of other sizes one by one."""
     from plyfile import PlyData, PlyParseError
 
     try:
@@ -67,30 +67,32 @@ def _read_binary(file: Any) -> Any:
 
 
 def _lines(text: bytes) -> int:
-    """The lines with anything in them after a PLY file's header."""
+    """Number of lines after a PLY file's header that are not blank."""
     body = text.partition(b"end_header")[2]
     return sum(bool(line.strip()) for line in body.splitlines())
 
 
 def raw_labels(column: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
-    """Raw labels of a column of any type; what is negative or not finite, or -1 in 32 bits, is none (65535)."""
+    """Return raw labels of a column of any type; negative, 2^32 - 1 and values that are not finite become 65535."""
     values = column.astype(np.float64)
     is_label = (values >= 0) & (values < 2**32 - 1)
     return np.where(is_label, values, UNLABELLED[1]).astype(np.uint32)
 
 
 def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]:
-    """A mesh's triangles (T, 3, 3), or else a cloud's points (T, 1, 3), and their raw labels (T,).
+    """Return a mesh's triangles (T, 3, 3), or a cloud's points (T, 1, 3), in metres, and their raw labels (T,).
 
-    Metres; faces of more than three vertices become fans of triangles. A file whose faces and vertices both have labels
-    is a mesh. Raises InputError where nothing has labels, and as ``read_ply`` does.
+    Faces of more than three vertices become fans of triangles. A file is a mesh where its faces have labels. Raises
+    InputError where neither faces nor vertices have labels, and as ``read_ply`` does.
     """
     ply = read_ply(path, "write it again")
     vertices = ply["vertex"].data
     names = vertices.dtype.names or ()
     missing = [name for name in "xyz" if name not in names or vertices[name].dtype.kind not in "iuf"]
     if missing:
-        raise InputError(f"{path}: its vertices have no number '{missing[0]}'; write it with x, y and z in metres")
+        raise InputError(
+            f"{path}: its vertices have no numeric property '{missing[0]}'; write it with x, y and z in metres"
+        )
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
     labels = _label_column(ply, "face")
     if labels is not None:
@@ -98,14 +100,12 @@ def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]
         return points[triangles], raw_labels(labels)[faces]
     labels = _label_column(ply, "vertex")
     if labels is None:
-        raise InputError(
-            f"{path}: neither its faces nor its vertices have labels; write one number for each as the property 'label'"
-        )
+        raise InputError(f"{path}: neither its faces nor its vertices have labels; write a numeric property 'label'")
     return points[:, None], raw_labels(labels)
 
 
 def _label_column(ply: Any, element: str) -> npt.NDArray[Any] | None:
-    """The labels of an element's rows; None without any."""
+    """Labels of an element's rows; None without any."""
     if element not in ply:
         return None
     rows = ply[element].data
@@ -115,7 +115,7 @@ def _label_column(ply: Any, element: str) -> npt.NDArray[Any] | None:
 
 
 def _triangles(path: Path, faces: npt.NDArray[Any], num_vertices: int) -> tuple[Int64Array, Int64Array]:
-    """Vertices (T, 3) of the triangles that make up faces, and whose they are (T,)."""
+    """Vertex indices (T, 3) of the faces' triangles, and the face index of each triangle (T,)."""
     name = next((name for name in _FACE_LISTS if name in (faces.dtype.names or ())), None)
     if name is None:
         raise InputError(f"{path}: its faces have no list 'vertex_indices'; write them with one")
@@ -128,9 +128,9 @@ def _triangles(path: Path, faces: npt.NDArray[Any], num_vertices: int) -> tuple[
         num_triangles = np.maximum(sizes - 2, 0)
         owners = np.repeat(np.arange(len(lists)), num_triangles)
         first = (np.cumsum(sizes) - sizes)[owners]
-        # The n-th triangle of a fan has the first vertex and those after its n-th.
+        # Triangle n of a fan has the vertices 0, n + 1 and n + 2.
         nth = np.arange(len(owners)) - (np.cumsum(num_triangles) - num_triangles)[owners]
         triangles = flat[np.stack([first, first + nth + 1, first + nth + 2], axis=1)]
     if triangles.size and (triangles.min() < 0 or triangles.max() >= num_vertices):
-        raise InputError(f"{path}: is damaged: a face names a vertex that is not there; write it again")
+        raise InputError(f"{path}: is damaged: a face has a vertex index out of range; write it again")
     return triangles, owners

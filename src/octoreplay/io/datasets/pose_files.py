@@ -1,6 +1,6 @@
-"""Files of poses: a 4x4 matrix each, tables of TUM and of KITTI.
+"""Pose files: one 4x4 matrix per file, and tables of TUM and KITTI.
 
-``T_map_sensor`` is (4, 4) float64 and maps coordinates of the sensor to the map's.
+``T_map_sensor`` is (4, 4) float64 and maps sensor coordinates to map coordinates.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from octoreplay.records import Float64Array
 from octoreplay.transforms import inverse
 
 POSE_GAP_NS = 200_000_000
-"""Poses are interpolated between neighbours that are at most this far apart."""
+"""Largest time between two poses that are interpolated."""
 
 _SAME_TIME_NS = 1_000_000
 
 PoseReader: TypeAlias = Callable[[], Float64Array | None]
-"""Gives T_map_sensor of one frame when asked; None where there is no usable one."""
+"""Function that reads T_map_sensor of one frame; None without a usable one."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """The rows of a file of poses: T_map_sensor, None where a row is not finite; stamps [ns] in a TUM file only.
+    """Rows of a pose file: T_map_sensor, None where a row is not finite; stamps [ns] in a TUM file only.
 
-    ``name`` says what the file is.
+    ``name`` is the format.
     """
 
     name: str
@@ -40,9 +40,9 @@ class PoseTable:
     stamps: list[int] | None = None
 
     def at(self, stamp_ns: int) -> Float64Array | None:
-        """T_map_sensor at a time, of a TUM file: of a row at most 1 ms away, else interpolated; None without any.
+        """Return T_map_sensor of a TUM file at a time: a row at most 1 ms away, else interpolated; None without any.
 
-        Rows and file names are rounded, so that what was one time is not quite one.
+        The tolerance covers the rounding of times in rows and file names.
         """
         if self.track is None:
             return None
@@ -53,9 +53,9 @@ class PoseTable:
 
 
 def matrix_reader(path: Path) -> PoseReader:
-    """Reads a file of one 4x4 matrix when asked; None where it is missing or, as for lost tracking, not finite.
+    """Return a reader of a file with one 4x4 matrix; it gives None where the file is missing or not finite.
 
-    The reader raises InputError for another number of numbers and for a matrix that is no rigid transform.
+    The reader raises InputError for another number of numbers and for a matrix that is not a rigid transform.
     """
 
     def read() -> Float64Array | None:
@@ -66,11 +66,11 @@ def matrix_reader(path: Path) -> PoseReader:
 
 
 def read_poses(path: Path) -> PoseTable:
-    """The poses of a TUM file (stamp, position, quaternion x y z w) or a KITTI file (the upper 3x4 part of a matrix).
+    """Return the poses of a TUM file (stamp, position, quaternion x y z w) or a KITTI file (3x4 part of a matrix).
 
-    KITTI's are the left camera's poses; with its ``calib.txt`` beside the file they become the lidar's,
+    KITTI's poses are those of the left camera; with ``calib.txt`` beside the file they become the lidar's,
     inv(Tr) T_map_camera Tr, in a map that starts at the lidar (https://github.com/PRBonn/semantic-kitti-api).
-    Raises InputError where the file is empty, has another number of columns or a matrix that is no rigid transform.
+    Raises InputError where the file is empty, has another number of columns or a matrix that is not a rigid transform.
     """
     found = read_rows(path)
     if found.stamps_ns is not None:
@@ -87,15 +87,15 @@ def read_poses(path: Path) -> PoseTable:
 
 
 def read_tum_track(path: Path) -> Trajectory:
-    """The poses of a TUM file, to be interpolated. Raises InputError where a row is none."""
+    """Return the trajectory of a TUM file. Raises InputError for another format."""
     found = read_rows(path)
     if found.stamps_ns is None:
-        raise InputError(f"{path}: expects TUM's rows of a time, a position and a quaternion")
+        raise InputError(f"{path}: expects rows of a time, a position and a quaternion (TUM)")
     return trajectory(found.stamps_ns, found)
 
 
 def track_reader(track: Trajectory, stamp_ns: int) -> PoseReader:
-    """Interpolates a pose when asked; None where the track has none at that time."""
+    """Return a reader of the interpolated pose at a stamp; it gives None where the track has none there."""
     return lambda: track.matrix_at(stamp_ns, POSE_GAP_NS)
 
 
@@ -108,5 +108,5 @@ def _read_calibration(path: Path) -> Float64Array:
             if np.isfinite(T).all():
                 return rigid(where, T)
     raise InputError(
-        f"{path}: has no usable row 'Tr:', lidar to camera; mend it, or take it away where the poses are the lidar's"
+        f"{path}: has no usable row 'Tr:' (lidar to camera); correct it, or remove the file for lidar poses"
     )

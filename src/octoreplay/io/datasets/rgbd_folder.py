@@ -1,13 +1,13 @@
-"""Folders of depth pictures with poses, turned into ordinary logs.
+"""Import of folders of depth images with poses.
 
-Three layouts are told apart by what is in the folder:
+Three layouts are recognised by the files in the folder:
 
 * 7-Scenes: ``frame-NNNNNN.depth.png`` (millimetres) with ``frame-NNNNNN.pose.txt`` (4x4, camera to world), and the 3x3
   matrix K in ``camera-intrinsics.txt`` here or one folder up; without it fx = fy = 585, cx = 320, cy = 240.
 * TUM RGB-D: ``depth.txt`` (stamp, file; 1/5000 m) and ``groundtruth.txt`` (stamp, position, quaternion of the camera),
   fx = fy = 525, cx = 319.5, cy = 239.5. Poses are interpolated at the depth stamps.
 * ScanNet: ``depth/N.png`` (millimetres), ``pose/N.txt`` (4x4, camera to world), ``intrinsic/intrinsic_depth.txt`` and,
-  where it was exported, ``label/N.png`` or ``label-filt/N.png``.
+  if exported, ``label/N.png`` or ``label-filt/N.png``.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ import numpy.typing as npt
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.datasets.frames_folder import (
     check_choice,
+    check_folder,
     chosen_frames,
     frame_stamps,
     natural_order,
     read_times,
     robot_name,
     unfinished,
+    write_frames,
 )
 from octoreplay.io.datasets.pose_files import PoseReader, matrix_reader, read_tum_track, track_reader
 from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
 from octoreplay.io.text_tables import read_matrix, rows, seconds_to_ns
-from octoreplay.records import CameraModel, ClassTable
+from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.transforms import inverse
 
 MILLIMETRE = 0.001
@@ -44,7 +46,7 @@ _INVALID = 65535
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What was imported. ``num_without_pose`` frames were left out because their pose is missing or not finite."""
+    """Summary of an import; ``num_without_pose`` frames were left out because their pose is missing or not finite."""
 
     path: Path
     robot_id: str
@@ -59,7 +61,7 @@ class ImportSummary:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """One picture of the folder: its files, its stamp where the folder has one, and how to get its pose."""
+    """One frame of the folder: its files, its stamp (None without one) and the reader of its pose."""
 
     depth_file: Path
     label_file: Path | None
@@ -69,9 +71,9 @@ class _Frame:
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """What the folder is: its frames in order, its camera (fx, fy, cx, cy) and the metres in one unit of depth.
+    """Layout of the folder: its frames in order, its camera (fx, fy, cx, cy) and the metres in one unit of depth.
 
-    ``assumed`` intrinsics are not the folder's own but what the dataset says of its 640x480 pictures.
+    ``assumed`` is true for the dataset's published intrinsics of 640x480 images, false for the folder's own.
     """
 
     name: str
@@ -97,18 +99,19 @@ def import_rgbd(
     every: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> ImportSummary:
-    """Write the depth pictures and poses of a folder as one robot's log (MCAP).
+    """Write the depth images and poses of a folder as one robot's log (MCAP).
 
-    Frames ``first`` to ``last`` (both included, counted from 0 in the folder's order) are taken, of them each
-    ``every``-th. They are stamped from 0 on at ``rate`` Hz; or with the seconds that the text file ``times`` lists, one
-    line for each frame of the folder or for each one taken; or, in a TUM folder without either, with their own stamps.
-    Depth in millimetres is written as 16UC1 with 0 where nothing was measured (0 or 65535 in the files), other units
-    as 32FC1 metres with NaN there. ``intrinsics`` (fx, fy, cx, cy) in pixels and ``depth_unit`` in metres take the
-    place of the folder's. ``labels`` is a folder of label PNGs named like the depth ones; ``class_table`` names their
-    values. The log's name gives ``robot_id`` where it is None. The same input gives the same bytes.
+    - Choice: every ``every``-th frame from ``first`` to ``last`` (included), counted from 0 in the folder's order.
+    - Stamps: from 0 at ``rate`` Hz; or the seconds in the text file ``times``, one line per frame of the folder or per
+      chosen frame; or, in a TUM folder without both, the frames' own stamps.
+    - Depth: millimetres are written as 16UC1 with 0 where nothing was measured (0 or 65535 in the files), other units
+      as 32FC1 metres with NaN there.
+    - ``intrinsics`` (fx, fy, cx, cy) in pixels and ``depth_unit`` in metres replace the folder's.
+    - Labels: ``labels`` is a folder of label PNGs named like the depth images; ``class_table`` names their values.
+    - ``robot_id`` defaults to the log's file name.
 
-    Raises InputError for what is missing or damaged, ConfigError for options that do not fit, OutputError where the log
-    cannot be written; then nothing is left behind.
+    The same input gives the same bytes. Raises InputError for missing or damaged files, ConfigError for options that do
+    not fit, OutputError where the log cannot be written; then no file is left.
     """
     check_choice(rate, times, first, every)
     _check_options(intrinsics, depth_unit)
@@ -138,7 +141,7 @@ def import_rgbd(
 
 @dataclass
 class _Import:
-    """One import under way, and what it counts."""
+    """One import in progress, with its counts."""
 
     frames: list[_Frame]
     stamps: list[int]
@@ -158,25 +161,24 @@ class _Import:
         with RobotLogWriter(
             path, robot_id, self.camera, class_table, T_body_sensor=T_body_sensor, start_ns=self.stamps[0]
         ) as log:
-            for index, (frame, stamp_ns) in enumerate(zip(self.frames, self.stamps, strict=True)):
-                T_map_sensor = frame.read_pose()
-                if T_map_sensor is None:
-                    self.num_without_pose += 1
-                    continue
+
+            def write_frame(index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:
+                frame = self.frames[index]
                 depth = self._depth_image(frame.depth_file)
                 label_image = None if frame.label_file is None else self._label_image(frame.label_file)
                 log.write_pose(stamp_ns, T_map_sensor @ T_sensor_body)
                 log.write_frame(stamp_ns, depth, label_image)
                 self.num_frames += 1
                 self.num_labelled += label_image is not None
-                if progress is not None:
-                    progress((index + 1) / len(self.frames))
+
+            readers = [frame.read_pose for frame in self.frames]
+            self.num_without_pose = write_frames(self.stamps, readers, write_frame, progress)
 
     def _depth_image(self, path: Path) -> npt.NDArray[Any]:
-        """A depth picture as the log holds it: uint16 millimetres, or float32 metres."""
+        """A depth image as the log holds it: uint16 millimetres, or float32 metres."""
         raw = _read_png(path)
         if raw.dtype != np.uint16:
-            raise InputError(f"{path}: a depth picture must be a 16-bit grey PNG, this one has {_kind(raw)}")
+            raise InputError(f"{path}: a depth image must be a 16-bit grey PNG, this one has {_kind(raw)}")
         self._check_size(path, raw)
         measured = (raw != 0) & (raw != _INVALID)
         if abs(self.depth_unit - MILLIMETRE) < 1e-12:
@@ -185,23 +187,24 @@ class _Import:
         return np.where(measured, metres, np.float32(np.nan))
 
     def _label_image(self, path: Path) -> npt.NDArray[Any]:
-        """A label picture, uint8 or uint16."""
+        """A label image, uint8 or uint16."""
         raw = _read_png(path)
         if raw.ndim != 2:
-            raise InputError(f"{path}: a label picture must be an 8-bit or 16-bit grey PNG, this one has {_kind(raw)}")
+            raise InputError(f"{path}: a label image must be an 8-bit or 16-bit grey PNG, this one has {_kind(raw)}")
         self._check_size(path, raw)
         return raw
 
     def _check_size(self, path: Path, image: npt.NDArray[Any]) -> None:
+        """Raise InputError where an image has another size than the camera."""
         if image.shape != (self.camera.height, self.camera.width):
             raise InputError(
-                f"{path}: is {image.shape[1]}x{image.shape[0]} pixels, but the depth pictures are "
+                f"{path}: is {image.shape[1]}x{image.shape[0]} pixels, but the depth images are "
                 f"{self.camera.width}x{self.camera.height}; resize it without interpolation"
             )
 
 
 def _check_options(intrinsics: Sequence[float] | None, depth_unit: float | None) -> None:
-    """Refuse a camera that makes no sense whatever the folder holds."""
+    """Raise ConfigError for a camera that is invalid for every folder."""
     if intrinsics is not None and (
         len(intrinsics) != 4 or not np.isfinite(intrinsics).all() or min(intrinsics[:2]) <= 0
     ):
@@ -214,41 +217,39 @@ def _check_options(intrinsics: Sequence[float] | None, depth_unit: float | None)
 
 
 def _find_layout(folder: Path) -> _Layout:
-    """Tell the layout by what is in the folder."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder")
-    pictures = sorted(folder.glob("frame-*.depth.png"), key=natural_order)
-    if pictures:
-        return _seven_scenes(folder, pictures)
+    """Layout of a folder, recognised by its files."""
+    check_folder(folder)
+    images = sorted(folder.glob("frame-*.depth.png"), key=natural_order)
+    if images:
+        return _seven_scenes(folder, images)
     if (folder / "depth.txt").is_file() and (folder / "groundtruth.txt").is_file():
         return _tum(folder)
-    pictures = sorted((folder / "depth").glob("*.png"), key=natural_order)
-    if pictures and (folder / "pose").is_dir():
-        return _scannet(folder, pictures)
+    images = sorted((folder / "depth").glob("*.png"), key=natural_order)
+    if images and (folder / "pose").is_dir():
+        return _scannet(folder, images)
     raise InputError(
         f"{folder}: no RGB-D sequence found; looked for frame-*.depth.png with frame-*.pose.txt (7-Scenes), depth.txt "
         "with groundtruth.txt (TUM RGB-D), depth/*.png with pose/*.txt (ScanNet)"
     )
 
 
-def _seven_scenes(folder: Path, pictures: list[Path]) -> _Layout:
+def _seven_scenes(folder: Path, images: list[Path]) -> _Layout:
+    """Layout of a 7-Scenes folder."""
     intrinsics, assumed = (585.0, 585.0, 320.0, 240.0), True
     for place in (folder, folder.parent):
         if (place / "camera-intrinsics.txt").is_file():
             intrinsics, assumed = _read_camera_matrix(place / "camera-intrinsics.txt"), False
             break
-    frames = [
-        _Frame(picture, None, None, matrix_reader(picture.with_name(f"{_stem(picture)}.pose.txt")))
-        for picture in pictures
-    ]
+    frames = [_Frame(image, None, None, matrix_reader(image.with_name(f"{_stem(image)}.pose.txt"))) for image in images]
     return _Layout("7-Scenes", frames, intrinsics, assumed, MILLIMETRE)
 
 
-def _scannet(folder: Path, pictures: list[Path]) -> _Layout:
+def _scannet(folder: Path, images: list[Path]) -> _Layout:
+    """Layout of a ScanNet folder."""
     path = folder / "intrinsic" / "intrinsic_depth.txt"
     if not path.is_file():
         raise InputError(f"{path}: not found; a ScanNet folder holds the depth camera's matrix there")
-    frames = [_Frame(p, None, None, matrix_reader(folder / "pose" / f"{p.stem}.txt")) for p in pictures]
+    frames = [_Frame(p, None, None, matrix_reader(folder / "pose" / f"{p.stem}.txt")) for p in images]
     for name in ("label", "label-filt"):
         if (folder / name).is_dir():
             frames = _with_labels(frames, folder / name)
@@ -257,6 +258,7 @@ def _scannet(folder: Path, pictures: list[Path]) -> _Layout:
 
 
 def _tum(folder: Path) -> _Layout:
+    """Layout of a TUM RGB-D folder."""
     track = read_tum_track(folder / "groundtruth.txt")
     frames = []
     for where, fields in rows(folder / "depth.txt"):
@@ -265,21 +267,21 @@ def _tum(folder: Path) -> _Layout:
         stamp_ns = seconds_to_ns(where, fields[0])
         frames.append(_Frame(folder / fields[1], None, stamp_ns, track_reader(track, stamp_ns)))
     if not frames:
-        raise InputError(f"{folder / 'depth.txt'}: lists no depth pictures")
+        raise InputError(f"{folder / 'depth.txt'}: lists no depth images")
     frames.sort(key=lambda frame: frame.stamp_ns or 0)
     return _Layout("TUM RGB-D", frames, (525.0, 525.0, 319.5, 239.5), True, 1 / 5000)
 
 
 def _own_times(frames: list[_Frame]) -> list[int] | None:
-    """The frames' own stamps; None where one has none."""
+    """Own stamps of the frames; None unless every frame has one."""
     stamps = [frame.stamp_ns for frame in frames if frame.stamp_ns is not None]
     return stamps if len(stamps) == len(frames) else None
 
 
 def _with_labels(frames: list[_Frame], folder: Path) -> list[_Frame]:
-    """The frames with the label pictures of the same name; a frame may have none."""
+    """The frames with the label images of the same name; a frame may have none."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: is not a folder of label pictures")
+        raise InputError(f"{folder}: is not a folder of label images")
     by_name = {_stem(path): path for path in sorted(folder.glob("*.png"))}
     matched = [
         _Frame(frame.depth_file, by_name.get(_stem(frame.depth_file)), frame.stamp_ns, frame.read_pose)
@@ -287,13 +289,13 @@ def _with_labels(frames: list[_Frame], folder: Path) -> list[_Frame]:
     ]
     if all(frame.label_file is None for frame in matched):
         raise InputError(
-            f"{folder}: no label picture is named like a depth picture such as '{frames[0].depth_file.name}'"
+            f"{folder}: no label image has the name of a depth image such as '{frames[0].depth_file.name}'"
         )
     return matched
 
 
 def _stem(path: Path) -> str:
-    """A picture's name without its endings: frame-000001.depth.png -> frame-000001."""
+    """An image's name without its suffixes: frame-000001.depth.png -> frame-000001."""
     return re.sub(r"(\.(depth|label|labels))?\.png$", "", path.name)
 
 
@@ -308,20 +310,18 @@ def _read_camera_matrix(path: Path) -> tuple[float, float, float, float]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
-def _camera(picture: Path, intrinsics: Sequence[float], *, assumed: bool) -> CameraModel:
-    """The camera of a folder, sized as its first chosen depth picture."""
-    image = _read_png(picture)
+def _camera(path: Path, intrinsics: Sequence[float], *, assumed: bool) -> CameraModel:
+    """Camera of a folder, with the size of its first chosen depth image."""
+    image = _read_png(path)
     height, width = image.shape[:2]
     if assumed and (width, height) != (640, 480):
-        raise ConfigError(
-            f"{picture}: is {width}x{height} pixels, and the folder has no intrinsics; give fx, fy, cx, cy"
-        )
+        raise ConfigError(f"{path}: is {width}x{height} pixels, and the folder has no intrinsics; give fx, fy, cx, cy")
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     return CameraModel(width, height, fx, fy, cx, cy)
 
 
 def _read_png(path: Path) -> npt.NDArray[Any]:
-    """The pixels of a picture: (H, W) uint8 or uint16 for grey ones."""
+    """Pixels of an image: (H, W) uint8 or uint16 for grey ones."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -333,11 +333,11 @@ def _read_png(path: Path) -> npt.NDArray[Any]:
     except FileNotFoundError as error:
         raise InputError(f"{path}: not found") from error
     except UnidentifiedImageError as error:
-        raise InputError(f"{path}: is not a picture") from error
+        raise InputError(f"{path}: is not an image") from error
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path}: is damaged: {error}") from error
 
 
 def _kind(image: npt.NDArray[Any]) -> str:
-    """What a picture is, for a message."""
+    """Type of an image, as a clause of an error."""
     return f"{image.dtype.itemsize * 8} bits in {1 if image.ndim == 2 else image.shape[2]} channels"

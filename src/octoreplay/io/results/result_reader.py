@@ -209,7 +209,7 @@ class ResultReader:
     def _read_config(self) -> RunConfig:
         """Parse the stored configuration."""
         try:
-            return parse_team(self._metadata["config"]["team_file"], source=str(self.path), folder=self.path.parent)
+            return parse_team(self._metadata["config"]["team_file"], name=str(self.path), folder=self.path.parent)
         except (ConfigError, KeyError) as error:
             raise InputError(f"{self.path}: damaged: its configuration cannot be read: {error}") from error
 

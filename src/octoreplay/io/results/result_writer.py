@@ -13,15 +13,15 @@ from typing import Any, Self
 import numpy as np
 
 from octoreplay._version import __version__
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import ClassTable, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.records import Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
 from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
@@ -97,11 +97,11 @@ class ResultWriter:
     cannot be read for its fingerprint.
     """
 
-    def __init__(self, path: Path, config: RunConfig, class_table: ClassTable) -> None:
+    def __init__(self, path: Path, config: ResolvedRun) -> None:
         self.path = path
         self.partial_path = partial_path(path)
-        self._config = dataclasses.replace(config, classes=class_table)
-        self._class_table = class_table
+        self._config = config
+        self._class_table = config.classes
         self._started = False
         self._open = True
         self._check_path()

@@ -1,1 +1,1 @@
-"""From logs to robots: which topics are whose, where the sensor is, and frames in the order of their stamps."""
+"""Robots in logs: their topics, their poses, and their frames in stamp order."""

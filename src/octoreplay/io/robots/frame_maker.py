@@ -1,4 +1,4 @@
-"""From a sensor message with its labels and pose to a frame: images of a camera, point clouds and laser scans."""
+"""Decoding of sensor messages with their labels and poses into frames: depth images, point clouds, laser scans."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from octoreplay.records import (
 
 
 class FrameMaker(ABC):
-    """Decodes the messages of one sensor; ``partner_topics`` are the topics of what goes with each of them."""
+    """Decoder of one sensor's messages."""
 
     def __init__(self, robot: RobotConfig, labels: LabelLookup | None) -> None:
         self._robot = robot
@@ -38,20 +38,21 @@ class FrameMaker(ABC):
     @property
     @abstractmethod
     def partner_topics(self) -> tuple[str, ...]:
-        """Topics of messages that belong to a sensor message of the same time; the first must be there."""
+        """Topics of the messages that are paired with each sensor message; the first is required."""
 
     @abstractmethod
     def make(
         self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
     ) -> Frame | None:
-        """The frame of a sensor message, ``stamp_ns`` on the team's clock; None where its labels are missing.
+        """Return the frame of a sensor message; None where its labels are missing.
 
-        Raises InputError, and DamagedMessageError where only this message is bad.
+        ``stamp_ns`` is on the team's clock. Raises DamagedMessageError where only this message is unusable, else
+        InputError.
         """
 
 
 class DepthFrameMaker(FrameMaker):
-    """Depth images, raw or encoded, with label and confidence images of the same size."""
+    """Decoder of depth images, raw or compressed, with label and confidence images of the same size."""
 
     def __init__(self, robot: RobotConfig, labels: LabelLookup | None, calibration: RawMessage | None) -> None:
         super().__init__(robot, labels)
@@ -61,13 +62,13 @@ class DepthFrameMaker(FrameMaker):
         if calibration is not None:
             found = calibration.sensor_message()
             if not isinstance(found, Calibration):
-                raise InputError(f"{calibration.where}: is of type {calibration.type_name}, no CameraInfo")
+                raise InputError(f"{calibration.where}: is of type {calibration.type_name}, not CameraInfo")
             check_camera(found, self._where, is_rectified=_is_rectified(robot))
             self._calibration = found
 
     @property
     def partner_topics(self) -> tuple[str, ...]:
-        """The topics of labels and confidences."""
+        """Topics of labels and confidences."""
         if self._labels is None or not self._robot.label_topic:
             return ()
         return tuple(topic for topic in (self._robot.label_topic, self._robot.confidence_topic) if topic)
@@ -75,7 +76,7 @@ class DepthFrameMaker(FrameMaker):
     def make(
         self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
     ) -> Frame:
-        """The frame of a depth image."""
+        """Return the frame of a depth image."""
         message = settled.message
         depth, unit = decode_depth(_image(message), message.where, self._robot.depth_unit)
         camera = self._camera_of(depth, message.where)
@@ -93,15 +94,15 @@ class DepthFrameMaker(FrameMaker):
         )
 
     def _camera_of(self, depth: Any, where: str) -> CameraModel:
-        """The camera of an image, whose size must be what the calibration says, where that says any."""
+        """The camera of an image. Raises InputError where its size differs from the calibration or the first image."""
         height, width = depth.shape
-        announced = (0, 0) if self._calibration is None else image_size(self._calibration)
+        expected = (0, 0) if self._calibration is None else image_size(self._calibration)
         if self._camera is not None:
-            announced = self._camera.width, self._camera.height
-        if announced[0] and announced != (width, height):
-            whose = "the first one was" if self._calibration is None else "its CameraInfo is for"
+            expected = self._camera.width, self._camera.height
+        if expected[0] and expected != (width, height):
+            reason = "the first image is" if self._calibration is None else "its CameraInfo is for"
             raise InputError(
-                f"{where}: the image is {width}x{height}, but {whose} {announced[0]}x{announced[1]}; name the right "
+                f"{where}: the image is {width}x{height}, but {reason} {expected[0]}x{expected[1]}; name the right "
                 f"depth_topic or camera_info_topic, or give intrinsics: [fx, fy, cx, cy]"
             )
         if self._camera is None:
@@ -109,7 +110,7 @@ class DepthFrameMaker(FrameMaker):
         return self._camera
 
     def _new_camera(self, width: int, height: int) -> CameraModel:
-        """The camera, made when there is an image of its size."""
+        """A camera with the size of the first image."""
         if self._calibration is None:
             fx, fy, cx, cy = self._robot.intrinsics or (0.0, 0.0, 0.0, 0.0)
             return CameraModel(width, height, fx, fy, cx, cy)
@@ -118,26 +119,26 @@ class DepthFrameMaker(FrameMaker):
 
     @staticmethod
     def _check_size(image: Any, depth: Any, message: RawMessage, depth_message: RawMessage) -> None:
-        """Raise InputError where an image has another size than the depth image that it goes with."""
+        """Raise InputError where an image has another size than its depth image."""
         if image.shape[:2] != depth.shape:
             raise InputError(
                 f"{message.where}: the image is {image.shape[1]}x{image.shape[0]}, but the depth image of "
-                f"'{depth_message.topic}' is {depth.shape[1]}x{depth.shape[0]}; name topics of one size"
+                f"'{depth_message.topic}' is {depth.shape[1]}x{depth.shape[0]}; name topics of one image size"
             )
 
 
 class CloudFrameMaker(FrameMaker):
-    """Point clouds and laser scans, whose labels and confidences are fields of their points."""
+    """Decoder of point clouds and laser scans; labels and confidences are fields of their points."""
 
     @property
     def partner_topics(self) -> tuple[str, ...]:
-        """None: everything is in the cloud."""
+        """Empty: clouds have no partners."""
         return ()
 
     def make(
         self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
     ) -> Frame | None:
-        """The frame of a cloud or a scan."""
+        """Return the frame of a cloud or a scan."""
         message = settled.message
         found = message.sensor_message()
         if isinstance(found, Scan):
@@ -149,29 +150,29 @@ class CloudFrameMaker(FrameMaker):
                 wanted_confidences=self._robot.confidence_field,
             )  # fmt: skip
         else:
-            raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no point cloud")
+            raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, not a point cloud")
         class_ids: UInt8Array | None = None
         if self._labels is not None and points.labels is not None:
             class_ids = self._labels.of_points(points.labels, message.where)
         elif self._labels is not None and self._labels.num_classes > 1:
             return None
         if T_frame_points is not None:
-            # Rays begin where the points' own frame does.
+            # Rays begin at the origin of the frame that the points are given in.
             T_team_sensor = T_team_sensor @ T_frame_points
         confidences = points.confidences if class_ids is not None else None
         return CloudFrame(self._robot.robot_id, stamp_ns, points.points, class_ids, T_team_sensor, confidences, boxes)
 
 
 def _image(message: RawMessage) -> Image | CompressedImage:
-    """The image in a message of an image topic. Raises DamagedMessageError for the others that it may carry too."""
+    """The image in a message. Raises DamagedMessageError for a message of another type on the topic."""
     found = message.sensor_message()
     if not isinstance(found, Image | CompressedImage):
-        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no image")
+        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, not an image")
     return found
 
 
 def _is_rectified(robot: RobotConfig) -> bool:
-    """True where the depth image is rectified: as the team file says, or else the topic's name."""
+    """True where the depth image is rectified, by the team file or else by the topic's name."""
     if robot.rectified is not None:
         return robot.rectified
     return re.search(r"(^|[/_])rect", str(robot.depth_topic).lower()) is not None

@@ -1,4 +1,4 @@
-"""Where a robot's sensor is at a stamp: from a pose topic or a trajectory file and TF, or from TF alone."""
+"""Pose of a robot's sensor over time, from a pose topic or a trajectory file and TF, or from TF alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Self, TypeAlias
 
 import numpy as np
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
 from octoreplay.io.messages.decoders import DamagedMessageError
@@ -20,33 +20,33 @@ from octoreplay.records import Float64Array
 from octoreplay.transforms import normalise, transform_of
 
 Link: TypeAlias = tuple[str, str]
-"""A transform that TF must give: its target frame and its source frame."""
+"""Transform that TF must give: (target frame, source frame)."""
 
 POSE_KINDS = (Kind.ODOMETRY, Kind.POSE, Kind.PATH, Kind.TF)
-"""What a pose topic can be."""
+"""Kinds of messages that a pose topic can carry."""
 
 
 def is_static_tf(topic: TopicInfo) -> bool:
-    """True for a topic of transforms that never change: by its name, or a Foxglove topic that says it only once."""
+    """True for a topic of fixed transforms: by its name, or a Foxglove topic with a single message."""
     return "static" in topic.name.rsplit("/", 1)[-1] or (
         topic.type_name.startswith("foxglove") and topic.num_messages == 1
     )
 
 
 def tf_topics(topics: Collection[TopicInfo], sensor_topic: str) -> tuple[TopicInfo, ...]:
-    """The TF topics that concern a sensor topic: those in a namespace above it, else all."""
+    """Return the TF topics that concern a sensor topic: those in a namespace above it, else all."""
     tf = sorted((topic for topic in topics if kind_of(topic.type_name) is Kind.TF), key=lambda topic: topic.name)
     above = [topic for topic in tf if f"/{sensor_topic.lstrip('/')}".startswith(_folder(topic.name))]
     return tuple(above or tf)
 
 
 def moving_tf_names(topics: Collection[TopicInfo]) -> tuple[str, ...]:
-    """The names of the topics of transforms that change, once each."""
+    """Return the names of the topics of moving transforms, without repetition."""
     return tuple(dict.fromkeys(topic.name for topic in topics if not is_static_tf(topic)))
 
 
 def load_static_transforms(tree: FrameTree, logs: Sequence[LogReader], topics: Collection[TopicInfo]) -> None:
-    """Put every static transform of the logs into a tree, wherever in the files it stands."""
+    """Add every static transform of the logs to a tree, wherever in the files it is."""
     static = {topic.name for topic in topics if is_static_tf(topic)}
     for log in logs:
         for message in log.messages(static):
@@ -57,19 +57,17 @@ def load_static_transforms(tree: FrameTree, logs: Sequence[LogReader], topics: C
 class PoseSource:
     """The pose of one robot's sensor in its map frame over time.
 
-    ``known`` is an earlier source of the same robot, whose trajectory file or path need not be read again.
-    ``topics`` are those whose messages it must be given through ``take``, in the order of the log. A pose is the
-    product T_map_origin T_origin_body T_body_sensor: the middle one from the pose topic or file, the others from TF
-    where they are not the identity or given; without either the whole of it comes from TF.
-    Raises InputError where the log cannot give such a pose at any time.
+    A pose is the product T_map_origin T_origin_body T_body_sensor. The middle one comes from the pose topic or file,
+    the others from TF unless they are the identity or configured. Where the pose topic is TF, the whole pose comes from
+    TF. The messages of ``topics`` must be passed to ``take`` in the order of the log. ``known`` is an earlier source of
+    the same robot, whose trajectory is used again. Raises InputError where the log gives no pose at any time.
     """
 
     def __init__(
         self,
-        robot: RobotConfig,
+        robot: ResolvedRobot,
         logs: Sequence[LogReader],
         *,
-        sensor_topic: str,
         sensor_frame: str,
         pose_gap_ns: int,
         use_log_time: bool,
@@ -79,16 +77,15 @@ class PoseSource:
         self._logs = logs
         self._use_log_time = use_log_time
         self._pose_gap_ns = pose_gap_ns
-        self._sensor_topic = sensor_topic
         self._sensor_frame = frame_name(robot.sensor_frame or sensor_frame)
         infos = [topic for log in logs for topic in log.topics]
-        tf = tf_topics(infos, sensor_topic)
+        tf = tf_topics(infos, robot.sensor_topic)
         self._tree = FrameTree(pose_gap_ns)
         self._T_given = None if robot.T_body_sensor is None else transform_of(robot.T_body_sensor)
         load_static_transforms(self._tree, logs, tf)
         kinds = {kind_of(topic.type_name) for topic in infos if topic.name == robot.pose_topic}
         self.trajectory: Trajectory | None = known.trajectory if known else self._whole_trajectory(Kind.PATH in kinds)
-        """The poses where they are known from the beginning, from a file or a path; else None."""
+        """Poses from a file or a path, known from the beginning; else None."""
         self._track = PoseTrack(pose_gap_ns) if self.trajectory is None and Kind.TF not in kinds else None
         self._before, self._after = self._tf_link() if Kind.TF in kinds else self._links_of_poses()
         self._body = self._body_link()
@@ -100,7 +97,7 @@ class PoseSource:
             self.check_connected()
 
     def is_known(self, stamp_ns: int) -> bool:
-        """True where the poses on both sides of a stamp have come; always for a sensor that stands still."""
+        """True where the poses on both sides of a stamp are known; always for a sensor that does not move."""
         stamps = [] if self._track is None else [self._track.last_ns]
         stamps += [self._tree.last_ns(*link) for link in self._moving_links]
         return all(stamp is not None and stamp >= stamp_ns for stamp in stamps)
@@ -125,24 +122,24 @@ class PoseSource:
         return result
 
     def T_body_sensor_at(self, stamp_ns: int) -> Float64Array | None:
-        """From the sensor to the frame of ``body_box`` at a stamp, (4, 4) float64; None where TF does not say it."""
+        """Transform from the sensor to the frame of ``body_box`` at a stamp, (4, 4) float64; None where TF has none."""
         return self._sensor_at(stamp_ns) if self._body is None else self._link_at(self._body, stamp_ns)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop what no stamp from ``stamp_ns`` on needs."""
+        """Drop poses that no stamp from ``stamp_ns`` on needs."""
         self._tree.forget_before(stamp_ns)
         if self._track is not None:
             self._track.forget_before(stamp_ns)
 
     def check_connected(self) -> None:
-        """Raise InputError with both frames' names where the TF taken so far does not join what it has to."""
+        """Raise InputError where the TF messages so far do not join the frames of every link."""
         for link in self._links:
             if not self._tree.is_connected(*link):
                 raise InputError(f"{self._name}: {self._tree.why_not_connected(*link)}; {self._remedy(link)}")
 
     @property
     def _name(self) -> str:
-        """The robot's logs, as errors begin."""
+        """Paths of the robot's logs, as an error begins."""
         return ", ".join(str(log.path) for log in self._logs)
 
     # --- the three parts of a pose ------------------------------------------------------------------------------------
@@ -158,39 +155,39 @@ class PoseSource:
         return self._link_at(self._after, stamp_ns) if self._T_given is None else self._T_given
 
     def _link_at(self, link: Link | None, stamp_ns: int) -> Float64Array | None:
-        """The transform of a TF link at a stamp; None also where nothing joins its frames yet."""
+        """Transform of a TF link at a stamp; None also where its frames are not joined yet."""
         if link is None:
             return np.eye(4)
         return self._tree.T_a_b(*link, stamp_ns) if self._tree.is_connected(*link) else None
 
     def _remedy(self, link: Link) -> str:
-        """What to put into a team file where a link cannot be made."""
+        """Remedy in the team file where TF does not join a link's frames."""
         if link == self._before:
             return "name another map_frame, sensor_frame or pose_topic"
         if link == self._body:
             return "name another body_frame"
         return "name the sensor_frame, or give T_body_sensor: [x, y, z, qx, qy, qz, qw]"
 
-    # --- what the parts are -------------------------------------------------------------------------------------------
+    # --- links and trajectory -----------------------------------------------------------------------------------------
 
     def _tf_link(self) -> tuple[Link | None, Link | None]:
-        """What to take from TF where the whole pose comes from it."""
+        """Links before and after the poses where the whole pose comes from TF."""
         if self._robot.map_frame is None:
             raise InputError(f"{self._name}: poses from TF need a map_frame for robot '{self._robot.robot_id}'")
         return (frame_name(self._robot.map_frame), self._sensor_frame), None
 
     def _body_link(self) -> Link | None:
-        """What to take from TF for the robot's own box: None where its frame is that of the poses."""
+        """Link from the sensor to ``body_frame``; None where the box is in the frame of the poses."""
         frame = self._robot.body_frame
         return None if frame is None or self._robot.body_box is None else (frame_name(frame), self._sensor_frame)
 
     def _links_of_poses(self) -> tuple[Link | None, Link | None]:
-        """What to take from TF before and after the poses, by the frames that these are in and of."""
+        """Links before and after the poses, by the first pose's parent and child frames."""
         if self._robot.pose_file is not None:
-            # A file names no frames: it holds the sensor's poses, or those of the body that T_body_sensor is given for.
+            # A file names no frames: it holds poses of the sensor, or of the body where T_body_sensor is given.
             return None, None
         topic = str(self._robot.pose_topic)
-        # A path that grows is empty at first.
+        # The first messages of a growing path are empty.
         messages = (message for log in self._logs for message in log.messages((topic,)))
         first = next((message for message in messages if _holds_poses(message)), None)
         if first is None:
@@ -203,21 +200,21 @@ class PoseSource:
             return before, None
         if not body:
             raise InputError(
-                f"{first.where}: the poses do not name the frame they are of; "
+                f"{first.where}: the poses have no child frame; "
                 f"give T_body_sensor: [x, y, z, qx, qy, qz, qw] ([0, 0, 0, 0, 0, 0, 1] for the sensor's own poses)"
             )
         return before, (body, self._sensor_frame)
 
     def _whole_trajectory(self, is_path: bool) -> Trajectory | None:
-        """The robot's poses where they are known from the beginning: from a file, or from the last Path message."""
+        """Trajectory of a pose file or of the last Path message; None for another pose topic."""
         if self._robot.pose_file is not None:
             return self._file_trajectory(read_rows(self._robot.pose_file))
         if not is_path:
             return None
         if self._use_log_time:
             raise InputError(
-                f"{self._name}: the path '{self._robot.pose_topic}' has stamps of its own, which clock: log cannot go "
-                f"by; use clock: header, or give pose_file"
+                f"{self._name}: the path '{self._robot.pose_topic}' has its own stamps, which clock: log cannot "
+                f"replace; use clock: header, or give pose_file"
             )
         last: RawMessage | None = None
         for log in self._logs:
@@ -231,38 +228,40 @@ class PoseSource:
         return trajectory(stamps, rows)
 
     def _file_trajectory(self, rows: TrajectoryRows) -> Trajectory:
-        """The poses of a trajectory file with the stamps that belong to them."""
+        """Trajectory of a file's poses with their stamps."""
         path, times = self._robot.pose_file, self._robot.pose_times
         if times is not None and rows.stamps_ns is not None:
-            raise InputError(f"{path}: its rows have times of their own; leave pose_times out")
+            raise InputError(f"{path}: its rows have times; remove pose_times")
         if times is not None:
             stamps = read_times(times)
         elif rows.stamps_ns is not None:
             return trajectory(rows.stamps_ns, rows)
         else:
-            messages = (message for log in self._logs for message in log.messages((self._sensor_topic,)))
+            messages = (message for log in self._logs for message in log.messages((self._robot.sensor_topic,)))
             stamps = np.sort(
                 np.array([m.log_time_ns if self._use_log_time else m.header_stamp_ns() for m in messages], np.int64)
             )
         if stamps.size != len(rows.positions):
-            whose = f"{times} has {stamps.size} times" if times else f"'{self._sensor_topic}' {stamps.size} messages"
+            found = (
+                f"{times} has {stamps.size} times" if times else f"'{self._robot.sensor_topic}' {stamps.size} messages"
+            )
             raise InputError(
-                f"{path}: has {len(rows.positions)} poses, but {whose}; give pose_times: a file with a time [s] for "
-                f"every pose"
+                f"{path}: has {len(rows.positions)} poses, but {found}; give pose_times: a file with the time [s] "
+                f"of each pose"
             )
         return trajectory(stamps, rows)
 
 
 def _transforms(message: RawMessage) -> Transforms:
-    """The poses or transforms in a message. Raises DamagedMessageError for others that the topic may carry too."""
+    """The transforms in a message. Raises DamagedMessageError for a message of another type on the topic."""
     found = message.sensor_message()
     if not isinstance(found, Transforms):
-        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, no pose")
+        raise DamagedMessageError(f"{message.where}: is of type {message.type_name}, not a pose")
     return found
 
 
 def _holds_poses(message: RawMessage) -> bool:
-    """True where a message is whole and has a pose."""
+    """True where a message can be decoded and has a pose."""
     with suppress(DamagedMessageError):
         return bool(_transforms(message).transforms)
     return False

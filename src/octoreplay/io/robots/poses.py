@@ -1,4 +1,4 @@
-"""Poses in time: tracks that are interpolated, and trees of frames."""
+"""Interpolated pose tracks and trees of frames."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from octoreplay.transforms import Pose, interpolate, inverse, normalise, pose_ma
 class PoseTrack:
     """Poses over time, interpolated between neighbours: linearly in position, by slerp in rotation.
 
-    A stamp of a pose itself always has that pose. Any other has one only where it lies between two poses that are at
-    most ``pose_gap_ns`` apart. Poses may be added out of order; of two with one stamp the later added holds.
+    At the stamp of a pose the result is that pose. At any other stamp there is a pose only between two poses that are
+    at most ``pose_gap_ns`` apart. Poses may be added in any order; of two with the same stamp the last one is kept.
     """
 
     def __init__(self, pose_gap_ns: int) -> None:
@@ -26,7 +26,7 @@ class PoseTrack:
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
         self.num_added = 0
-        """Poses that were added, the dropped ones too."""
+        """Number of poses added, including dropped ones."""
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -37,7 +37,7 @@ class PoseTrack:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, position: Sequence[float], quaternion: Sequence[float]) -> bool:
-        """Add a pose; False, and nothing added, where a number is not finite or the quaternion is zero."""
+        """Add a pose; return False and add nothing where a number is not finite or the quaternion is zero."""
         x, y, z = (float(value) for value in position)
         rotation = normalise(quaternion)
         if rotation is None or not math.isfinite(x + y + z):
@@ -57,7 +57,7 @@ class PoseTrack:
         return True
 
     def at(self, stamp_ns: int) -> Pose | None:
-        """The pose at a stamp, or None where there is none (see the class)."""
+        """Pose at a stamp; None where there is none (see the class)."""
         index = bisect_left(self._stamps, stamp_ns)
         if index < len(self._stamps) and self._stamps[index] == stamp_ns:
             return self._poses[index]
@@ -69,13 +69,13 @@ class PoseTrack:
         return interpolate(self._poses[index - 1], self._poses[index], (stamp_ns - before) / (after - before))
 
     def matrix_at(self, stamp_ns: int) -> Float64Array | None:
-        """The pose at a stamp as a (4, 4) transform, or None."""
+        """Pose at a stamp as a (4, 4) transform, or None."""
         pose = self.at(stamp_ns)
         return None if pose is None else pose_matrix(*pose)
 
     @property
     def only_matrix(self) -> Float64Array:
-        """The one pose of a track that has one, as a (4, 4) transform."""
+        """Pose of a track with a single pose, as a (4, 4) transform."""
         return pose_matrix(*self._poses[0])
 
     def forget_before(self, stamp_ns: int) -> None:
@@ -87,7 +87,7 @@ class PoseTrack:
 
 
 class FrameTree:
-    """The frames of a robot as TF gives them: every frame has one parent, by a fixed or a moving transform."""
+    """Tree of a robot's frames from TF: each frame has one parent and a fixed or moving transform to it."""
 
     def __init__(self, pose_gap_ns: int) -> None:
         self._pose_gap_ns = pose_gap_ns
@@ -107,7 +107,7 @@ class FrameTree:
     ) -> None:
         """Add T_parent_child: fixed where ``stamp_ns`` is None, else the moving transform's value at that stamp.
 
-        A transform that is not finite or has a zero quaternion is left out.
+        A transform that is not finite or has a zero quaternion is ignored.
         """
         parent, child = frame_name(parent), frame_name(child)
         known = self._parents.setdefault(child, parent)
@@ -133,16 +133,16 @@ class FrameTree:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The names of all frames, sorted."""
+        """Names of all frames, sorted."""
         return tuple(sorted({*self._parents, *self._parents.values()}))
 
     def root_of(self, frame: str) -> str:
-        """The frame at the top of the chain of parents above a frame (itself where it has none)."""
+        """Root of the tree that a frame is in (the frame itself where it has no parent)."""
         *_, root = self._ancestors(frame_name(frame))
         return root
 
     def is_connected(self, a: str, b: str) -> bool:
-        """True where a chain of transforms joins two frames, at whatever time."""
+        """True where a chain of transforms joins two frames, at any time."""
         return self.root_of(a) == self.root_of(b)
 
     def is_fixed(self, a: str, b: str) -> bool:
@@ -153,22 +153,22 @@ class FrameTree:
         return all(child in self._fixed for child in (*up, *down))
 
     def last_ns(self, a: str, b: str) -> int | None:
-        """The stamp up to which every moving transform between two frames is known; None without moving ones."""
+        """Stamp up to which every moving transform between two frames is known; None without moving transforms."""
         up, down = self._chain(frame_name(a), frame_name(b))
         moving = [self._moving[child] for child in (*up, *down) if child in self._moving and child not in self._fixed]
         return min((track.last_ns for track in moving if track.last_ns is not None), default=None)
 
     def T_a_b(self, a: str, b: str, stamp_ns: int) -> Float64Array | None:
-        """The transform from frame b to frame a at a stamp; None where a moving transform has no value there.
+        """Transform from frame b to frame a at a stamp, (4, 4); None where a moving transform has no value there.
 
-        Raises InputError with both names where nothing joins the frames, or a frame between has two parents.
+        Raises InputError where no chain joins the frames, or a frame in it has two parents.
         """
         a, b = frame_name(a), frame_name(b)
         if not self.is_connected(a, b):
             raise InputError(self.why_not_connected(a, b))
         result = np.eye(4)
         up, down = self._chain(a, b)
-        # Up from a to the common ancestor against the transforms, then down to b along them.
+        # Up from a to the common ancestor by inverse transforms, then down to b.
         for child in up:
             step = self._edge(child, stamp_ns)
             if step is None:
@@ -196,7 +196,7 @@ class FrameTree:
         )
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop what no stamp from ``stamp_ns`` on needs."""
+        """Drop transforms that no stamp from ``stamp_ns`` on needs."""
         for track in self._moving.values():
             track.forget_before(stamp_ns)
 
@@ -214,7 +214,7 @@ class FrameTree:
         return track.only_matrix if child in self._holding and track.num_added == 1 else track.matrix_at(stamp_ns)
 
     def _ancestors(self, frame: str) -> Iterator[str]:
-        """A frame, its parent, and so on to the root; a loop ends where it closes."""
+        """A frame and its ancestors up to the root; a cycle ends before its first repeated frame."""
         seen = set()
         while frame not in seen:
             seen.add(frame)
@@ -224,7 +224,7 @@ class FrameTree:
             frame = self._parents[frame]
 
     def _chain(self, a: str, b: str) -> tuple[list[str], list[str]]:
-        """The frames to step up from: from a, and from b, each to the first common ancestor."""
+        """Frames below the first common ancestor of a and b: those above a, and those above b, each with a or b."""
         from_a = list(self._ancestors(a))
         depth_of = {frame: index for index, frame in enumerate(from_a)}
         down: list[str] = []
@@ -236,5 +236,5 @@ class FrameTree:
 
 
 def frame_name(name: str) -> str:
-    """A frame's name without the leading slash that old logs write."""
+    """Return a frame's name without the leading slash of ROS 1."""
     return name.lstrip("/")

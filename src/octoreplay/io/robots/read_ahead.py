@@ -1,4 +1,4 @@
-"""Frames read and decoded in a thread of their own, a few ahead of whoever takes them."""
+"""Frames read and decoded in a background thread, a few ahead of the consumer."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import Frame
 
 NUM_AHEAD = 4
-"""Frames that wait to be taken, at most; so memory does not grow with the length of the log."""
+"""Largest number of waiting frames; it bounds the memory, whatever the length of the log."""
 
-# How often a waiting thread looks whether it is still wanted.
-_LOOK_EVERY_SECONDS = 0.1
+# Period at which a waiting thread checks whether the log was closed.
+_POLL_SECONDS = 0.1
 
 
 class ReadAhead:
-    """The frames of one robot's log from a thread; a context manager that ends the thread before the log is closed.
+    """Frames of one robot's log, read in a thread; a context manager that ends the thread before the log is closed.
 
-    ``team_start_ns`` as for ``RobotLog.frames``. What that raises is raised by the iterator that ``frames`` gives.
+    ``team_start_ns`` is that of ``RobotLog.frames``. Errors of the thread are raised by the iterator of ``frames``.
     """
 
     def __init__(self, log: RobotLog, team_start_ns: int | None = None) -> None:
@@ -42,23 +42,23 @@ class ReadAhead:
         self._thread.join()
 
     def frames(self) -> Iterator[Frame]:
-        """The frames from the beginning; to be called once."""
+        """Yield the frames from the beginning; may be called once."""
         while (item := self._take()) is not None:
             if isinstance(item, Exception):
                 raise item
             yield item
 
     def _take(self) -> Frame | Exception | None:
-        """What was read next; None at the end, and when the log is closed."""
+        """Next frame or error; None at the end and when the log is closed."""
         while not self._is_closed.is_set():
             try:
-                return self._queue.get(timeout=_LOOK_EVERY_SECONDS)
+                return self._queue.get(timeout=_POLL_SECONDS)
             except Empty:
                 continue
         return None
 
     def _read(self) -> None:
-        """Read frames until there are none, one fails, or nobody wants them."""
+        """Read frames until the end, an error, or the closing of the log."""
         try:
             for frame in self._log.frames(self._team_start_ns, is_wanted=lambda: not self._is_closed.is_set()):
                 if not self._put(frame):
@@ -68,10 +68,10 @@ class ReadAhead:
             self._put(error)
 
     def _put(self, item: Frame | Exception | None) -> bool:
-        """Wait until there is room; False when nobody wants it any more."""
+        """Put an item into the queue when there is room; False when the log was closed."""
         while not self._is_closed.is_set():
             try:
-                self._queue.put(item, timeout=_LOOK_EVERY_SECONDS)
+                self._queue.put(item, timeout=_POLL_SECONDS)
             except Full:
                 continue
             return True

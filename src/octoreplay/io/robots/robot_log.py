@@ -1,4 +1,4 @@
-"""One robot's log as a stream of frames: images and labels paired, poses interpolated, in the order of their stamps."""
+"""Frames of one robot's log in stamp order, with paired labels and interpolated poses."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from typing import Self
 
 import numpy as np
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
-from octoreplay.errors import ConfigError, InputError
+from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, first_whole_message
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.body_box import body_box_at
 from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker, FrameMaker
 from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
 from octoreplay.io.robots.pose_source import PoseSource
@@ -27,34 +28,34 @@ from octoreplay.io.robots.stamp_check import StampCheck
 from octoreplay.io.robots.thinning import Thinning
 from octoreplay.io.sensors.labels import LabelLookup
 from octoreplay.records import BodyBox, ClassTable, Float64Array, Frame, FrameCounts
-from octoreplay.transforms import inverse, transform_of
+from octoreplay.transforms import transform_of
 
-# A message that a robot recorded may have been under way for this long, and its poses too.
+# Largest delay between the stamp of a message or pose and its log time.
 _LOG_DELAY_NS = 10_000_000_000
-# So many of a sensor's first messages may be out of order.
+# Number of a sensor's first messages that may be out of order.
 _NUM_FIRST = 8
-# Messages between two looks at which poses are needed no more.
+# Number of messages between two removals of poses that are not needed any more.
 _FORGET_EVERY = 64
 _STAMPED_KINDS = (Kind.IMAGE, Kind.COMPRESSED_IMAGE, Kind.CLOUD, Kind.SCAN)
 
 
 class RobotLog:
-    """The frames of one robot, read lazily; a context manager.
+    """Frames of one robot, read lazily; a context manager.
 
-    ``robot`` names its topics (``discover.resolve`` fills those that a team file leaves out). With a ``class_table``
-    raw labels become class ids; without one, or without labels in the log, frames carry no classes. An empty
-    ``label_topic`` means that labels in the log, also those in a point cloud, are not used.
-    A frame's stamp is that of its image or point cloud plus the robot's clock offset; its pose is in the team's frame.
-    A stamp is settled, and its frame given, once the sensor's stream is ``reorder_window`` further. A stamp that no
-    clock can have given (``StampCheck``) makes its message unreadable, and a sensor that would be further than
-    ``reach`` [m] from the team's origin along an axis has no pose.
-    ``logs`` are the robot's logs where they are open already, and stay open. Raises InputError where a log cannot be
-    opened or lacks intrinsics, frames or poses altogether.
+    - Classes: ``class_table`` maps raw labels to class ids. Frames have no classes without it, without labels in the
+      log, and with an empty ``label_topic`` or ``label_field``.
+    - Stamps: a frame's stamp is that of its image or point cloud plus the robot's clock offset. Its frame is given once
+      the sensor's stream is ``reorder_window`` further. A message with a damaged stamp (``StampCheck``) is undecodable.
+    - Poses: they are in the team's frame. A sensor that is further than ``reach`` [m] from the team's origin along an
+      axis has no pose.
+    - Open ``logs`` of the robot are used as they are and stay open.
+
+    Raises InputError where a log cannot be opened or has no intrinsics, frames or poses.
     """
 
     def __init__(
         self,
-        robot: RobotConfig,
+        robot: ResolvedRobot,
         time: TimeConfig,
         class_table: ClassTable | None,
         *,
@@ -65,52 +66,36 @@ class RobotLog:
         self.counts = FrameCounts()
         self._time = time
         self._reach = reach
-        self._num_beyond = 0
+        self._num_out_of_reach = 0
         self._use_log_time = time.clock == "log"
-        self._offset_ns = round(robot.clock_offset * 1e9)
+        self._offset_ns = robot.clock_offset_ns
         self._stamp_check = StampCheck(self._offset_ns)
         self.T_team_map = transform_of(robot.T_team_map)
         is_labelled = class_table is not None and "" not in (robot.label_topic, robot.label_field)
         self._labels = LabelLookup(class_table, strict=time.strict_labels) if class_table and is_labelled else None
-        sensor_topic = robot.depth_topic or robot.cloud_topic
-        if sensor_topic is None or (robot.pose_topic or robot.pose_file) is None:
-            missing = "depth_topic or cloud_topic" if sensor_topic is None else "pose_topic or pose_file"
-            raise ConfigError(f"robot '{robot.robot_id}': needs a {missing}")
-        self.sensor_topic = sensor_topic
+        self.sensor_topic = robot.sensor_topic
         self._known_poses: PoseSource | None = None
         with ExitStack() as stack:
             if logs is None:
                 logs = [stack.enter_context(open_log(path)) for path in robot.logs]
             self._logs = tuple(logs)
-            first = self._first_of(sensor_topic, _STAMPED_KINDS)
+            first = self._first_of(self.sensor_topic, _STAMPED_KINDS)
             if first is None:
-                raise InputError(f"{self._name}: topic '{sensor_topic}' holds no messages")
+                raise InputError(f"{self._name}: topic '{self.sensor_topic}' holds no messages")
             self._sensor_frame = first.header_frame_id()
             self.first_log_time_ns = first.log_time_ns
             """Log time of the sensor's first message, without the clock offset."""
             self.first_stamp_ns = self._first_stamp(first)
-            """The sensor's first stamp, clock offset applied."""
+            """First stamp of the sensor, clock offset applied."""
             self._maker = self._frame_maker()
-            # Fails here rather than after a long run where poses cannot come about.
+            # Fails before the run where the log can give no pose.
             self.pose_source()
             self._closing = stack.pop_all()
 
     @property
     def robot_id(self) -> str:
-        """The robot's name in the team."""
+        """Name of the robot in the team."""
         return self.robot.robot_id
-
-    @property
-    def start_ns(self) -> int | None:
-        """Log time of the first message of any topic, clock offset applied; None in a log without messages."""
-        starts = [log.start_ns for log in self._logs if log.start_ns is not None]
-        return min(starts) + self._offset_ns if starts else None
-
-    @property
-    def end_ns(self) -> int | None:
-        """Log time of the last message of any topic, clock offset applied; None in a log without messages."""
-        ends = [log.end_ns for log in self._logs if log.end_ns is not None]
-        return max(ends) + self._offset_ns if ends else None
 
     def __enter__(self) -> Self:
         return self
@@ -127,13 +112,13 @@ class RobotLog:
     def frames(
         self, team_start_ns: int | None = None, *, is_wanted: Callable[[], bool] = lambda: True
     ) -> Iterator[Frame]:
-        """The robot's frames in order of stamp, decoded as they are taken; ``counts`` says what became of the rest.
+        """Yield the robot's frames in stamp order, decoded on demand; ``counts`` has the frames that are not given.
 
         ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. With a
         ``start``, reading begins some seconds before it, and late, duplicate, undecodable and damaged messages before
         that are not counted. The logs are read from their beginning where the delay between stamps and log times
         changes by more than 10 s, or where Foxglove's transforms, which hold from their first message on, are needed.
-        Reading ends when ``is_wanted`` returns False, which is checked for every message. Every call starts with fresh
+        Reading ends when ``is_wanted``, which is called for every message, returns False. Every call starts with fresh
         counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for images
         whose sizes differ, and for frames that TF never joins.
         """
@@ -142,7 +127,7 @@ class RobotLog:
             self._labels.unknown = self.counts.unknown_label_pixels
             self._labels.unknown_colors = self.counts.unknown_colors
         start_ns = self.first_stamp_ns if team_start_ns is None else team_start_ns
-        self._stamp_check, self._num_beyond = StampCheck(self._offset_ns), 0
+        self._stamp_check, self._num_out_of_reach = StampCheck(self._offset_ns), 0
         thinning = Thinning(self._time, start_ns - self._offset_ns)
         poses = self.pose_source()
         log_start_ns = self._log_start_ns(thinning.needed_from_ns, poses)
@@ -151,22 +136,21 @@ class RobotLog:
         for settled in self._settled(poses, thinning, log_start_ns, is_wanted):
             if thinning.keeps(settled.stamp_ns):
                 yield from self._frame(settled, poses)
-        # Reading on may have come upon more damage than opening did.
+        # Reading may have found more damage than opening.
         self.counts.truncated_files = self._damage()
         if self.counts.used == 0 and self.counts.no_pose > 0:
             if log_start_ns is not None:
                 # Transforms in the part that was not read may connect the frames.
                 for message in self._messages(poses.topics, None, log_start_ns):
-                    self._give(message, poses)
+                    self._add_pose(message, poses)
             poses.check_connected()
             self._check_within_reach()
 
     def pose_source(self) -> PoseSource:
-        """The robot's poses, before any message of the logs is taken."""
+        """Return a new source of the robot's poses, before its first message."""
         self._known_poses = PoseSource(
             self.robot,
             self._logs,
-            sensor_topic=self.sensor_topic,
             sensor_frame=self._sensor_frame,
             pose_gap_ns=round(self._time.pose_gap * 1e9),
             use_log_time=self._use_log_time,
@@ -175,18 +159,18 @@ class RobotLog:
         return self._known_poses
 
     def pose_messages(self, poses: PoseSource, needed_from_ns: int) -> Iterator[RawMessage]:
-        """Gives a pose source its messages one by one, and each of them when it has been taken.
+        """Pass the messages of a pose source to it one by one, and yield each of them afterwards.
 
         Messages that no pose from the stamp ``needed_from_ns`` (without the clock offset) on needs may be left out.
         """
         for message in self._messages(poses.topics, self._log_start_ns(needed_from_ns, poses)):
-            self._give(message, poses)
+            self._add_pose(message, poses)
             yield message
 
     def _settled(
         self, poses: PoseSource, thinning: Thinning, log_start_ns: int | None, is_wanted: Callable[[], bool]
     ) -> Iterator[Settled[RawMessage]]:
-        """The sensor's messages in the order of their stamps, with what goes with them."""
+        """Sensor messages in stamp order, with their partners and poses."""
         partner_topics = self._maker.partner_topics
         queue: FrameQueue[RawMessage] = FrameQueue(
             poses,
@@ -205,7 +189,7 @@ class RobotLog:
             while (ready := queue.pop(final=False)) is not None:
                 yield ready
             if number % _FORGET_EVERY == 0:
-                # Poses without images would pile up.
+                # Poses without images would accumulate.
                 poses.forget_before(queue.needed_from_ns(self.first_stamp_ns - self._offset_ns))
         while (ready := queue.pop(final=True)) is not None:
             yield ready
@@ -256,31 +240,31 @@ class RobotLog:
                     self._stamp_of(message, self._stamp_check)
 
     def _is_over(self, thinning: Thinning, newest_ns: int | None, log_time_ns: int) -> bool:
-        """True once nothing can come that is wanted, by the stamps and by the log's time: one stamp may be wrong."""
-        # Stamps may be of another clock than the log, but run as quickly.
+        """True once the span is over by the stamps and by the log time, since one stamp may be wrong."""
+        # Stamps may be of another clock than the log times, with the same rate.
         elapsed_ns = log_time_ns - self.first_log_time_ns
         by_log_ns = self.first_stamp_ns - self._offset_ns + elapsed_ns
         return newest_ns is not None and thinning.is_over(newest_ns) and thinning.is_over(by_log_ns)
 
     @property
     def _name(self) -> str:
-        """The robot's logs, as errors begin."""
+        """Paths of the robot's logs, as an error begins."""
         return ", ".join(str(path) for path in self.robot.logs)
 
     def _damage(self) -> list[str]:
-        """A sentence for each log that is cut or damaged, as far as they have been read."""
+        """One sentence for each log with damage found so far."""
         return [log.damage for log in self._logs if log.damage is not None]
 
     def _first_of(self, topic: str, kinds: Collection[Kind]) -> RawMessage | None:
-        """The first message of a topic in all the robot's logs that says one of some kinds of things and is whole."""
+        """First whole message of a topic, of some kinds, in all the robot's logs."""
         found = [first_whole_message(log, topic, kinds) for log in self._logs]
         return min((m for m in found if m is not None), key=lambda message: message.log_time_ns, default=None)
 
     def _first_stamp(self, first: RawMessage) -> int:
-        """The least of the sensor's first stamps within ``reorder_window`` that is not late from the start."""
-        # A log may begin at 0; a header that was never stamped is 0 at any time.
+        """Smallest of the sensor's first stamps within ``reorder_window`` that is not late."""
+        # A stamp of 0 is valid in a log that begins at time 0; elsewhere the header was not stamped.
         if not self._use_log_time and first.header_stamp_ns() == 0 and first.log_time_ns != 0:
-            raise InputError(f"{first.where}: the header's stamp is 0; give clock: log to go by the log's times")
+            raise InputError(f"{first.where}: the header's stamp is 0; give clock: log to use the log's times")
         window_ns = round(self._time.reorder_window * 1e9)
         stamps, check = [], StampCheck(self._offset_ns)
         for message in islice(self._messages((self.sensor_topic,)), _NUM_FIRST):
@@ -293,30 +277,30 @@ class RobotLog:
             stamp_ns = first.log_time_ns if self._use_log_time else first.header_stamp_ns()
             raise InputError(
                 f"{first.where}: the stamp {stamp_ns / 1e9:.6g} s with the clock_offset {self.robot.clock_offset:g} s "
-                f"is not from 0 to 2^31 s, the year 2038; give another clock_offset or the other clock (header, log)"
+                f"is outside 0 to 2^31 s (1970 - 2038); give another clock_offset or clock"
             )
         return stamp_ns + self._offset_ns
 
     def _stamp_of(self, message: RawMessage, check: StampCheck) -> int:
-        """A message's stamp, without the clock offset. Raises DamagedMessageError where it has none that can be."""
+        """A message's stamp, without the clock offset. Raises DamagedMessageError where it is missing or damaged."""
         if kind_of(message.type_name) not in _STAMPED_KINDS:
-            # What stands first in its bytes is no stamp.
+            # A message of another type does not begin with a stamp.
             raise DamagedMessageError(f"{message.where}: is of type {message.type_name}")
         stamp = message.log_time_ns if self._use_log_time else message.header_stamp_ns()
         if not check.is_good(message.topic, stamp, message.log_time_ns):
-            raise DamagedMessageError(f"{message.where}: no clock gave the stamp {stamp} ns")
+            raise DamagedMessageError(f"{message.where}: the stamp {stamp} ns is damaged")
         return stamp
 
     def _check_within_reach(self) -> None:
-        """Raise InputError where every frame had a pose, and each of them was out of reach."""
-        if self._num_beyond == self.counts.no_pose:
+        """Raise InputError where every frame had a pose out of reach."""
+        if self._num_out_of_reach == self.counts.no_pose:
             raise InputError(
-                f"{self._name}: all poses of robot '{self.robot_id}' lie outside the map, where the sensor may be "
+                f"{self._name}: all poses of robot '{self.robot_id}' are outside the map, which reaches "
                 f"{self._reach:g} m from the origin; check the poses, or give T_team_map or a coarser resolution"
             )
 
     def _frame_maker(self) -> FrameMaker:
-        """What decodes the sensor's messages."""
+        """Decoder of the sensor's messages."""
         if self.robot.depth_topic is None:
             return CloudFrameMaker(self.robot, self._labels)
         if self.robot.intrinsics is not None:
@@ -331,22 +315,22 @@ class RobotLog:
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """The messages of some topics of all the robot's logs in a range of log time, in order of log time."""
+        """Messages of some topics of all the robot's logs in [start_ns, stop_ns) of log time, in order of log time."""
         streams = (log.messages(topics, start_ns, stop_ns) for log in self._logs)
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     @staticmethod
-    def _give(message: RawMessage, poses: PoseSource) -> None:
-        """Give a message to the poses; frames that miss a damaged one are counted as frames without a pose."""
+    def _add_pose(message: RawMessage, poses: PoseSource) -> None:
+        """Pass a message to the poses; a damaged one leads to frames that are counted as without a pose."""
         with contextlib.suppress(DamagedMessageError):
             poses.take(message)
 
     def _take(
         self, message: RawMessage, queue: FrameQueue[RawMessage], poses: PoseSource, partner_topics: tuple[str, ...]
     ) -> None:
-        """Give a message to the poses or to the queue, or count it as one that cannot be used."""
+        """Pass a message to the poses or to the queue, or count it as unused."""
         if message.topic in poses.topics:
-            self._give(message, poses)
+            self._add_pose(message, poses)
             return
         try:
             stamp = self._stamp_of(message, self._stamp_check)
@@ -369,7 +353,7 @@ class RobotLog:
             self.counts.duplicate += 1
 
     def _frame(self, settled: Settled[RawMessage], poses: PoseSource) -> Iterator[Frame]:
-        """The frame of a settled sensor message, or nothing where a part is missing (which is counted)."""
+        """The frame of a settled sensor message; nothing where a part is missing, which is counted."""
         if None in settled.partners:
             self._count_missing("no_label", settled)
             return
@@ -382,8 +366,8 @@ class RobotLog:
             self._count_missing("no_pose", settled)
             return
         if not (np.abs(T_team_sensor[:3, 3]) <= self._reach).all():
-            # It is the pose that is broken, and the next one may be good.
-            self._num_beyond += 1
+            # A single pose may be wrong, so the frame alone is skipped.
+            self._num_out_of_reach += 1
             self._count_missing("no_pose", settled)
             return
         try:
@@ -398,16 +382,13 @@ class RobotLog:
         yield frame
 
     def _count_missing(self, cause: str, settled: Settled[RawMessage]) -> None:
-        """Count a sensor message that lacks something, and remember which was the first."""
+        """Count an unused sensor message by cause, and remember the first of each cause."""
         setattr(self.counts, cause, getattr(self.counts, cause) + 1)
         self.counts.first_missing.setdefault(cause, settled.message.where)
 
     def _own_boxes(self, poses: PoseSource, stamp_ns: int, T_team_sensor: Float64Array) -> tuple[BodyBox, ...] | None:
-        """The robot's own box where it is at a stamp; None where TF does not say it."""
+        """The robot's own box at a stamp, empty without one; None where TF does not give it."""
         if self.robot.body_box is None:
             return ()
-        T_body_sensor = poses.T_body_sensor_at(stamp_ns)
-        if T_body_sensor is None:
-            return None
-        corners = np.array(self.robot.body_box).reshape(2, 3)
-        return (BodyBox(corners[0], corners[1], T_body_sensor @ inverse(T_team_sensor), is_own=True),)
+        box = body_box_at(self.robot, poses, stamp_ns, T_team_sensor, is_own=True)
+        return None if box is None else (box,)

@@ -1,4 +1,4 @@
-"""One robot's ordinary log, as ROS 2 robots record it: depth images or clouds, labels, TF, odometry, class names."""
+"""Writer of one robot's ROS 2 log: depth images or clouds, labels, TF, odometry and class names."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.transforms import rotation_to_quaternion
 
 MAP_FRAME = "map"
-"""The frame that the logs' poses are given in."""
+"""Frame that the logs' poses are given in."""
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a forward looking optical frame (z forward, x right, y down) in a body (x forward, y left): REP 103."""
 
 _POINT_TYPES = {"u2": 4, "u4": 6, "f4": 7}
-"""NumPy types of a point's fields to sensor_msgs/PointField datatypes."""
+"""sensor_msgs/PointField datatype of each NumPy type of a point's fields."""
 
 
 class RobotLogWriter:
@@ -31,11 +31,11 @@ class RobotLogWriter:
     Topics of robot R: ``/R/camera/depth/image_raw`` (16UC1 in millimetres or 32FC1 in metres),
     ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16), ``/R/labels/label_info`` (once),
     ``/R/odom``, ``/tf`` (map to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame). Without a
-    ``camera`` it is a lidar's log: ``/R/lidar/points`` in the frame R/lidar takes the place of the images.
+    ``camera`` the log is a lidar's: ``/R/lidar/points`` in the frame R/lidar replaces the images.
 
     ``class_table`` is None for a log without labels. ``T_body_sensor`` is (4, 4) float64, from the camera's optical
-    frame, or the lidar's, to the base. ``start_ns`` stamps what is written once, before everything else. Calls must
-    come in time order. Raises OutputError where the file cannot be written.
+    frame, or the lidar's, to the base. ``start_ns`` is the stamp of messages that are written once, at the beginning.
+    Calls must be in time order. Raises OutputError where the file cannot be written.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class RobotLogWriter:
         """Append one point cloud.
 
         ``points`` is (P, 3) float in the sensor's frame, metres, written as float32; ``labels`` (P,) uint16 or uint32
-        raw labels; ``rgb`` (P,) uint32 0x00RRGGBB, declared as float32, which is PCL's habit and what viewers look for;
+        raw labels; ``rgb`` (P,) uint32 0x00RRGGBB, declared as float32 as in PCL, which viewers expect;
         ``intensity`` (P,) float. Raises InputError for other types or lengths, and in a camera's log.
         """
         columns = {name: points[:, axis].astype("<f4") for axis, name in enumerate("xyz")}
@@ -152,13 +152,13 @@ class RobotLogWriter:
         self._writer.write(self._cloud_topic, "sensor_msgs/msg/PointCloud2", value, stamp_ns)
 
     def _point_table(self, columns: dict[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """Points one after another, from their fields."""
+        """Structured array of points from their fields."""
         num_points = len(columns["x"])
         fit = all(column.shape == (num_points,) and column.dtype.str[1:] in _POINT_TYPES for column in columns.values())
         if self._camera is not None or not fit:
             raise InputError(
-                f"{self.path}: topic '{self._cloud_topic}': takes clouds in a lidar's log only, whose points have each "
-                "a label of uint16 or uint32, a colour and an intensity, or none has"
+                f"{self.path}: topic '{self._cloud_topic}': takes clouds in a lidar's log only; labels must be "
+                "uint16 or uint32, and labels, colours and intensities must be given for every point or for none"
             )
         table = np.empty(num_points, [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
         for name, column in columns.items():
@@ -168,7 +168,7 @@ class RobotLogWriter:
     def _write_image(
         self, topic: str, stamp_ns: int, image: npt.NDArray[Any], encodings: dict[str, str], camera: CameraModel
     ) -> None:
-        """Append one image in the encoding of its type."""
+        """Append one image in the encoding of its dtype."""
         encoding = encodings.get(image.dtype.str[1:])
         size = (camera.height, camera.width)
         if encoding is None or image.shape != size:
@@ -241,7 +241,7 @@ class RobotLogWriter:
 
 
 def topics(robot_id: str) -> tuple[str, str, str, str, str]:
-    """A robot's topics: depth images, label images, camera info, odometry, label info."""
+    """Return a robot's topics: depth images, label images, camera info, odometry, label info."""
     camera = f"/{robot_id}/camera"
     return (
         f"{camera}/depth/image_raw",
@@ -253,7 +253,7 @@ def topics(robot_id: str) -> tuple[str, str, str, str, str]:
 
 
 def cloud_topic(robot_id: str) -> str:
-    """The topic of a lidar robot's point clouds."""
+    """Return the topic of a lidar robot's point clouds."""
     return f"/{robot_id}/lidar/points"
 
 

@@ -1,20 +1,20 @@
-"""Telling stamps that a clock gave from damaged ones, before these move the clock of a whole log."""
+"""Detection of damaged stamps."""
 
 from __future__ import annotations
 
 MAX_STAMP_NS = (1 << 31) * 1_000_000_000
-"""Stamps are from 0 up to this, in the year 2038: ROS 2 writes seconds in 32 bits with a sign."""
+"""Exclusive upper bound of stamps, in the year 2038: ROS 2 stores seconds in a signed 32-bit integer."""
 
 MAX_JUMP_NS = 3_600 * 1_000_000_000
-"""From one message to the next a stamp may move against the time of the log by an hour; most clocks move by nothing."""
+"""Largest change of the difference between stamp and log time from one message to the next: one hour."""
 
 
 class StampCheck:
-    """Judges the stamps of one log, topic by topic; ``offset_ns`` is the robot's clock offset.
+    """Check of the stamps of one robot, topic by topic; ``offset_ns`` is the robot's clock offset.
 
-    A stamp is damage where it is out of range, or more than ``MAX_JUMP_NS`` further from the log's time, or nearer to
-    it, than that of the last good message of its topic and that of the message before it. So a damaged stamp is found
-    whatever it is, and a clock that is set while recording costs one message of each topic.
+    A stamp is damaged where it is out of range, or where its difference to the log time differs by more than
+    ``MAX_JUMP_NS`` both from that of the last good message of the topic and from that of the previous message. A clock
+    that is set during the recording therefore loses one message per topic.
     """
 
     def __init__(self, offset_ns: int) -> None:
@@ -23,11 +23,11 @@ class StampCheck:
         self._latest: dict[str, int] = {}
 
     def is_in_range(self, stamp_ns: int) -> bool:
-        """True where a stamp, before the clock offset is applied, is one that a result can hold."""
+        """True where a result can hold a stamp, given without the clock offset, once the offset is added."""
         return 0 <= stamp_ns + self._offset_ns < MAX_STAMP_NS
 
     def is_good(self, topic: str, stamp_ns: int, log_time_ns: int) -> bool:
-        """True where the stamp of the next message of a topic can be believed."""
+        """True where the stamp of a topic's next message is not damaged."""
         if not self.is_in_range(stamp_ns):
             return False
         ahead_ns = stamp_ns - log_time_ns

@@ -1,13 +1,17 @@
-"""What is in a log: its topics, what the first message of each sensor's topic shows, and which robots share it."""
+"""Survey of a log: its topics, a sample of each sensor topic, and the robots that share the log."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, TopicInfo, first_whole_message
+from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import ENCODINGS
 from octoreplay.io.messages.sensor_messages import (
     Cloud,
@@ -33,10 +37,11 @@ _CONFIDENCE_HINTS = ("confidence", "probability", "uncertainty")
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the first message of an image, cloud or scan topic shows.
+class TopicSample:
+    """Properties of the first message of an image, cloud or scan topic.
 
-    ``encoding`` is '' but for images, ``fields`` are empty but for clouds.
+    ``encoding`` is '' except for images, ``fields`` is empty except for clouds; ``size`` is (width, height) in pixels
+    or points.
     """
 
     topic: str
@@ -54,7 +59,7 @@ class Look:
 
     @property
     def is_depth(self) -> bool:
-        """True for a depth image, by its encoding and, where labels and thermal images share that, by its name."""
+        """True for a depth image, by its encoding and, where other images share the encoding, by its topic's name."""
         subject = self._subject
         if self.encoding not in DEPTH_ENCODINGS or subject in (_LABEL_HINTS, _CONFIDENCE_HINTS):
             return False
@@ -62,7 +67,7 @@ class Look:
 
     @property
     def is_label(self) -> bool:
-        """True for a label image: an encoding that only labels have, or one that they share and a name that says so."""
+        """True for a label image, by an encoding of labels alone or a shared encoding and the topic's name."""
         subject = self._subject
         if self.encoding not in (*LABEL_ENCODINGS, "palette", "jpeg rgb8") or subject is _CONFIDENCE_HINTS:
             return False
@@ -70,37 +75,37 @@ class Look:
 
     @property
     def is_color(self) -> bool:
-        """True where an image's pixels are colours."""
+        """True where the image's pixels are colours."""
         return self.encoding in COLOR_ENCODINGS or self.encoding == "jpeg rgb8"
 
     @property
     def is_confidence(self) -> bool:
-        """True for an image that says how sure labels are: its name speaks of both."""
-        says_both = self._subject is _CONFIDENCE_HINTS and self._place_of(_LABEL_HINTS) >= 0
-        return says_both and self.encoding in ("mono8", "8UC1", "mono16", "16UC1", "32FC1")
+        """True for an image of label confidences: the topic's name holds hints of both."""
+        has_both = self._subject is _CONFIDENCE_HINTS and self._end_of(_LABEL_HINTS) >= 0
+        return has_both and self.encoding in ("mono8", "8UC1", "mono16", "16UC1", "32FC1")
 
     @property
     def is_sensor(self) -> bool:
-        """True where a map can be made from it."""
+        """True where a map can be made from the topic."""
         return self.is_depth or self.kind in CLOUDS
 
     @property
     def _subject(self) -> tuple[str, ...] | None:
-        """What the topic's name speaks of last: a namespace before it may speak of anything."""
-        last = max((_DEPTH_HINTS, _LABEL_HINTS, _CONFIDENCE_HINTS), key=self._place_of)
-        return last if self._place_of(last) >= 0 else None
+        """Hints that occur last in the topic's name; a namespace before them may hold other hints."""
+        last = max((_DEPTH_HINTS, _LABEL_HINTS, _CONFIDENCE_HINTS), key=self._end_of)
+        return last if self._end_of(last) >= 0 else None
 
-    def _place_of(self, hints: tuple[str, ...]) -> int:
-        """Where the last of some hints ends in the topic's name; -1 without any."""
+    def _end_of(self, hints: tuple[str, ...]) -> int:
+        """Position in the topic's name at which the last of some hints ends; -1 without any."""
         name = self.topic.lower()
         return max(name.rfind(hint) + len(hint) if hint in name else -1 for hint in hints)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Survey:
-    """One open log's topics, and what its sensor topics look like by name.
+    """Topics of one open log, and samples of its sensor topics by name.
 
-    ``owners`` says which robot a topic belongs to where the log holds several; it is empty where it holds one.
+    ``owners`` maps topics to robots where the log holds several robots; it is empty where it holds one.
     """
 
     log: LogReader
@@ -108,41 +113,63 @@ class Survey:
     end_ns: int | None
     num_messages: int
     topics: tuple[TopicInfo, ...]
-    looks: Mapping[str, Look]
+    samples: Mapping[str, TopicSample]
     owners: Mapping[str, str]
     damage: str | None
 
     @property
     def path(self) -> Path:
-        """Where the log is."""
+        """Path of the log."""
         return self.log.path
 
     @property
     def robots(self) -> tuple[str, ...]:
-        """The robots that share the log, in the order of their sensors' topics; empty where it holds one."""
-        sensors = (topic for topic, look in self.looks.items() if look.is_sensor)
+        """Robots that share the log, in the order of their sensor topics; empty where it holds one."""
+        sensors = (topic for topic, sample in self.samples.items() if sample.is_sensor)
         return tuple(dict.fromkeys(self.owners[topic] for topic in sensors if topic in self.owners))
 
 
+class LogSurveys:
+    """Surveys of logs, each of which is opened and surveyed once; a context manager that closes the logs."""
+
+    def __init__(self) -> None:
+        self._surveys: dict[Path, Survey] = {}
+        self._closing = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.close()
+
+    def of(self, path: Path) -> Survey:
+        """Return the survey of a log, opened at the first call. Raises InputError where it cannot be opened."""
+        if path not in self._surveys:
+            self._surveys[path] = survey_log(self._closing.enter_context(open_log(path)))
+        return self._surveys[path]
+
+
 def survey_log(log: LogReader) -> Survey:
-    """An open log's topics; the first message of each image, cloud and scan topic is looked at."""
-    looks = {}
+    """Return the survey of an open log; the first message of each image, cloud and scan topic is decoded."""
+    samples = {}
     for topic in log.topics:
         if kind_of(topic.type_name) in SENSORS and topic.encoding in ENCODINGS and topic.num_messages:
-            look = _look(log, topic)
-            if look is not None:
-                looks[topic.name] = look
-    owners = _owners_by_name(log.topics, looks) or _owners_by_frame(log, looks)
-    return Survey(log, log.start_ns, log.end_ns, log.message_count, log.topics, looks, owners, log.damage)
+            sample = _sample(log, topic)
+            if sample is not None:
+                samples[topic.name] = sample
+    owners = _owners_by_name(log.topics, samples) or _owners_by_frame(log, samples)
+    return Survey(log, log.start_ns, log.end_ns, log.message_count, log.topics, samples, owners, log.damage)
 
 
 def first_part(topic: str) -> str:
-    """The first part of a topic's name."""
+    """Return the first part of a topic's name."""
     return topic.strip("/").split("/", 1)[0]
 
 
-def _look(log: LogReader, topic: TopicInfo) -> Look | None:
-    """What a topic's first message shows; None where it cannot be decoded."""
+def _sample(log: LogReader, topic: TopicInfo) -> TopicSample | None:
+    """Sample of a topic's first message; None where it cannot be decoded."""
     message = first_whole_message(log, topic.name, SENSORS)
     kind = None if message is None else kind_of(message.type_name)
     if message is None or kind not in SENSORS:
@@ -152,29 +179,27 @@ def _look(log: LogReader, topic: TopicInfo) -> Look | None:
         if isinstance(found, Image | CompressedImage):
             encoding, size = encoding_and_size(found, message.where)
             detail = f"{encoding} {size[0]}x{size[1]}"
-            return Look(topic.name, kind, encoding, size, frame_name(found.frame_id), (), detail)
+            return TopicSample(topic.name, kind, encoding, size, frame_name(found.frame_id), (), detail)
     except InputError:
         return None
     if isinstance(found, Cloud):
         names = [field.name for field in found.fields]
         size, detail = (found.width, found.height), f"{found.width}x{found.height}: {', '.join(names)}"
-        return Look(topic.name, kind, "", size, frame_name(found.frame_id), tuple(names), detail)
+        return TopicSample(topic.name, kind, "", size, frame_name(found.frame_id), tuple(names), detail)
     if isinstance(found, Scan):
         size = (found.ranges.size, 1)
-        return Look(topic.name, kind, "", size, frame_name(found.frame_id), (), f"{size[0]} ranges")
+        return TopicSample(topic.name, kind, "", size, frame_name(found.frame_id), (), f"{size[0]} ranges")
     return None
 
 
-def _owners_by_name(topics: tuple[TopicInfo, ...], looks: Mapping[str, Look]) -> dict[str, str]:
-    """Topics to robots by the first part of their names, where at least two such parts have a sensor and a pose each.
-
-    A sensor whose frame has the same first part counts as one with a pose, which TF then gives.
-    """
+def _owners_by_name(topics: tuple[TopicInfo, ...], samples: Mapping[str, TopicSample]) -> dict[str, str]:
+    """Robot of each topic by the first part of its name, where two or more such parts have a sensor and a pose."""
     found = []
-    for name in dict.fromkeys(first_part(topic) for topic, look in looks.items() if look.is_sensor):
+    for name in dict.fromkeys(first_part(topic) for topic, sample in samples.items() if sample.is_sensor):
         own = [topic for topic in topics if first_part(topic.name) == name and topic.name.count("/") > 1]
         has_pose = any(kind_of(topic.type_name) in POSE_KINDS for topic in own)
-        frames = [look.frame_id for topic, look in looks.items() if first_part(topic) == name]
+        # TF gives the pose of a sensor whose frame has the same first part.
+        frames = [sample.frame_id for topic, sample in samples.items() if first_part(topic) == name]
         if has_pose or any(frame.startswith(f"{name}/") for frame in frames):
             found.append(name)
     if len(found) < 2:
@@ -182,13 +207,13 @@ def _owners_by_name(topics: tuple[TopicInfo, ...], looks: Mapping[str, Look]) ->
     return {topic.name: first_part(topic.name) for topic in topics if first_part(topic.name) in found}
 
 
-def _owners_by_frame(log: LogReader, looks: Mapping[str, Look]) -> dict[str, str]:
-    """Topics to robots by the first part of their frames, where the sensors have at least two such parts."""
-    owners = {topic: first_part(look.frame_id) for topic, look in looks.items() if "/" in look.frame_id}
-    if len({owners[topic] for topic, look in looks.items() if look.is_sensor and topic in owners}) < 2:
+def _owners_by_frame(log: LogReader, samples: Mapping[str, TopicSample]) -> dict[str, str]:
+    """Robot of each topic by the first part of its frame, where the sensors have at least two such parts."""
+    owners = {topic: first_part(sample.frame_id) for topic, sample in samples.items() if "/" in sample.frame_id}
+    if len({owners[topic] for topic, sample in samples.items() if sample.is_sensor and topic in owners}) < 2:
         return {}
     for topic in log.topics:
-        if kind_of(topic.type_name) not in (None, Kind.TF) and topic.name not in looks and topic.num_messages:
+        if kind_of(topic.type_name) not in (None, Kind.TF) and topic.name not in samples and topic.num_messages:
             frame = _frame(log, topic.name)
             if "/" in frame:
                 owners[topic.name] = first_part(frame)
@@ -196,7 +221,7 @@ def _owners_by_frame(log: LogReader, looks: Mapping[str, Look]) -> dict[str, str
 
 
 def _frame(log: LogReader, topic: str) -> str:
-    """The frame of a topic's first message: of a pose the one that it is of, where it says that; '' without any."""
+    """Frame of a topic's first message, for a pose its child frame where it has one; '' without a frame."""
     message = first_whole_message(log, topic, tuple(Kind))
     if message is None:
         return ""

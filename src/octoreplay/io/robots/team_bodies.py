@@ -1,35 +1,34 @@
-"""Where the robots' bodies are, so that what one robot sees of another does not become part of the map."""
+"""Body boxes of the other robots of a team, whose points do not become part of a robot's map."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.containers.log_reader import RawMessage
+from octoreplay.io.robots.body_box import body_box_at
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.records import BodyBox, Float64Array
-from octoreplay.transforms import inverse
+from octoreplay.records import BodyBox, Frame
 
-# Poses are looked for this much further in the log than the time they are wanted for.
+# Poses are read up to this much log time past the stamp that they are needed for.
 _LOOK_AHEAD_NS = 10_000_000_000
 
 
 class BodyTrack:
-    """The box of one robot over time, from its own reading of the poses in its log; a context manager."""
+    """Box of one robot over time, with its own reader of the log's poses; a context manager."""
 
-    def __init__(self, robot: RobotConfig, time: TimeConfig) -> None:
+    def __init__(self, robot: ResolvedRobot, time: TimeConfig) -> None:
+        self._robot = robot
         self._log = RobotLog(robot, time, None)
         self._poses = self._log.pose_source()
         self._messages: Iterator[RawMessage] | None = None
         self._pose_gap_ns = round(time.pose_gap * 1e9)
-        self._offset_ns = round(robot.clock_offset * 1e9)
-        self._corners = np.array(robot.body_box, np.float64).reshape(2, 3)
+        self._offset_ns = robot.clock_offset_ns
 
     def __enter__(self) -> Self:
         return self
@@ -40,7 +39,7 @@ class BodyTrack:
         self._log.close()
 
     def advance(self, start_ns: int, end_ns: int) -> None:
-        """Make the poses from a stamp to another known, as far as the log has them, and drop the ones before."""
+        """Read the poses between two stamps and drop earlier ones."""
         start_ns, end_ns = start_ns - self._offset_ns, end_ns - self._offset_ns
         self._poses.forget_before(start_ns)
         if self._messages is None:
@@ -55,22 +54,22 @@ class BodyTrack:
                 return
 
     def box_at(self, stamp_ns: int) -> BodyBox | None:
-        """The robot's box at a stamp; None where its pose is not known there."""
+        """Return the robot's box at a stamp; None where its pose is not known."""
         stamp_ns -= self._offset_ns
-        T_map_sensor, T_body_sensor = self._poses.at(stamp_ns), self._poses.T_body_sensor_at(stamp_ns)
-        if T_map_sensor is None or T_body_sensor is None:
+        T_map_sensor = self._poses.at(stamp_ns)
+        if T_map_sensor is None:
             return None
-        T_team_sensor: Float64Array = self._log.T_team_map @ T_map_sensor
-        return BodyBox(self._corners[0], self._corners[1], T_body_sensor @ inverse(T_team_sensor), is_own=False)
+        return body_box_at(self._robot, self._poses, stamp_ns, self._log.T_team_map @ T_map_sensor, is_own=False)
 
 
 class TeamBodies:
-    """The boxes of all robots that have one (``body_box``); a context manager.
+    """Boxes of all robots with a ``body_box``; a context manager.
 
+    It opens the logs a second time: poses are needed up to the end of a tick before any robot's frames of it are given.
     ``advance`` is called for a span of time before the boxes in it are asked for, which threads may then do.
     """
 
-    def __init__(self, robots: Sequence[RobotConfig], time: TimeConfig) -> None:
+    def __init__(self, robots: Sequence[ResolvedRobot], time: TimeConfig) -> None:
         with ExitStack() as stack:
             self._tracks = {
                 index: stack.enter_context(BodyTrack(robot, time))
@@ -92,7 +91,7 @@ class TeamBodies:
         for track in self._tracks.values():
             track.advance(start_ns, end_ns)
 
-    def seen_by(self, index: int, stamp_ns: int) -> tuple[BodyBox, ...]:
-        """The boxes at a stamp of all robots but one."""
-        boxes = (track.box_at(stamp_ns) for other, track in self._tracks.items() if other != index)
-        return tuple(box for box in boxes if box is not None)
+    def add_to(self, index: int, frame: Frame) -> Frame:
+        """Return a robot's frame with the boxes of all other robots at its stamp added."""
+        boxes = (track.box_at(frame.stamp_ns) for other, track in self._tracks.items() if other != index)
+        return dataclasses.replace(frame, boxes=(*frame.boxes, *(box for box in boxes if box is not None)))

@@ -1,4 +1,4 @@
-"""Which of a sensor's messages a run takes: a span of time, one of so many, or so many a second."""
+"""Selection of a sensor's messages by time span, by number and by rate."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from octoreplay.config.time import TimeConfig
 
 
 class Thinning:
-    """Decides message by message, in the order of their stamps; stamps and ``team_start_ns`` are of one clock.
+    """Selection of messages, which are passed in stamp order; stamps and ``team_start_ns`` are of the same clock.
 
-    ``every`` counts the messages within the span from its first on. ``rate_limit`` keeps the first message of each
-    period since the span's start, so that the rate holds over any length of time whatever the jitter.
+    ``every`` counts the messages within the span, beginning with its first. ``rate_limit`` keeps the first message of
+    each period since the span's start, so that jitter does not change the mean rate.
     """
 
     def __init__(self, time: TimeConfig, team_start_ns: int) -> None:
@@ -30,8 +30,8 @@ class Thinning:
         return self._start_ns - self._hold_ns if self._has_start else None
 
     def keeps(self, stamp_ns: int) -> bool:
-        """True where the next message, with this stamp, is taken."""
-        # Without a start what comes before the first stamp is taken too.
+        """True where the next message, with this stamp, is used."""
+        # Without a start, messages before the first stamp are used too.
         if (self._has_start and stamp_ns < self._start_ns) or (self._end_ns is not None and stamp_ns >= self._end_ns):
             return False
         if next(self._numbers) % self._every:
@@ -44,5 +44,5 @@ class Thinning:
         return True
 
     def is_over(self, now_ns: int) -> bool:
-        """True once no message of the span can still come, now that a clock of the stamps shows this."""
+        """True once no message of the span can still arrive; ``now_ns`` is the newest stamp."""
         return self._end_ns is not None and now_ns > self._end_ns + self._hold_ns

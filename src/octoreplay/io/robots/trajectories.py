@@ -1,4 +1,4 @@
-"""Poses over time as a whole: trajectory files in evo's formats (TUM, KITTI), and the track that they make.
+"""Trajectories, and trajectory files in evo's formats (TUM, KITTI).
 
 Formats: https://github.com/MichaelGrupp/evo/wiki/Formats
 """
@@ -25,7 +25,7 @@ class Trajectory:
     rotations: Float64Array
 
     def matrix_at(self, stamp_ns: int, pose_gap_ns: int) -> Float64Array | None:
-        """The pose (4, 4) at a stamp, interpolated between two that are at most ``pose_gap_ns`` apart; else None."""
+        """Pose (4, 4) at a stamp, interpolated between two that are at most ``pose_gap_ns`` apart; else None."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if index < self.stamps_ns.size and self.stamps_ns[index] == stamp_ns:
             return pose_matrix(self.positions[index], self.rotations[index])
@@ -44,9 +44,9 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRows:
-    """The rows of a trajectory file: poses as in Trajectory, ``stamps_ns`` None where the format has no times.
+    """Rows of a trajectory file: poses as in Trajectory, ``stamps_ns`` None where the format has no times.
 
-    Rows that are not finite, as lost tracking writes them, or have a quaternion without direction, are NaN.
+    Rows that are not finite (lost tracking) or have a zero quaternion are NaN.
     """
 
     stamps_ns: Int64Array | None
@@ -63,7 +63,7 @@ class TrajectoryRows:
 
 
 def trajectory(stamps_ns: Int64Array, poses: TrajectoryRows) -> Trajectory:
-    """The trajectory of poses and their stamps, sorted, without NaN; of two with one stamp the later row holds."""
+    """Return the trajectory of poses and stamps, sorted, without NaN; of rows with the same stamp the last is kept."""
     last_first = np.flatnonzero(~np.isnan(poses.rotations[:, 0]))[::-1]
     stamps, places = np.unique(stamps_ns[last_first], return_index=True)
     used = last_first[places]
@@ -71,10 +71,10 @@ def trajectory(stamps_ns: Int64Array, poses: TrajectoryRows) -> Trajectory:
 
 
 def read_rows(path: Path) -> TrajectoryRows:
-    """The poses of a trajectory file: TUM (time x y z qx qy qz qw) or KITTI (the 12 numbers of a 3x4 matrix, row-wise).
+    """Return the poses of a trajectory file: TUM (time x y z qx qy qz qw) or KITTI (3x4 matrix by rows, 12 numbers).
 
-    Numbers are separated by blanks or commas; what follows a # is a comment. Raises InputError with the line where the
-    file is empty, a row has another number of columns, or a matrix is no rigid transform.
+    Blanks or commas separate the numbers; # begins a comment. Raises InputError with the line where the file is empty,
+    a row has another number of columns, or a matrix is not a rigid transform.
     """
     table = list(rows(path))
     if not table:
@@ -94,14 +94,14 @@ def read_rows(path: Path) -> TrajectoryRows:
 
 
 def read_times(path: Path) -> Int64Array:
-    """Times [ns] of a text file that holds one in seconds in each line. Raises InputError with the line."""
+    """Return the times [ns] of a text file with one time in seconds per line. Raises InputError with the line."""
     return np.array([seconds_to_ns(where, fields[0]) for where, fields in rows(path)], dtype=np.int64)
 
 
 def rigid(where: str, T: Float64Array) -> Float64Array:
-    """A (4, 4) matrix that is a rigid transform. Raises InputError where it is not."""
+    """Return a (4, 4) matrix unchanged. Raises InputError where it is not a rigid transform."""
     rotation = T[:3, :3]
-    # Files hold few digits, so that rotations are not quite orthogonal.
+    # Files round their numbers, so rotations are not exactly orthogonal.
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=0.02) or np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: its upper left 3x3 part is not a rotation")
     return T

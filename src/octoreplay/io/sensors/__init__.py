@@ -1,1 +1,1 @@
-"""From message objects to arrays: images, point clouds, cameras and labels."""
+"""Decoding of sensor messages into arrays: images, point clouds, cameras and labels."""

@@ -1,4 +1,4 @@
-"""Calibrations to camera models: rectified or distorted, with binning and a region of interest."""
+"""Camera models from calibrations: rectified or distorted, with binning and a region of interest."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from numpy.polynomial import Polynomial
 from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Calibration
 from octoreplay.io.sensors.images import MAX_PIXELS
-from octoreplay.records import CameraModel, Float32Array, Float64Array
+from octoreplay.records import CameraModel, Float32Array, Float64Array, read_only
 
 POLYNOMIAL_MODELS = ("plumb_bob", "rational_polynomial")
 FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
-"""Distortion models by the names that ROS and Foxglove give them; the formulas are OpenCV's."""
+"""Distortion models by their names in ROS and Foxglove; the formulas are OpenCV's."""
 
-# Larger ones are of no lens, and smaller ones than the second change nothing.
+# No lens has coefficients above the first; polynomial coefficients below the second have no effect.
 _MAX_COEFFICIENT, _NEGLIGIBLE = 1e6, 1e-12
-# Pixels whose ray, distorted again, misses them by more than this lie outside the lens model's range.
+# A pixel is outside the lens model's range where its distorted ray misses it by more than this.
 _MAX_ERROR_PIXELS = 0.05
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
 def camera_model(calibration: Calibration, where: str, *, is_rectified: bool) -> CameraModel:
-    """The model of the camera that took an image: pinhole by P where the image is rectified, else by K and D.
+    """Return the camera model of an image: pinhole by P where the image is rectified, else by K and D.
 
-    Binning and the region of interest are applied as ROS's image_geometry does: the region is cut out of the full image
-    first. Rays of a lens that distorts are worked out once (``CameraModel.slopes``); pixels that no ray of the lens
-    model hits have NaN. Raises InputError for a camera without calibration and for an unknown model of distortion.
+    Binning and the region of interest are applied as in ROS's image_geometry: the region is cut out of the full image
+    first. Rays of a distorting lens are computed once (``CameraModel.slopes``), with NaN for pixels that no ray of the
+    lens model hits. Raises InputError for a camera without calibration and for an unknown distortion model.
     """
     matrix = check_camera(calibration, where, is_rectified=is_rectified)
     width, height = image_size(calibration)
@@ -43,9 +43,9 @@ def camera_model(calibration: Calibration, where: str, *, is_rectified: bool) ->
 
 
 def check_camera(calibration: Calibration, where: str, *, is_rectified: bool) -> Float64Array:
-    """The camera matrix (3, 3) of the images [pixels]. Raises as ``camera_model`` does, and works out no rays.
+    """Return the camera matrix (3, 3) of the images [pixels]; raises as ``camera_model`` does.
 
-    So a calibration that lies about the images' size costs nothing until there is such an image.
+    No rays are computed, so that a calibration of a wrong image size takes no memory.
     """
     has_projection = is_rectified and calibration.P[0, 0] > 0 and calibration.P[1, 1] > 0
     matrix = (calibration.P[:, :3] if has_projection else calibration.K).copy()
@@ -61,24 +61,26 @@ def check_camera(calibration: Calibration, where: str, *, is_rectified: bool) ->
 
 
 def image_size(calibration: Calibration) -> tuple[int, int]:
-    """Width and height of the images that a calibration is for, binning and region of interest applied [pixels]."""
+    """Return width and height of a calibration's images, binning and region of interest applied [pixels]."""
     _, _, width, height = calibration.roi
     binning = calibration.binning
     return (width or calibration.width) // binning[0], (height or calibration.height) // binning[1]
 
 
 def _distorts(calibration: Calibration, is_rectified: bool) -> bool:
-    """True where the lens bends the rays of the images."""
+    """True where the images have lens distortion."""
     return not is_rectified and bool(np.any(calibration.D != 0))
 
 
 def _check_lens(calibration: Calibration, where: str) -> None:
-    """Raise InputError for a lens whose rays cannot be worked out."""
+    """Raise InputError for a lens whose rays cannot be computed."""
     D, (width, height) = calibration.D, image_size(calibration)
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(f"{where}: the camera's image cannot be {width}x{height} pixels; give intrinsics")
     if not (np.abs(D) <= _MAX_COEFFICIENT).all():
-        raise InputError(f"{where}: no lens distorts by {D.tolist()}; give intrinsics: [fx, fy, cx, cy]")
+        raise InputError(
+            f"{where}: the distortion coefficients {D.tolist()} are out of range; give intrinsics: [fx, fy, cx, cy]"
+        )
     if not (calibration.model in POLYNOMIAL_MODELS and D.size in (4, 5, 8, 12, 14)) and not (
         calibration.model in FISHEYE_MODELS and D.size == 4
     ):
@@ -93,7 +95,7 @@ def _check_lens(calibration: Calibration, where: str) -> None:
 def _rays(
     model: str, coefficients: tuple[float, ...], numbers: tuple[float, ...], width: int, height: int
 ) -> Float32Array:
-    """X / z and y / z of every pixel, (2, height, width), of a lens with a camera matrix; NaN where it has no ray."""
+    """Slopes x / z and y / z of every pixel, (2, height, width); NaN where the lens model has no ray."""
     D, matrix = np.array(coefficients), np.array(numbers).reshape(3, 3)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
@@ -101,29 +103,28 @@ def _rays(
         rays = cv2.fisheye.undistortPoints(pixels, matrix, D, criteria=_CRITERIA)
         again = cv2.fisheye.distortPoints(rays, matrix, D)
         k1, k2, k3, k4 = coefficients
-        angle = _grows_up_to(Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4]), Polynomial([1]))
+        angle = _monotonic_limit(Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4]), Polynomial([1]))
         widest = math.tan(angle) if angle < math.pi / 2 else math.inf
     else:
         rays = cv2.undistortPoints(pixels, matrix, D, criteria=_CRITERIA)
         ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)
         again, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, D)
         k1, k2, k3, k4, k5, k6 = np.pad(D, (0, 8))[[0, 1, 4, 5, 6, 7]]
-        widest = _grows_up_to(Polynomial([0, 1, 0, k1, 0, k2, 0, k3]), Polynomial([1, 0, k4, 0, k5, 0, k6]))
+        widest = _monotonic_limit(Polynomial([0, 1, 0, k1, 0, k2, 0, k3]), Polynomial([1, 0, k4, 0, k5, 0, k6]))
     error = np.abs(np.reshape(again, (-1, 2)) - pixels[:, 0]).max(axis=1)
     flat = np.reshape(rays, (-1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
         is_real = (error <= _MAX_ERROR_PIXELS) & (np.hypot(flat[:, 0], flat[:, 1]) <= widest)
         slopes = np.where(is_real[:, None], flat, np.nan).astype(np.float32)
     slopes = np.ascontiguousarray(slopes.T.reshape(2, height, width))
-    # Shared by all who ask for the same lens.
-    slopes.flags.writeable = False
-    return slopes
+    # The cached array is shared by all cameras with the same lens.
+    return read_only(slopes)
 
 
-def _grows_up_to(numerator: Polynomial, denominator: Polynomial) -> float:
-    """Where a lens model's distance from the image's centre first stops to grow: beyond it the image would be folded.
+def _monotonic_limit(numerator: Polynomial, denominator: Polynomial) -> float:
+    """Largest ray parameter up to which a lens model's image radius increases.
 
-    Several rays fall on one pixel of a folded image, and only the one within is real.
+    Beyond it several rays fall on one pixel, and only the one within the limit is real.
     """
     slope = numerator.deriv() * denominator - numerator * denominator.deriv()
     roots = np.concatenate([poly.trim(_NEGLIGIBLE).roots() for poly in (slope, denominator)])

@@ -1,4 +1,4 @@
-"""Image messages, raw or encoded, to arrays of depth, labels and confidences."""
+"""Decoding of image messages, raw or compressed, into arrays of depth, labels and confidences."""
 
 from __future__ import annotations
 
@@ -25,61 +25,61 @@ DEPTH_ENCODINGS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
 """Depth encodings and metres per unit (REP 118)."""
 
 COLOR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8")
-"""Encodings of label images whose colours mean labels."""
+"""Encodings of label images with colours in place of ids."""
 
 LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1", "16SC1", "32SC1", *COLOR_ENCODINGS)
-"""Encodings of label images: ids, or colours."""
+"""Encodings of label images: ids or colours."""
 
 MAX_PIXELS = 1 << 26
-"""Images of more pixels are refused before they are decoded, and clouds of more points."""
+"""Largest number of pixels of an image and of points of a cloud; larger ones are refused before decoding."""
 
-# What a byte of a PNG or JPEG can hold at most: deflate makes 1032 bytes of one, each of eight pixels of a bit; a JPEG
-# has a bit at least for every block of 64 pixels.
+# Upper bound for PNG and JPEG: deflate expands a byte to at most 1032 bytes of eight 1-bit pixels each, and JPEG needs
+# at least one bit for every block of 64 pixels.
 _MAX_PIXELS_PER_BYTE = 8 * 1032
 
 _ELEMENTS = {
     "mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "16SC1": "i2", "32SC1": "i4", "32FC1": "f4",
     "rgb8": "3u1", "bgr8": "3u1", "rgba8": "4u1", "bgra8": "4u1", "8UC3": "3u1", "8UC4": "4u1",
 }  # fmt: skip
-# Pillow's modes of pixels.
+# Encodings of Pillow's pixel modes.
 _MODES = {"P": "palette", "L": "8UC1", "1": "8UC1", "F": "32FC1"}
-# What Pillow's readers raise for bytes that are damaged.
+# Exceptions that Pillow's readers raise for damaged bytes.
 _UNREADABLE = (
     OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, ArithmeticError, LookupError, TypeError,
     AttributeError, RuntimeError, MemoryError,
 )  # fmt: skip
-# Their classes read a head without PIL.Image.open's own limit of size, which warns before it refuses.
+# These classes read headers without the size limit of PIL.Image.open, which warns before it raises.
 _FILES = (
     (b"\x89PNG\r\n\x1a\n", PngImageFile), (b"\xff\xd8\xff", JpegImageFile), (b"RIFF", WebPImageFile),
 )  # fmt: skip
-# compressed_depth_image_transport: its format's number and two parameters of the quantisation, before a PNG.
+# compressed_depth_image_transport: format number and two quantisation parameters, followed by a PNG.
 _DEPTH_HEADER = struct.Struct("<iff")
 
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """Raw labels (H, W) of an integer type, or colours (H, W, 3) uint8 red, green, blue; lossy ones are not exact."""
+    """Raw labels (H, W) of an integer type, or colours (H, W, 3) uint8 RGB; ``is_lossy`` where they are not exact."""
 
     pixels: npt.NDArray[Any]
     is_lossy: bool = False
 
     @property
     def is_color(self) -> bool:
-        """True where the labels are colours."""
+        """True where the pixels are colours."""
         return self.pixels.ndim == 3
 
 
 def encoding_and_size(image: Image | CompressedImage, where: str) -> tuple[str, tuple[int, int]]:
-    """An image's encoding and size (width, height), of an encoded image from its head alone.
+    """Return an image's encoding and size (width, height); of a compressed image only the header is read.
 
-    PNGs have the encodings of raw images (``16UC1``, ``8UC1``, ``rgb8``), others their format in front of it
-    (``jpeg rgb8``). Raises DamagedMessageError where there is no such head.
+    PNGs have the encodings of raw images (``16UC1``, ``8UC1``, ``rgb8``), other formats precede it (``jpeg rgb8``).
+    Raises DamagedMessageError where the header cannot be read.
     """
     if isinstance(image, Image):
         return image.encoding, (image.width, image.height)
     data = bytes(image.data)
     is_depth = "compresseddepth" in image.format.lower()
-    head, size = _head(image, data[_DEPTH_HEADER.size :] if is_depth else data, where)
+    head, size = _read_header(image, data[_DEPTH_HEADER.size :] if is_depth else data, where)
     if is_depth:
         return image.format.split(";")[0], size
     return head.removeprefix("png "), size
@@ -88,12 +88,11 @@ def encoding_and_size(image: Image | CompressedImage, where: str) -> tuple[str, 
 def decode_depth(
     image: Image | CompressedImage, where: str, depth_unit: float | None = None
 ) -> tuple[npt.NDArray[Any], float]:
-    """The depth image (H, W), uint8, uint16 or float32, and its unit: metres along z = value x unit.
+    """Return the depth image (H, W), uint8, uint16 or float32, and its unit: metres along z = value x unit.
 
-    ``depth_unit`` takes the place of the encoding's unit (REP 118), and lets 8 bits and lossy images hold depth.
-    ``where`` begins the errors. The array is C-contiguous, aligned and in native byte order; it is a view of the
-    message where its bytes allow that.
-    Raises InputError for an image that holds no depth, DamagedMessageError where its bytes are not what it announces.
+    ``depth_unit`` replaces the encoding's unit (REP 118); with it 8-bit and lossy images are accepted too. ``where``
+    begins the errors. The array is C-contiguous, aligned and in native byte order; it is a view of the message where
+    possible. Raises InputError for an image without depth, DamagedMessageError where its bytes do not fit its size.
     """
     if isinstance(image, CompressedImage):
         pixels, is_lossy = _decode_depth_file(image, where)
@@ -107,15 +106,16 @@ def decode_depth(
     if not holds_depth or (unit is None and depth_unit is None):
         raise InputError(
             f"{where}: {found} holds no depth; {', '.join(DEPTH_ENCODINGS)}, PNG and compressedDepth can be read, "
-            f"and one channel of 8 bits where depth_unit is given"
+            f"and one channel of 8 bits with depth_unit"
         )
     return pixels, float(depth_unit if depth_unit is not None else unit or 0.0)
 
 
 def decode_labels(image: Image | CompressedImage, where: str) -> LabelImage:
-    """The raw labels of a label image, or the colours that mean labels.
+    """Return the raw labels or colours of a label image.
 
-    As ``decode_depth`` otherwise. Raises InputError for another encoding, DamagedMessageError for damaged bytes.
+    The array is as that of ``decode_depth``. Raises InputError for another encoding, DamagedMessageError for damaged
+    bytes.
     """
     if isinstance(image, CompressedImage):
         pixels, is_lossy = _decode_file(image, bytes(image.data), where)
@@ -123,7 +123,7 @@ def decode_labels(image: Image | CompressedImage, where: str) -> LabelImage:
     else:
         encoding, is_lossy = image.encoding, False
         pixels = _pixels(image, where) if encoding in (*LABEL_ENCODINGS, "8UC3", "8UC4") else np.empty(0)
-        # Channels without a name are in OpenCV's order, as Foxglove says and cv_bridge writes them.
+        # 8UC3 and 8UC4 have OpenCV's channel order, as in Foxglove's schema and cv_bridge.
         if encoding in ("bgr8", "bgra8", "8UC3", "8UC4"):
             pixels = pixels[..., [2, 1, 0]]
     if pixels.ndim < 2 or pixels.dtype.kind == "f" or (pixels.ndim == 3 and pixels.dtype != np.uint8):
@@ -132,14 +132,14 @@ def decode_labels(image: Image | CompressedImage, where: str) -> LabelImage:
             f"read"
         )
     if is_lossy and pixels.ndim == 2:
-        raise InputError(f"{where}: a lossy image of ids holds no labels, as it changes them; record PNG, or colours")
+        raise InputError(f"{where}: lossy compression changes label ids; record PNG, or colours")
     return LabelImage(pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., :3]), is_lossy)
 
 
 def decode_confidences(image: Image | CompressedImage, where: str) -> UInt8Array:
-    """How sure each label is, (H, W) uint8 in 255ths, from 8 or 16 bits (their largest value: sure) or float (1: sure).
+    """Return the label confidences (H, W) uint8 in 255ths of an image of 8 or 16 bits, or of floats from 0 to 1.
 
-    Raises InputError for other images, DamagedMessageError for damaged bytes.
+    The largest integer is a confidence of 1. Raises InputError for other images, DamagedMessageError for damaged bytes.
     """
     if isinstance(image, CompressedImage):
         pixels, _ = _decode_file(image, bytes(image.data), where)
@@ -151,7 +151,7 @@ def decode_confidences(image: Image | CompressedImage, where: str) -> UInt8Array
 
 
 def confidences(values: npt.NDArray[Any]) -> UInt8Array:
-    """Confidences in 255ths, uint8, of integers (their type's largest value: sure) or floats (1: sure, NaN: not)."""
+    """Return confidences in 255ths, uint8, of integers (the type's largest value is 1) or floats (NaN is 0)."""
     if values.dtype == np.uint8:
         return values
     scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
@@ -161,7 +161,7 @@ def confidences(values: npt.NDArray[Any]) -> UInt8Array:
 
 
 def _pixels(image: Image, where: str) -> npt.NDArray[Any]:
-    """Pixels (H, W) or (H, W, channels), without the rows' padding, native and aligned."""
+    """Pixels (H, W) or (H, W, channels) without row padding, in native byte order, aligned."""
     dtype = np.dtype((">" if image.is_big_endian else "<") + _ELEMENTS[image.encoding].lstrip("34"))
     channels = int(_ELEMENTS[image.encoding][0]) if _ELEMENTS[image.encoding][0].isdigit() else 1
     height, width, step = image.height, image.width, image.step
@@ -170,10 +170,10 @@ def _pixels(image: Image, where: str) -> npt.NDArray[Any]:
         raise DamagedMessageError(
             f"{where}: an image of {width}x{height} {image.encoding} cannot have rows of {step} bytes"
         )
-    # The last row may come without its padding.
+    # The last row may have no padding.
     if len(image.data) < step * (height - 1) + row_bytes:
         raise DamagedMessageError(
-            f"{where}: the image holds {len(image.data)} bytes, but {height} rows of {step} bytes are announced"
+            f"{where}: the image holds {len(image.data)} bytes, but {height} rows of {step} bytes are expected"
         )
     if width * height > MAX_PIXELS:
         raise InputError(f"{where}: an image of {width}x{height} pixels is too large")
@@ -184,9 +184,10 @@ def _pixels(image: Image, where: str) -> npt.NDArray[Any]:
 
 
 def _decode_depth_file(image: CompressedImage, where: str) -> tuple[npt.NDArray[Any], bool]:
-    """The depth of an encoded image, with the header of compressedDepth where its format says so, and whether lossy.
+    """The depth of a compressed image, and whether it is lossy.
 
-    Quantised inverse depth becomes metres: depth = A / (value - B), 0 means none (compressed_depth_image_transport).
+    compressedDepth begins with a header; its quantised inverse depth is depth = A / (value - B) in metres, 0 where
+    nothing was measured (compressed_depth_image_transport).
     """
     if "compresseddepth" not in image.format.lower():
         return _decode_file(image, bytes(image.data), where)
@@ -206,14 +207,14 @@ def _decode_depth_file(image: CompressedImage, where: str) -> tuple[npt.NDArray[
 
 
 def _decode_file(image: CompressedImage, data: bytes, where: str) -> tuple[npt.NDArray[Any], bool]:
-    """The pixels of a PNG, JPEG or the like, colours in the order red, green, blue; and whether they are lossy.
+    """The pixels of a PNG, JPEG or WebP file, colours as RGB, and whether they are lossy.
 
-    A PNG with a palette gives its indices, which is how label images use it.
+    A PNG with a palette gives the indices, which are the ids of a label image.
     """
-    head, (width, height) = _head(image, data, where)
+    head, (width, height) = _read_header(image, data, where)
     if width * height > MAX_PIXELS:
         raise InputError(f"{where}: an image of {width}x{height} pixels is too large to decode")
-    # Room for the pixels is made before they are found to be missing.
+    # The decoder allocates all pixels before it finds the file cut.
     if width * height > _MAX_PIXELS_PER_BYTE * len(data) and head.startswith(("png", "jpeg")):
         raise _undecodable(image, where)
     try:
@@ -227,8 +228,8 @@ def _decode_file(image: CompressedImage, data: bytes, where: str) -> tuple[npt.N
     return (pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0]]), head.startswith("jpeg")
 
 
-def _head(image: CompressedImage, data: bytes, where: str) -> tuple[str, tuple[int, int]]:
-    """Format and pixels of an encoded image, such as 'png 16UC1' or 'jpeg rgb8', and its size (width, height)."""
+def _read_header(image: CompressedImage, data: bytes, where: str) -> tuple[str, tuple[int, int]]:
+    """Format and encoding of a compressed image, such as 'png 16UC1' or 'jpeg rgb8', and its size (width, height)."""
     reader = next((reader for magic, reader in _FILES if data.startswith(magic)), None)
     if reader is None:
         raise _undecodable(image, where)
@@ -241,4 +242,5 @@ def _head(image: CompressedImage, data: bytes, where: str) -> tuple[str, tuple[i
 
 
 def _undecodable(image: CompressedImage, where: str) -> DamagedMessageError:
+    """The error for an image that cannot be decoded."""
     return DamagedMessageError(f"{where}: the {image.format or 'compressed'} image cannot be decoded")

@@ -1,4 +1,4 @@
-"""Raw labels and colours to class ids, and class tables from the LabelInfo messages of a team."""
+"""Class ids of raw labels and colours, and class tables from a team's LabelInfo messages."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from octoreplay.io.sensors.images import LabelImage
 from octoreplay.records import NO_CLASS, ClassTable, Color, Int64Array, SemanticClass, UInt8Array
 
 UNLABELLED = (255, 65535)
-"""Raw labels that are ignored unless the class table names them (8 and 16 bit)."""
+"""Raw labels that are ignored unless the class table has them (8 and 16 bit)."""
 
 OCCUPIED = ClassTable((SemanticClass(1, "occupied", PALETTE[0], ()),))
-"""The class table of a team without labels: plain occupancy."""
+"""Class table of a team without labels: plain occupancy."""
 
 LOSSY_DISTANCE = 40
-"""A colour that compression changed is taken for the nearest of the table up to here (Euclidean, of 255).
+"""Largest Euclidean distance, in steps of 255, of a compressed colour to its colour in the table.
 
-JPEG moves a flat colour by a few steps, and next to an edge by tens; what is further away is a mixture.
+JPEG changes a flat colour by a few steps, and next to an edge by tens; a larger distance is a mixture of colours.
 """
 
-# Not a class id, since there are at most 254 classes: marks raw labels that the table does not know.
+# Marks raw labels that are not in the table; no class id, since there are at most 254 classes.
 _UNKNOWN = 255
 _LUT_SIZE = 1 << 16
 _BLACK = (0, 0, 0)
-# So many unknown colours are counted one by one; a photograph in place of labels would have millions.
+# Largest number of unknown colours that are counted exactly; a photograph in place of labels would have millions.
 _MAX_COUNTED_COLORS = 4096
 
 
 class LabelLookup:
-    """Raw labels and colours to class ids by a class table; counts those that the table does not know."""
+    """Map from raw labels and colours to class ids by a class table; counts those that are not in the table."""
 
     def __init__(self, table: ClassTable, *, strict: bool = False) -> None:
         self._table = table
         self._strict = strict
-        self._meaning = dict.fromkeys((*UNLABELLED, *table.ignored_raw_labels), NO_CLASS)
-        # A raw -1 is how a signed image writes 65535.
-        self._meaning[-1] = NO_CLASS
+        self._class_of = dict.fromkeys((*UNLABELLED, *table.ignored_raw_labels), NO_CLASS)
+        # Signed images store 65535 as -1.
+        self._class_of[-1] = NO_CLASS
         for semantic_class in table.classes:
-            self._meaning.update(dict.fromkeys(semantic_class.raw_labels, semantic_class.class_id))
+            self._class_of.update(dict.fromkeys(semantic_class.raw_labels, semantic_class.class_id))
         self._lut = np.full(_LUT_SIZE, _UNKNOWN, dtype=np.uint8)
-        for raw, class_id in self._meaning.items():
+        for raw, class_id in self._class_of.items():
             if 0 <= raw < _LUT_SIZE:
                 self._lut[raw] = class_id
         self._bytes = self._lut[:256].tobytes()
@@ -56,28 +56,28 @@ class LabelLookup:
 
     @property
     def num_classes(self) -> int:
-        """C, the number of classes that labels can mean."""
+        """Number of classes C."""
         return self._table.num_classes
 
     def of_image(self, image: LabelImage, where: str) -> UInt8Array:
-        """The class ids (H, W) of a label image; see ``class_ids`` and ``class_ids_of_colors``."""
+        """Return the class ids (H, W) of a label image; see ``class_ids`` and ``class_ids_of_colors``."""
         if image.is_color:
             return self.class_ids_of_colors(image.pixels, where, is_lossy=image.is_lossy)
         return self.class_ids(image.pixels, where)
 
     def of_points(self, raw: Int64Array | UInt8Array, where: str) -> UInt8Array:
-        """The class ids (P,) of points' raw labels (P,), or of the colours (P, 3) that mean them."""
+        """Return the class ids (P,) of points' raw labels (P,) or colours (P, 3)."""
         return self.class_ids_of_colors(raw, where, is_lossy=False) if raw.ndim == 2 else self.class_ids(raw, where)
 
     def class_ids(self, raw: npt.NDArray[Any], where: str) -> UInt8Array:
-        """The class ids of raw labels, an array of the same shape: 1..C, or NO_CLASS where ignored or unknown.
+        """Return the class ids of raw labels, uint8 of the same shape: 1..C, or NO_CLASS where ignored or unknown.
 
-        ``raw`` holds integers of any type. Unknown ones are counted in ``unknown`` (raw label to number).
-        Raises InputError for an unknown label where the lookup is strict; ``where`` begins it.
+        ``raw`` holds integers of any type. Unknown labels are counted in ``unknown`` (raw label to number). Raises
+        InputError for an unknown label where the lookup is strict; ``where`` begins the message.
         """
         class_ids: UInt8Array
         if raw.dtype == np.uint8:
-            # bytearray.translate is several times faster than numpy's indexing, and its result can be written to.
+            # bytearray.translate is several times faster than numpy's indexing, and its result is writable.
             mapped = np.frombuffer(bytearray(np.ascontiguousarray(raw)).translate(self._bytes), dtype=np.uint8)
             class_ids = mapped.reshape(raw.shape)
         elif raw.dtype == np.uint16:
@@ -89,17 +89,17 @@ class LabelLookup:
         return class_ids
 
     def class_ids_of_colors(self, rgb: npt.NDArray[Any], where: str, *, is_lossy: bool) -> UInt8Array:
-        """The class ids of colours (..., 3) uint8, an array of the leading shape: 1..C, or NO_CLASS.
+        """Return the class ids of colours (..., 3) uint8, uint8 of the leading shape: 1..C, or NO_CLASS.
 
-        Where ``is_lossy`` (JPEG), a colour is the table's colour that it is nearer to than half the way to that one's
-        nearest neighbour, and not further from than ``LOSSY_DISTANCE``. Colours that the table does not know are
-        counted in ``unknown_colors`` (0xRRGGBB to number; where they are many or lossy, rounded down to multiples of
-        16). Raises ConfigError where the table's colours do not tell its classes apart, InputError for an unknown
-        colour where the lookup is strict and the image not lossy; ``where`` begins it.
+        With ``is_lossy`` (JPEG) a colour matches a colour of the table within ``LOSSY_DISTANCE`` and within half of
+        that colour's distance to its nearest neighbour in the table. Unknown colours are counted in ``unknown_colors``
+        (0xRRGGBB to number; many or lossy ones rounded down to multiples of 16). Raises ConfigError where two classes
+        share a colour or no class has one, InputError for an unknown colour where the lookup is strict and the image is
+        not lossy; ``where`` begins the message.
         """
         if is_lossy not in self._color_luts:
-            self._color_luts[is_lossy] = _color_lut(_meaning_of_colors(self._table), is_lossy=is_lossy)
-        # Four bytes are one number: r + 256 g + 65536 b.
+            self._color_luts[is_lossy] = _color_lut(_class_ids_by_color(self._table), is_lossy=is_lossy)
+        # A pixel padded to four bytes is read as one number: r + 256 g + 65536 b.
         padded = np.zeros((*rgb.shape[:-1], 4), dtype=np.uint8)
         padded[..., :3] = rgb
         class_ids: UInt8Array = self._color_luts[is_lossy].take(padded.view("<u4")[..., 0])
@@ -126,7 +126,7 @@ class LabelLookup:
         class_ids[is_unknown] = NO_CLASS
 
     def _of_any_integer(self, raw: npt.NDArray[Any]) -> UInt8Array:
-        """Class ids of signed or wide integers, which may lie outside the table."""
+        """Class ids of signed or wide integers, which may be outside the lookup array."""
         if raw.size and raw.min() >= 0 and raw.max() < _LUT_SIZE:
             return self._lut.take(raw)
         values, inverse = np.unique(raw, return_inverse=True)
@@ -134,8 +134,8 @@ class LabelLookup:
         return of_value.take(inverse).reshape(raw.shape)
 
     def _of_integer(self, value: int) -> int:
-        """The class id of one number; above 16 bits, which no table uses, are instances (SemanticKITTI)."""
-        return self._meaning.get(value, self._meaning.get(value & 0xFFFF, _UNKNOWN) if value > 0xFFFF else _UNKNOWN)
+        """Class id of one number; bits above the lowest 16 are instance ids (SemanticKITTI)."""
+        return self._class_of.get(value, self._class_of.get(value & 0xFFFF, _UNKNOWN) if value > 0xFFFF else _UNKNOWN)
 
     def _count_unknown(self, raw: npt.NDArray[Any], class_ids: UInt8Array, where: str) -> None:
         """Count the unknown raw labels and give them no class."""
@@ -151,27 +151,27 @@ class LabelLookup:
         class_ids[is_unknown] = NO_CLASS
 
 
-def _meaning_of_colors(table: ClassTable) -> dict[Color, int]:
-    """The class id of every colour that a table knows. Raises ConfigError where a colour has two meanings, or none."""
+def _class_ids_by_color(table: ClassTable) -> dict[Color, int]:
+    """Class id of every colour of a table. Raises ConfigError where classes share a colour or none has one."""
     owners: dict[Color, str] = {}
-    meaning: dict[Color, int] = {}
+    class_of: dict[Color, int] = {}
     for item in table.classes:
         for color in item.raw_colors:
             if color in owners:
                 raise ConfigError(
-                    f"the labels are colours, but {_hex(color)} means both '{owners[color]}' and '{item.name}'; join "
+                    f"the labels are colours, but {_hex(color)} is both '{owners[color]}' and '{item.name}'; join "
                     f"them with merge_classes, or give their raw_colors"
                 )
-            owners[color], meaning[color] = item.name, item.class_id
+            owners[color], class_of[color] = item.name, item.class_id
     for color in table.ignored_raw_colors:
         if color in owners:
             raise ConfigError(
-                f"the labels are colours, but {_hex(color)} means '{owners[color]}' and is ignored; ignore that class "
-                f"too, or take the colour out of its raw_colors"
+                f"the labels are colours, but {_hex(color)} is both '{owners[color]}' and ignored; ignore that class "
+                f"too, or remove the colour from its raw_colors"
             )
-    if not meaning:
-        raise ConfigError("the labels are colours, but no class has one; give every class its 'raw_colors'")
-    return {_BLACK: NO_CLASS, **dict.fromkeys(table.ignored_raw_colors, NO_CLASS), **meaning}
+    if not class_of:
+        raise ConfigError("the labels are colours, but no class has a colour; give every class its 'raw_colors'")
+    return {_BLACK: NO_CLASS, **dict.fromkeys(table.ignored_raw_colors, NO_CLASS), **class_of}
 
 
 def _hex(color: Color) -> str:
@@ -179,11 +179,11 @@ def _hex(color: Color) -> str:
     return "#" + bytes(color).hex()
 
 
-def _color_lut(meaning: Mapping[Color, int], *, is_lossy: bool) -> UInt8Array:
-    """The class id of every colour there is, at r + 256 g + 65536 b: (2^24,) uint8."""
-    colors = np.array(list(meaning), dtype=np.int64)
+def _color_lut(class_of: Mapping[Color, int], *, is_lossy: bool) -> UInt8Array:
+    """Class id of every possible colour, at index r + 256 g + 65536 b: (2^24,) uint8."""
+    colors = np.array(list(class_of), dtype=np.int64)
     cube = np.full((256, 256, 256), _UNKNOWN, dtype=np.uint8)
-    for color, class_id in zip(colors, meaning.values(), strict=True):
+    for color, class_id in zip(colors, class_of.values(), strict=True):
         if is_lossy:
             _fill_ball(cube, color, _least_square(color, colors), class_id)
         b, g, r = color[::-1]
@@ -192,14 +192,14 @@ def _color_lut(meaning: Mapping[Color, int], *, is_lossy: bool) -> UInt8Array:
 
 
 def _least_square(color: Int64Array, colors: Int64Array) -> float:
-    """The squared distance of a colour to the nearest other one; infinite where there is none."""
+    """Squared distance of a colour to the nearest other one; infinite without another."""
     steps = (colors - color).astype(np.float64)
     squares = np.einsum("ij,ij->i", steps, steps)
     return float(np.min(squares[squares > 0], initial=np.inf))
 
 
 def _fill_ball(cube: UInt8Array, color: Int64Array, least_square: float, class_id: int) -> None:
-    """Set the colours that are nearer to one than half of the way to its neighbour, so that no two balls touch."""
+    """Set the class id of colours within half of the distance to the nearest other colour; balls do not touch."""
     low, high = np.maximum(color - LOSSY_DISTANCE, 0), np.minimum(color + LOSSY_DISTANCE, 255) + 1
     r, g, b = (np.arange(low[i], high[i]) - color[i] for i in range(3))
     squares = b[:, None, None] ** 2 + g[:, None] ** 2 + r**2
@@ -208,13 +208,13 @@ def _fill_ball(cube: UInt8Array, color: Int64Array, least_square: float, class_i
 
 
 def class_table_from_names(names_of_robots: Mapping[str, Mapping[int, str]]) -> ClassTable:
-    """The class table of a team from each robot's raw label names: classes are united by name.
+    """Return the class table of a team from each robot's raw label names; classes are united by name.
 
-    Classes are numbered in the order in which the robots, and in each the raw labels, name them first. Names such as
-    'unlabeled', and the raw labels 255 and 65535, are ignored. Their colours are made up, so no colour in an image
-    means them. Raises ConfigError where robots give one raw label two names, or where nothing is named.
+    Classes are numbered in order of their first occurrence, by robot and then by raw label. Names such as 'unlabeled'
+    and the raw labels 255 and 65535 are ignored. Colours are taken from a palette and match no colours in images.
+    Raises ConfigError where robots give one raw label different names, or where no class is named.
     """
-    meaning: dict[int, tuple[str, str]] = {}
+    named: dict[int, tuple[str, str]] = {}
     raw_labels: dict[str, list[int]] = {}
     ignored: set[int] = set()
     for robot_id, names in names_of_robots.items():
@@ -222,7 +222,7 @@ def class_table_from_names(names_of_robots: Mapping[str, Mapping[int, str]]) -> 
             if raw in UNLABELLED or name.strip().lower() in UNLABELLED_NAMES:
                 ignored.add(raw)
                 continue
-            first_robot, first_name = meaning.setdefault(raw, (robot_id, name))
+            first_robot, first_name = named.setdefault(raw, (robot_id, name))
             if first_name != name:
                 raise ConfigError(
                     f"raw label {raw} is '{first_name}' for robot '{first_robot}' and '{name}' for robot '{robot_id}'; "
@@ -230,10 +230,10 @@ def class_table_from_names(names_of_robots: Mapping[str, Mapping[int, str]]) -> 
                 )
             if raw not in raw_labels.setdefault(name, []):
                 raw_labels[name].append(raw)
-    clash = sorted(ignored & meaning.keys())
+    clash = sorted(ignored & named.keys())
     if clash:
         raise ConfigError(
-            f"raw label {clash[0]} is '{meaning[clash[0]][1]}' for robot '{meaning[clash[0]][0]}' and unlabelled for "
+            f"raw label {clash[0]} is '{named[clash[0]][1]}' for robot '{named[clash[0]][0]}' and unlabelled for "
             f"another; give one class table under 'classes' in the team file"
         )
     if not raw_labels:

@@ -1,1 +1,1 @@
-"""The compiled loops of the map, one file for each thing they do."""
+"""Compiled loops of the mapping package, one file for each task."""

@@ -1,7 +1,8 @@
-"""Which cells the rays of a scan pass.
+"""Ray casting: the cells that the rays of a scan pass and hit.
 
-The scratch grid of a scan is made of blocks of 8 x 8 x 8 cells, x fastest; a block holds eight bricks and its cells in
-Morton order. A *mark* says what the scan did to a cell: 0 nothing, 1 passed, 1 + class_id hit.
+The scratch grid of a scan consists of blocks of 8 x 8 x 8 cells in x-fastest order; a block holds eight bricks, and its
+cells are in Morton order. A *mark* is one byte for each cell: 0 untouched, 1 passed, 1 + class_id hit. A *flag* is one
+byte for each block: 1 where the block holds a mark. A cell's *place* is its position in the scratch grid.
 """
 
 from __future__ import annotations
@@ -17,21 +18,23 @@ BLOCK_CELLS = 1 << (3 * BLOCK_BITS)
 BRICKS_PER_BLOCK = BLOCK_CELLS // BRICK_CELLS
 
 FRACTION = 2.0**-32
-"""Rays are walked without rounding: positions and slopes are multiples of this part of a cell, and a coordinate of the
-scratch grid with such a fraction fits a float64."""
+"""Resolution of positions and slopes in cells. Rays are traversed without rounding: a coordinate of the scratch grid
+with such a fraction is exact in float64."""
 
 VECTOR = 16
-"""Slabs that are worked out in one go; rows of scratch memory have room for one go more."""
+"""Number of slabs computed together; rows of scratch memory have room for as many more."""
 
 _PIECE = 64
-"""Planes of the main axis that are worked on at once."""
+"""Number of slabs in one pass of the inner loops."""
 
 
 @inline_kernel
 def _offset(coordinate, unit, stride):
-    """What one coordinate adds to a cell's place in the scratch grid, in 32 bits.
+    """Return the uint32 term of one coordinate in a cell's place.
 
-    ``unit`` is 1, 2 and 4 for x, y and z, ``stride`` that of the axis' blocks.
+    - ``coordinate``: cell along the axis.
+    - ``unit``: 1, 2 or 4 for x, y or z.
+    - ``stride``: cells between neighbouring blocks along the axis.
     """
     within = np.uint32(coordinate & 1) | np.uint32((coordinate & 2) << 2) | np.uint32((coordinate & 4) << 4)
     return np.uint32((coordinate >> BLOCK_BITS) * stride) + np.uint32(within * unit)
@@ -41,15 +44,22 @@ def _offset(coordinate, unit, stride):
 def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, marks, flags):
     """Mark with 1 every cell that a ray passes before its end cell, and flag the blocks that rays pass.
 
-    All rays begin at ``start`` (3,), in cells of the scratch grid and a multiple of FRACTION, and go to ``ends``
-    (n, 3) [m], or where that is empty to the centres of the cells ``end_keys`` (n, 3). ``corner`` (3,) is the lowest
-    cell of the scratch grid of ``num_blocks`` (3,). ``tables`` (6, longest edge of the grid + VECTOR) is filled with
-    the places along each axis, upwards and then downwards: a cell's place in the grid is the sum of three of them.
+    Loop invariant: the passed cells of rays before ``i`` are marked and their blocks are flagged.
 
-    A ray is cut by the walls of its main axis, along which it is longest, into slabs of at most three cells each.
-    Positions at the walls follow from whole numbers without a sum along the way, so all slabs are worked out at once
-    and nothing drifts. Where two walls are met at once, z goes before y and y before x, as in OctoMap; walls closer
-    than about n x 2^-32 cells count as met at once in the n-th slab.
+    The walls of a ray's main axis, along which it is longest, cut it into slabs of at most three cells each. The
+    position at wall k is computed from the integer k, not accumulated from wall to wall, so all slabs are computed
+    together and errors do not add up. Where a ray crosses two walls at once, it crosses z before y and y before x, as
+    in OctoMap; walls closer than about n x 2^-32 cells count as crossed at once in slab n.
+
+    - ``start`` (3,) float64: start of all rays, in cells of the scratch grid, a multiple of FRACTION.
+    - ``ends`` (n, 3) float64: end points in the team's frame [m]; size 0 where rays end at the centres of end cells.
+    - ``end_keys`` (n, 3) int32: keys of the end cells.
+    - ``resolution``: edge of a cell [m].
+    - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
+    - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
+    - ``tables`` (6, longest edge of the grid + VECTOR) uint32: output, terms of a cell's place along x, y and z in
+      rising order, then in falling order.
+    - ``marks`` uint8, ``flags`` uint8: of the scratch grid, in place.
     """
     longest, stride = tables.shape[1] - VECTOR, BLOCK_CELLS
     strides = np.empty(3, np.uint32)
@@ -73,7 +83,7 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
             a = 1
         if abs(lengths[2]) > abs(lengths[a]):
             a = 2
-        # Of the other two axes, c is the one whose walls come first where both are met at once.
+        # Of the other two axes, c is the one that is crossed first where both walls are met at once.
         b, c = np.int64(a == 0), 2 - np.int64(a == 2)
         length_a, length_b, length_c = abs(lengths[a]), abs(lengths[b]), abs(lengths[c])
         up_a, up_b, up_c = lengths[a] >= 0.0, lengths[b] >= 0.0, lengths[c] >= 0.0
@@ -82,7 +92,7 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
         last_a = np.int32(end_keys[i, a] - corner[a])
         last_b, last_c = np.int32(end_keys[i, b] - corner[b]), np.int32(end_keys[i, c] - corner[c])
         n = abs(last_a - first_a)
-        # Which of the walls ahead of cells k_b and k_c comes first: they are k x scale + shift away.
+        # The walls ahead of cell k along b and c are at distances proportional to k x scale + shift.
         scale_b, shift_b = step_b * length_c, (up_b - start[b]) * step_b * length_c
         scale_c, shift_c = step_c * length_b, (up_c - start[c]) * step_c * length_b
         near_b, near_c, far_b, far_c = last_b, last_c, first_b, first_c
@@ -99,7 +109,7 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
                 size = min(_PIECE, n - piece)
                 begin = first_a + piece if up_a else longest - 1 - first_a + piece
                 places_a = tables[a if up_a else a + 3, begin:]
-                # Whole vectors: what lies behind the piece is worked out and not used.
+                # The count is rounded up to whole vectors; values behind the piece are not used.
                 whole = (size + VECTOR) // VECTOR * VECTOR
                 for k in range(whole):
                     coord_b = min(max(np.int32(from_b + rise_b * np.float64(piece + k)), low_b), high_b)
@@ -114,7 +124,7 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
                     entered[k] = place_a + place_b + place_c
                     left[k] = place_a + next_b + next_c
                     c_first = coords_c[k] * scale_c + shift_c <= coords_b[k] * scale_b + shift_b
-                    # Where one of the two coordinates stays, this is again the cell entered or the one left.
+                    # Where only one coordinate changes, this is again the cell entered or the cell left.
                     b_between = place_b if c_first else next_b
                     c_between = next_c if c_first else place_c
                     between[k] = place_a + b_between + c_between
@@ -133,30 +143,41 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
 
 @inline_kernel
 def _fraction(coord, cell, resolution):
-    """Where in its cell a coordinate [m] lies, in [0, 1), rounded to a multiple of FRACTION."""
+    """Position of ``coord`` [m] in ``cell`` (edge ``resolution`` [m]), in [0, 1), rounded to a multiple of FRACTION."""
     return min(max(np.rint((coord / resolution - cell) / FRACTION) * FRACTION, 0.0), 1.0 - FRACTION)
 
 
 @inline_kernel
 def _line(start, step, slope, distance, margin):
-    """Position along an axis at the k-th wall of the main one: first + k x second is in the cell behind the wall.
+    """Return a ray's position along an axis as (a, b): a + k b is in the cell behind wall k of the main axis.
 
-    ``start`` is the origin's position, ``slope`` at most 1, and ``distance`` the origin's from wall k = 0 behind it.
-    Rounding must not decide the order of walls that are met at once: an axis that goes first is put ahead by what the
-    roundings can amount to, ``margin`` x FRACTION, and one that goes last is put behind by a negative margin.
+    Rounding must not decide the order of walls that are crossed at once. An axis that goes first is moved ahead by the
+    largest rounding error, ``margin`` x FRACTION; an axis that goes last is moved back by a negative margin.
+
+    - ``start``: start of the ray along the axis [cell].
+    - ``step``: 1 or -1, direction along the axis.
+    - ``slope``: cells along the axis for each cell along the main axis, 0 to 1.
+    - ``distance``: distance of the start from wall 0 along the main axis [cell].
+    - ``margin``: multiple of FRACTION.
     """
     rise = min(np.floor(slope / FRACTION) * FRACTION, 1.0)
     ahead = margin * FRACTION - np.floor(slope * distance / FRACTION) * FRACTION
-    # Going down, a position on a wall is in the cell behind the wall.
+    # In falling direction, a position on a wall is in the cell behind the wall.
     return start - (step < 0) * FRACTION + step * ahead, step * rise
 
 
 @inline_kernel
 def _flag_blocks(flags, places_a, places_b, places_c, skipped, size):
-    """Flag the blocks that ``size`` slabs pass, the first of them ``skipped`` cells from where its block begins."""
+    """Flag the blocks that a piece of slabs passes.
+
+    - ``flags`` uint8: in place.
+    - ``places_a``, ``places_b``, ``places_c`` (size + 1,) uint32: terms of the place along the three axes.
+    - ``skipped``: cells between the start of the first slab's block and the first slab.
+    - ``size``: number of slabs.
+    """
     b, c = np.int64(places_b[0]) >> (3 * BLOCK_BITS), np.int64(places_c[0]) >> (3 * BLOCK_BITS)
     for stretch in range((size + skipped + BLOCK_EDGE - 1) >> BLOCK_BITS):
-        # Within one block of the main axis a ray lies in at most two blocks along each of the others.
+        # Within one block along the main axis, a ray is in at most two blocks along each of the other axes.
         begin = max(stretch * BLOCK_EDGE - skipped, 0)
         end = min(stretch * BLOCK_EDGE + BLOCK_EDGE - skipped, size)
         a = np.int64(places_a[begin]) >> (3 * BLOCK_BITS)
@@ -170,7 +191,15 @@ def _flag_blocks(flags, places_a, places_b, places_c, skipped, size):
 
 @inline_kernel
 def _mark_end_slabs(marks, flags, table_a, table_b, table_c, firsts, walls, lasts, sides):
-    """Mark the cells of a ray's first and last slab, one by one, but for the ray's last cell."""
+    """Mark the cells of a ray's first and last slab one by one, without the ray's end cell.
+
+    - ``marks`` uint8, ``flags`` uint8: in place.
+    - ``table_a``, ``table_b``, ``table_c`` uint32: terms of the place along the main axis a and along b and c.
+    - ``firsts``: first cell along a, b and c.
+    - ``walls``: cells along b and c at the end of the first slab, and at the start of the last one.
+    - ``lasts``: last cell along a, b and c.
+    - ``sides``: scale and shift of b and of c, steps along b and c; see mark_free.
+    """
     scale_b, shift_b, scale_c, shift_c, step_b, step_c = sides
     first_a, at_b, at_c = firsts
     to_b, to_c, far_b, far_c = walls
@@ -194,9 +223,13 @@ def _mark_end_slabs(marks, flags, table_a, table_b, table_c, firsts, walls, last
 
 @kernel
 def mark_hits(end_keys, end_marks, corner, tables, marks, flags):
-    """Write the marks (n,) of hit end cells (n, 3) over those of passed cells; ends with mark 0 are left out.
+    """Write the marks of hit end cells over those of passed cells.
 
-    ``tables`` are as mark_free leaves them.
+    - ``end_keys`` (n, 3) int32: keys of the end cells.
+    - ``end_marks`` (n,) uint8: marks; 0 is skipped.
+    - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
+    - ``tables`` uint32: as filled by mark_free.
+    - ``marks`` uint8, ``flags`` uint8: in place.
     """
     for i in range(end_marks.size):
         if end_marks[i] > 0:
@@ -208,7 +241,12 @@ def mark_hits(end_keys, end_marks, corner, tables, marks, flags):
 
 @kernel
 def mark_strengths(end_keys, end_marks, end_strengths, corner, tables, strengths):
-    """Write the strengths (n,) of hit end cells (n, 3) where mark_hits writes their marks."""
+    """Write the strengths of hit end cells.
+
+    - ``end_keys``, ``end_marks``, ``corner``, ``tables``: as for mark_hits.
+    - ``end_strengths`` (n,) uint8: label confidence in 1 / 255.
+    - ``strengths`` uint8: parallel to the marks, in place.
+    """
     for i in range(end_marks.size):
         if end_marks[i] > 0:
             x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
@@ -217,7 +255,13 @@ def mark_strengths(end_keys, end_marks, end_strengths, corner, tables, strengths
 
 @kernel
 def clear_outside(low, high, num_blocks, marks, flags):
-    """Take back the marks of cells outside [low, high) (3,), in cells of the scratch grid."""
+    """Clear the marks of cells outside a box.
+
+    - ``low``, ``high`` (3,) int64: the box [low, high) in cells of the scratch grid.
+    - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
+    - ``marks`` uint8: in place.
+    - ``flags`` uint8: flagged blocks.
+    """
     for block in range(flags.size):
         if flags[block] == 0:
             continue
@@ -234,9 +278,14 @@ def clear_outside(low, high, num_blocks, marks, flags):
 
 @kernel
 def touched_bricks(words, flags, corner, num_blocks, touched, codes):
-    """The bricks of flagged blocks that hold a mark: their places in the grid and their codes.
+    """Find the bricks that hold a mark; returns their number m.
 
-    ``words`` are the marks, eight to a word. Returns their number.
+    - ``words`` uint64: marks of the scratch grid, eight to a word.
+    - ``flags`` uint8: flagged blocks.
+    - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
+    - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
+    - ``touched`` (>= m,) int64: output, positions of the bricks in the scratch grid.
+    - ``codes`` (>= m,) int64: output, Morton codes of the bricks.
     """
     offset = KEY_OFFSET >> BLOCK_BITS
     low_x, low_y, low_z = corner[0] >> BLOCK_BITS, corner[1] >> BLOCK_BITS, corner[2] >> BLOCK_BITS
@@ -265,7 +314,7 @@ def touched_bricks(words, flags, corner, num_blocks, touched, codes):
 
 @kernel
 def clear_marks(marks, flags):
-    """Zero the flagged blocks of the scratch grid, and the flags."""
+    """Set ``marks`` uint8 to 0 in the flagged blocks of the scratch grid, and ``flags`` uint8 to 0."""
     for block in range(flags.size):
         if flags[block] != 0:
             flags[block] = 0

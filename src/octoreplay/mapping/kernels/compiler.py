@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept: they take plain arrays and trust them; the wrappers check and coerce."""
+"""Compilation and caching of kernels. Kernels trust their plain arrays; the wrappers check and coerce them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ logger = logging.getLogger(__name__)
 
 
 def _cache_folder() -> str | None:
-    """Where compiled kernels are kept: a folder named after the content of all kernel files; None where none can be.
+    """Folder of the compiled kernels, named after the content of all kernel files; None where none is writable.
 
-    numba's own rule looks at one file at a time, and would keep a kernel whose callee in another file has changed.
+    numba's own cache looks at one file at a time, and would keep a kernel whose callee in another file has changed.
     """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -47,15 +47,15 @@ _CACHE_FOLDER = _cache_folder()
 
 
 def cache_is_empty() -> bool:
-    """True where compiled kernels can be kept, and none is yet."""
+    """Return True where the cache folder is writable and holds no compiled kernel."""
     return _CACHE_FOLDER is not None and not any(Path(_CACHE_FOLDER).rglob("*.nbi"))
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Any:
-    """numba.njit with the on-disk cache where a cache folder can be written, without it elsewhere.
+    """Apply numba.njit, with the on-disk cache where a cache folder is writable.
 
-    No fast-math: reordered sums come out differently when callees are linked from the cache instead of inlined, and
-    the same input must give the same bytes. Loops over a brick run as vectors when they sum element by element.
+    Without fast-math: reordered sums differ between callees linked from the cache and inlined ones, and the same input
+    must give the same bytes. Loops over a brick compile to vector instructions where they sum element by element.
     """
     settings = {"nogil": True, "error_model": "numpy", **options}
     if _CACHE_FOLDER is None:
@@ -69,20 +69,20 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile for plain arrays, all of which are passed.
+    """Compile a kernel that allocates no arrays.
 
-    Without numba's own memory arrays are not counted: each use would take two atomic operations, which was half of the
-    time of an iteration. A kernel that makes arrays is an ``allocating_kernel``. numba has the option ``_nrt`` for its
-    own tests and does not document it; without it the kernels are the same, and slower.
+    Without numba's runtime (``_nrt=False``) array references are not counted: counting takes two atomic operations at
+    each use, which was half of the time of an iteration. A kernel that allocates arrays is an ``allocating_kernel``.
+    numba does not document ``_nrt``; without the option kernels are slower and give the same results.
     """
     return _compile(function, _nrt=False)
 
 
 def allocating_kernel(function: Callable[..., Any]) -> Any:
-    """Compile for plain arrays, with arrays of its own; for few and long calls."""
+    """Compile a kernel that allocates arrays; for few and long calls."""
     return _compile(function)
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
-    """Compile for use inside other kernels."""
+    """Compile a kernel that is inlined into other kernels."""
     return _compile(function, inline="always", _nrt=False)

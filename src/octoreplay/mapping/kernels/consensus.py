@@ -1,7 +1,10 @@
 """One iteration of a consensus rule, and the sum of evidence, brick by brick.
 
-The loops run over whole bricks that lie in one piece, so that they become vector instructions. Only integers are
-reduced over lanes: the order of a floating point sum is part of the result.
+The inner loops run over the contiguous values of one brick, so that they compile to vector instructions. Only integers
+are reduced over vector lanes: the order of a floating-point sum changes the result.
+
+In shapes, R is the number of robots, n of bricks, C of classes, and W = ceil(C / 8) of mask words. Values are float32
+log-odds relative to the prior.
 """
 
 from __future__ import annotations
@@ -16,20 +19,29 @@ from octoreplay.mapping.kernels.intrinsics import (
     float_array,
     fma,
     lowest_one,
+    max_octet,
     prefetch_line,
-    raise_octet,
     same_bits,
 )
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, collapse, load, octets_of, ones_below
+from octoreplay.mapping.kernels.storage import (
+    BRICK_CELLS,
+    OCTETS,
+    ROW_BYTES,
+    load_brick,
+    octets_of,
+    ones_below,
+    prune_brick,
+)
 
-GRADIENT, NATURAL, BAYES, MERGE, LOCAL = 0, 1, 2, 3, 4
+GRADIENT, NATURAL, BAYES, MERGE, COPY = 0, 1, 2, 3, 4
+"""Updates; octoreplay.mapping.consensus.team_step gives their equations."""
 
 
 @inline_kernel
 def exp_negative(x):
-    """Exp of a float32 that is at most 0, within a relative 5e-7; 5e-38 below -86. 2^n times a minimax polynomial."""
+    """exp(x) of a float32 ``x`` <= 0 as 2^n times a minimax polynomial: relative error 5e-7, 5e-38 below x = -86."""
     bounded = max(x, np.float32(-86.0))
-    # Adding 1.5 x 2^23 rounds to an integer, which then stands in the lowest bits.
+    # Adding 1.5 x 2^23 rounds to an integer, which is then in the lowest bits.
     shifted = fma(bounded, np.float32(1.44269504088896341), np.float32(12582912.0))
     f = fma(shifted - np.float32(12582912.0), np.float32(-0.69314718056), bounded)
     p = fma(np.float32(0.008312521), f, np.float32(0.041890156))
@@ -42,9 +54,9 @@ def exp_negative(x):
 
 @inline_kernel
 def prefetch(table, n, column):
-    """Ask for a brick's block ahead of its use: bricks lie in another order in every octree."""
+    """Prefetch the block of brick ``n`` in ``column`` of ``table``: the order of bricks differs between octrees."""
     if table.addresses[column, n] != 0:
-        # Most maps have one word to a mask.
+        # Most maps have one mask word, so the first one is outside the loop.
         rows = count_ones(octets_of(table.known[column, n])) + count_ones(table.masks[column, n, 0])
         for w in range(1, table.masks.shape[2]):
             rows += count_ones(table.masks[column, n, w])
@@ -54,36 +66,51 @@ def prefetch(table, n, column):
 
 @inline_kernel
 def rows_at(table, n, column, layout, known, m, scratch_at, num_classes):
-    """Where a brick's values lie with the rows for ``known[m]`` and ``layout[m]``: in its block, or ``scratch_at``."""
+    """Return the address of a brick's rows in another layout: its own block if that has the layout, else a copy.
+
+    - ``table``, ``n``, ``column``: the brick is row ``n`` of the table's ``column``.
+    - ``layout`` (k, W) uint64, ``known`` (k,) uint64, ``m``: the layout has class rows ``layout[m]`` and known cells
+      ``known[m]``.
+    - ``scratch_at``: address of the copy, with room for (C + 1) x 64 float32.
+    - ``num_classes``: C.
+    """
     place = table.addresses[column, n]
     other = np.uint64(place == 0) | (table.masks[column, n, 0] ^ layout[m, 0])
     other |= octets_of(table.known[column, n]) ^ octets_of(known[m])
     for w in range(1, layout.shape[1]):
         other |= table.masks[column, n, w] ^ layout[m, w]
     if other != 0:
-        load(scratch_at, table, n, column, layout, known, m, num_classes)
+        load_brick(scratch_at, table, n, column, layout, known, m, num_classes)
         place = scratch_at
     return place
 
 
-OWN, BASE, EVIDENCE, OLD_EVIDENCE, FIRST_NEIGHBOUR = 0, 1, 2, 3, 4
-"""A robot's columns of the table: its own map, the map that it published (the base of the differences), its evidence
+OWN, BASE, EVIDENCE, LAST_EVIDENCE, FIRST_NEIGHBOUR = 0, 1, 2, 3, 4
+"""Order of a robot's columns in the table: its own map, its published map (the base of the differences), its evidence
 log q, its evidence at the last iteration, then its neighbours' maps."""
 
 NUM_SCRATCH_BLOCKS = 5
-"""Blocks that a step works in: the mixed map, its distance to the evidence, and three for the gradient."""
+"""Scratch blocks of a step: the mixed map, its difference to the evidence, and three for the gradient."""
 
 
 PREFETCH_AHEAD = 4
-"""Bricks between the one that is asked for and the one in work: a few microseconds."""
+"""Number of bricks between the prefetched one and the current one: a few microseconds."""
 
 
 @kernel
 def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, num_shared, rows, num_classes, gamma):
-    """Mixed (rows, 8) += gamma x the gradient, with ``delta`` (rows, 8) = h~ - log q; all given by address.
+    """Add gamma x the gradient to the mixed map h~.
 
-    The shared rows stand for all the classes of their octet that have no row; ``octets`` (rows,) are the shared rows of
-    the others' octets. ``scratch_at`` has place for three arrays of ``room`` bytes and three of a brick's cells.
+    A shared row counts once for each class of its octet that has no class row.
+
+    - ``mixed_at``: address of h~ (rows, 8), in place.
+    - ``delta_at``: address of h~ - log q (rows, 8).
+    - ``scratch_at``: address of three arrays of ``room`` bytes and three of 64 float32.
+    - ``room``: bytes of a block with all rows.
+    - ``octets`` (rows,) int64: shared row of each class row's octet.
+    - ``num_shared``, ``rows``: number of shared rows, and of all rows.
+    - ``num_classes``: C.
+    - ``gamma``: float32.
     """
     size, shared_size = rows * OCTETS, num_shared * OCTETS
     mixed, delta = float_array(mixed_at, (size,)), float_array(delta_at, (size,))
@@ -101,7 +128,7 @@ def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, num_shared, rows
         first = octets[r] * OCTETS
         for k in range(OCTETS):
             terms[first + k] -= np.float32(1.0)
-        raise_octet(spread_at + octets[r] * ROW_BYTES, mixed_at + r * ROW_BYTES)
+        max_octet(spread_at + octets[r] * ROW_BYTES, mixed_at + r * ROW_BYTES)
     for r in range(num_shared, rows):
         copy_octet(spread_at + r * ROW_BYTES, spread_at + octets[r] * ROW_BYTES)
     for i in range(size):
@@ -127,7 +154,12 @@ def _add_gradient(mixed_at, delta_at, scratch_at, room, octets, num_shared, rows
 
 @kernel
 def _row_octets(layout, known, m, octets):
-    """The shared row of the octet of each row of a single class; returns the number of shared rows and of all rows."""
+    """Write the shared row of each class row's octet; returns the numbers of shared rows and of all rows.
+
+    - ``layout`` (k, W) uint64, ``known`` (k,) uint64, ``m``: the block has class rows ``layout[m]`` and known cells
+      ``known[m]``.
+    - ``octets`` (rows,) int64: output; the entries of shared rows are not set.
+    """
     present = octets_of(known[m])
     num_shared = count_ones(present)
     rows = num_shared
@@ -142,7 +174,13 @@ def _row_octets(layout, known, m, octets):
 
 @kernel
 def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_weight, size):
-    """Mixed (size,) += the sum of weight x (source - base) of three sources; all given by address."""
+    """Add weight x (map - base) of three maps to the mixed map, all (size,) float32.
+
+    - ``mixed_at``, ``base_at``: addresses of the mixed map, in place, and of the base.
+    - ``a_at``, ``b_at``, ``c_at``: addresses of the maps.
+    - ``a_weight``, ``b_weight``, ``c_weight``: float32.
+    - ``size``: number of values.
+    """
     mixed, base = float_array(mixed_at, (size,)), float_array(base_at, (size,))
     a, b, c = float_array(a_at, (size,)), float_array(b_at, (size,)), float_array(c_at, (size,))
     for i in range(size):
@@ -153,20 +191,34 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 @kernel
 def team_step(
-    start, end, table, columns, first_columns, weights, gammas, rule, num_classes, clamp_min, clamp_max, layouts, known,
-    is_awake, scratch, int_scratch, changes, is_even,
+    start, end, table, columns, first_columns, weights, gammas, update, num_classes, clamp_min, clamp_max, layouts,
+    known, needs_update, scratch, int_scratch, changes, is_even,
 ):  # fmt: skip
-    """One iteration of a rule at R robots, brick by brick for all of them, in place in their own maps.
+    """One iteration of R robots, in place in their own maps.
 
-    ``table`` says where the bricks ``start`` to ``end`` of all maps lie. Robot r's ``columns`` of it are those from
-    ``first_columns[r]`` to ``first_columns[r + 1]``: OWN, BASE, EVIDENCE, OLD_EVIDENCE, then its neighbours', with
-    their ``weights`` 2 epsilon A_ij at the same places. ``layouts`` (R n, W) and ``known`` (R n,) are the masks and the
-    known cells of the own bricks, which hold those of all the robot's columns; an own brick is one value only where all
-    others are. Only bricks that are awake (R, n) are worked on. ``changes`` (R, n) get their largest changes,
-    ``is_even`` (R, n) where all values are equal then; what is one value is left in the table. Rule MERGE clamps.
+    Loop invariant: all robots' bricks before ``b`` are updated and none from ``b`` on. A step at brick ``b`` reads
+    columns of brick ``b`` only, and no robot's own map is a column of another robot, so the order of bricks and robots
+    does not matter.
 
-    ``scratch`` float32 has room for NUM_SCRATCH_BLOCKS blocks with every row, one more for each of a robot's columns,
-    and 3 x 64 values; ``int_scratch`` int64 for two numbers for each row of a block and each of a robot's columns.
+    The layout of an own brick includes the known cells and class rows of all the robot's columns, and an own brick is
+    one value only where all these columns are. Where an own brick is one value, its new value is written to ``table``.
+
+    - ``start``, ``end``: bricks of the table to update, ``end`` excluded.
+    - ``table``: BrickTable of all maps, (J, n).
+    - ``columns`` int64: columns of the table, robot by robot: OWN, BASE, EVIDENCE, LAST_EVIDENCE, then its neighbours'.
+    - ``first_columns`` (R + 1,) int64: robot r has the entries ``first_columns[r]`` to ``first_columns[r + 1]``.
+    - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours, parallel to ``columns``.
+    - ``gammas`` (R,) float32: gradient step sizes.
+    - ``update``: GRADIENT, NATURAL, BAYES, MERGE or COPY.
+    - ``num_classes``: C.
+    - ``clamp_min``, ``clamp_max``: float32, limits of the log-odds, used by MERGE alone.
+    - ``layouts`` (R n, W) uint64, ``known`` (R n,) uint64: class rows and known cells of the own bricks.
+    - ``needs_update`` (R, n) bool: the other bricks are skipped.
+    - ``scratch`` float32: room for NUM_SCRATCH_BLOCKS blocks with all rows, one more for each of a robot's columns, and
+      3 x 64 values.
+    - ``int_scratch`` (2, k) int64: k at least the number of rows of a block and of a robot's columns.
+    - ``changes`` (R, n) float32: output, largest absolute change of a log-odds in each brick.
+    - ``is_even`` (R, n) bool: output, True where a changed brick's values are all equal.
     """
     robots = gammas.size
     room = (num_classes + 1) * BRICK_CELLS * 4
@@ -178,22 +230,22 @@ def team_step(
         for column in range(table.addresses.shape[0]):
             prefetch(table, min(b + PREFETCH_AHEAD, end - 1), column)
         for robot in range(robots):
-            if not is_awake[robot, b]:
+            if not needs_update[robot, b]:
                 continue
-            m = robot * is_awake.shape[1] + b
+            m = robot * needs_update.shape[1] + b
             num_shared, rows = _row_octets(layouts, known, m, octets)
             size = rows * OCTETS
             first = first_columns[robot]
             num_columns = first_columns[robot + 1] - first
             for k in range(num_columns):
-                if k == OLD_EVIDENCE and rule != BAYES and rule != MERGE:
+                if k == LAST_EVIDENCE and update != BAYES and update != MERGE:
                     continue
                 places[k] = rows_at(table, b, columns[first + k], layouts, known, m, spare_at + k * room, num_classes)
             own_at, base_at = places[OWN], places[BASE]
             own = float_array(own_at, (size,))
             mixed = float_array(mixed_at, (size,))
             delta = float_array(delta_at, (size,))
-            # The sum of the differences comes first: it is exactly 0 where all maps agree.
+            # The differences are summed before the own value is added: the sum is exactly 0 where all maps agree.
             for i in range(size):
                 mixed[i] = np.float32(0.0)
             for k in range(FIRST_NEIGHBOUR, num_columns, 3):
@@ -204,28 +256,28 @@ def team_step(
                     c_at, c_weight = places[k + 2], weights[first + k + 2]
                 _add_differences(mixed_at, base_at, places[k], b_at, c_at, weights[first + k], b_weight, c_weight, size)
             evidence = float_array(places[EVIDENCE], (size,))
-            if rule == LOCAL:
+            if update == COPY:
                 for i in range(size):
                     mixed[i] = evidence[i]
-            elif rule in (BAYES, MERGE):
-                old = float_array(places[OLD_EVIDENCE], (size,))
+            elif update in (BAYES, MERGE):
+                old = float_array(places[LAST_EVIDENCE], (size,))
                 for i in range(size):
                     mixed[i] += own[i] + (evidence[i] - old[i])
-                if rule == MERGE:
+                if update == MERGE:
                     for i in range(size):
                         mixed[i] = min(max(mixed[i], clamp_min), clamp_max)
             else:
                 for i in range(size):
                     mixed[i] += own[i]
                     delta[i] = mixed[i] - evidence[i]
-                if rule == NATURAL:
+                if update == NATURAL:
                     for i in range(size):
                         mixed[i] -= gammas[robot] * delta[i]
                 elif gammas[robot] != np.float32(0.0):
                     _add_gradient(
                         mixed_at, delta_at, gradient_at, room, octets, num_shared, rows, num_classes, gammas[robot]
                     )
-            # Numbers that are not negative are in the order of their bits.
+            # The bits of non-negative floats have the order of the floats.
             largest = np.int32(0)
             for i in range(size):
                 largest = max(largest, same_bits(abs(mixed[i] - own[i])))
@@ -244,10 +296,17 @@ def team_step(
 
 @kernel
 def finish_step(bricks, indices, table, column, changes, is_even, known_changed, revision):
-    """Store what is one value, set the revision of the bricks ``indices`` (n,) that changed, and prune them.
+    """Set values and revisions of changed bricks and prune them; returns the largest change.
 
-    Only those that are even, or whose known cells were added (``known_changed``), can have become one value. Returns
-    the largest of the ``changes`` (n,).
+    Only bricks that are even, or that got new known cells, can be pruned.
+
+    - ``bricks``: Bricks, in place.
+    - ``indices`` (n,) int64: brick indices; -1 is skipped.
+    - ``table``, ``column``: BrickTable and the octree's column, with the new values of bricks without a block.
+    - ``changes`` (n,) float32: largest change of a log-odds in each brick.
+    - ``is_even`` (n,) bool: True where all values of a brick are equal.
+    - ``known_changed`` (n,) bool: True where cells became known.
+    - ``revision``: revision of the changed bricks.
     """
     largest = np.float32(0.0)
     for b in range(indices.size):
@@ -259,37 +318,50 @@ def finish_step(bricks, indices, table, column, changes, is_even, known_changed,
         if bricks.blocks[index] < 0:
             bricks.values[index] = table.values[column, b]
         elif is_even[b] or known_changed[b]:
-            collapse(bricks, index)
+            prune_brick(bricks, index)
     return largest
 
 
 @kernel
-def join_columns(table, columns, is_awake, known, has_block, layout):
-    """What a robot's bricks need to hold those of the ``columns``: known cells (n,), a block, and rows (n, W).
+def join_columns(table, columns, needs_update, known, has_block, layout):
+    """Join the layouts of several columns of a table; outputs are combined with what the arrays hold.
 
-    All are joined to what the arrays hold. ``is_awake`` (n,) gains the bricks that changed, and loses those that have
-    no known cell.
+    - ``table``: BrickTable, (J, n).
+    - ``columns`` (k,) int64: columns to join.
+    - ``needs_update`` (n,) bool: set to True where a brick changed in any column, to False where no cell is known.
+    - ``known`` (n,) uint64: cells known in any column.
+    - ``has_block`` (n,) bool: True where the brick has a block in any column.
+    - ``layout`` (n, W) uint64: class rows of any column.
     """
     for column in columns:
         for b in range(known.size):
-            is_awake[b] |= table.is_changed[column, b]
+            needs_update[b] |= table.is_changed[column, b]
             known[b] |= table.known[column, b]
             has_block[b] |= table.addresses[column, b] != 0
         for w in range(layout.shape[1]):
             for b in range(known.size):
                 layout[b, w] |= table.masks[column, b, w]
     for b in range(known.size):
-        is_awake[b] &= known[b] != 0
+        needs_update[b] &= known[b] != 0
 
 
 @kernel
 def sum_evidence(bricks, indices, table, layout, known, counts, scales, num_classes, scratch, octets, no_rows):
-    """The sum over robots of log q, written to the bricks ``indices`` (n,), whose masks are ``layout`` (n, W).
+    """Write the sum over N robots of log q into bricks.
 
-    ``known`` (n,) are their known cells; index -1 is left out. ``table`` says where the robots' evidence lies. It is
-    divided by each cell's scans where the table ``counts`` has columns, and otherwise multiplied by ``scales`` (N,).
-    ``scratch`` float32 has room for 3 blocks with every row, ``octets`` int64 for a number for each row of a block, and
-    ``no_rows`` (n, 1) are empty masks.
+    log q of robot i is its evidence x ``scales[i]``, divided by each cell's number of scans where ``counts`` has
+    columns.
+
+    - ``bricks``: Bricks of the target, in place.
+    - ``indices`` (n,) int64: brick indices of the target; -1 is skipped.
+    - ``table``: BrickTable of the robots' evidence, (N, n).
+    - ``layout`` (n, W) uint64, ``known`` (n,) uint64: class rows and known cells of the target's bricks.
+    - ``counts``: BrickTable of the robots' scan counts, (N, n), or (0, n) for none.
+    - ``scales`` (N,) float32: factor of each robot's evidence.
+    - ``num_classes``: C.
+    - ``scratch`` float32: room for 3 blocks with all rows.
+    - ``octets`` int64: room for one number for each row of a block.
+    - ``no_rows`` (n, 1) uint64: empty masks.
     """
     term_at = np.int64(scratch.ctypes.data)
     room = (num_classes + 1) * BRICK_CELLS * 4
@@ -307,9 +379,9 @@ def sum_evidence(bricks, indices, table, layout, known, counts, scales, num_clas
             total[i] = np.float32(0.0)
             count[i] = np.float32(1.0)
         for r in range(table.addresses.shape[0]):
-            load(term_at, table, b, r, layout, known, b, num_classes)
+            load_brick(term_at, table, b, r, layout, known, b, num_classes)
             if counts.addresses.shape[0] > 0:
-                load(count_at, counts, b, r, no_rows, known, b, 1)
+                load_brick(count_at, counts, b, r, no_rows, known, b, 1)
                 for own in range(num_shared, rows):
                     copy_octet(count_at + own * ROW_BYTES, count_at + octets[own] * ROW_BYTES)
             for i in range(size):

@@ -1,7 +1,8 @@
-"""Where the rays of a scan end: measured points to keys, keys to distinct end cells with their classes.
+"""End cells of a scan's rays: from measured points to keys, from keys to distinct end cells with their classes.
 
-Neighbouring points mostly share a cell, so they are kept as *runs*: key, kind and number of points in a row. The loops
-over points have no branches, so that they run as vectors.
+Neighbouring points mostly share a cell, so they are stored as *runs* of consecutive points with equal key and kind. The
+loops over points have no branches, so that they compile to vector instructions. The *kind* of a point is its class_id,
+or one of the constants below.
 """
 
 from __future__ import annotations
@@ -11,29 +12,31 @@ import numpy as np
 from octoreplay.mapping.kernels.compiler import allocating_kernel, inline_kernel, kernel
 
 _CUT = np.int16(255)
-"""Kind of a ray that was cut at max_range, above every class_id; other kinds are class ids, 0 for an ignored label."""
+"""Kind of a ray that was cut at max_range; above every class_id."""
 
 _UNUSABLE = np.int16(0)
-"""Kind of a point that frees its ray and hits nothing."""
+"""Kind of a point that frees its ray and hits nothing, such as one with an ignored label."""
 
 _UNLABELLED = np.int16(1)
-"""Kind of a point without a label."""
+"""Kind of a point in a scan without labels: class 1."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
+"""Counters: number of runs, and number of stored end points."""
 
 IS_OWN = 3
-"""Row of a box that says whose body it is, after those of the axes."""
+"""Row of a box after those of the three axes; its first number is 1 for the robot's own body, 0 for another robot's."""
 
 _NONE = np.int16(-1)
 """Kind of a point that carries no information."""
 
 _FARTHEST_KEY = float(1 << 20)
-"""Keys are limited to this, which is outside every key space and fits 32 bits."""
+"""Limit of keys, outside the key space and within 32 bits."""
 
 _CLOSE = 1e-8
-"""Quotients farther from a whole number than this have the same floor with two roundings as with one."""
+"""Quotients farther than this from an integer have the same floor when rounded twice as when rounded once."""
 
 _BLOCK = 1024
+"""Number of points of a cloud that are processed together."""
 
 
 @allocating_kernel
@@ -41,16 +44,29 @@ def depth_to_runs(
     depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, special, meanings,
     confidences, boxes, keys, kinds, lengths, sums, ends, end_keys, counters,
 ):  # fmt: skip
-    """Runs of a depth image's end cells: ``keys`` (m, 3), ``kinds`` (m,) and ``lengths`` (m,), m = counters[NUM_RUNS].
+    """Find the runs of a depth image's end cells.
 
-    ``camera`` is (fx, fy, cx, cy), ``pose`` (4, 4); a class_image of size 0 means that every point is class 1.
-    Depths that equal one of ``special`` (s,), NaN included, become ``meanings`` (s,) [m], the last that applies.
-    ``ends`` (n, 3), where it is not empty, gets the end point [m] of every ray and ``end_keys`` (n, 3) its key,
-    n = counters[NUM_POINTS].
+    Loop invariant: the outputs hold the runs and end points of the rows before ``v``; ``counters`` holds their numbers
+    m and n.
 
-    ``confidences`` (H W,), where they are not empty, are the points', in 255ths, and ``sums`` (m,) gets their sum over
-    each run. ``boxes`` (b, 4, 6) have a row (r_x, r_y, r_z, t, low, high) for each axis, and hold the points p with
-    low <= r p + t <= high: these carry no information where the number at (IS_OWN, 0) is not 0, else they hit nothing.
+    - ``depth_image`` (H, W) uint16 or float32, ``depth_unit``: depth along z = value x ``depth_unit`` [m].
+    - ``class_image`` (H, W) uint8: class ids; size 0 for class 1 everywhere.
+    - ``camera`` (4,) float64: fx, fy, cx, cy [pixel].
+    - ``pose`` (4, 4) float64: T_team_sensor.
+    - ``resolution``: edge of a cell [m].
+    - ``min_range``, ``max_range``: limits of a point's distance [m].
+    - ``largest``: depth value that carries no information.
+    - ``special`` (s,) float64: depth values with a meaning, NaN included.
+    - ``meanings`` (s,) float64: their depths [m]; 0 carries no information. The last match applies.
+    - ``confidences`` (H W,) uint8: label confidences in 1 / 255; size 0 for full confidence.
+    - ``boxes`` (b, 4, 6) float64: a row (r_x, r_y, r_z, t, low, high) for each axis. A box holds the points p in the
+      team's frame with low <= r p + t <= high. Its points carry no information where the number at (IS_OWN, 0) is not
+      0; otherwise they free their rays and hit nothing.
+    - ``keys`` (>= m + 1, 3) int32, ``kinds`` (>= m + 1,) uint8, ``lengths`` (>= m + 1,) int32: output, runs.
+    - ``sums`` (>= m + 1,) int32: output, confidences summed over each run.
+    - ``ends`` (>= n + 1, 3) float64: output, end point of each ray in the team's frame [m]; size 0 for none.
+    - ``end_keys`` (>= n + 1, 3) int32: output, key of each end point.
+    - ``counters`` (2,) int64: m at NUM_RUNS and n at NUM_POINTS, in place.
     """
     height, width = depth_image.shape
     labelled = class_image.size > 0
@@ -80,14 +96,14 @@ def depth_to_runs(
             for u in range(width):
                 square = ratios[u] * ratios[u] + plus
                 z[u] = max_range / np.sqrt(square) if row_kinds[u] == _CUT else z[u]
-        # A loop over a number that is written down would be unrolled: three times as much to compile, and no faster.
+        # range(3) would be unrolled: three times as much code to compile, and no faster.
         for axis in range(keys.shape[1]):
             along, down = pose[axis, 0], pose[axis, 1] * ratio
             ahead, shift = pose[axis, 2], pose[axis, 3]
             for u in range(width):
                 world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
         if boxes.size + confidences.size > 0:
-            _leave_out(world, width, v * width, confidences, boxes, row_kinds)
+            _filter_points(world, width, v * width, confidences, boxes, row_kinds)
         num_runs = counters[NUM_RUNS]
         _add_runs(world, row_kinds, width, resolution, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
         if confidences.size > 0:
@@ -96,7 +112,7 @@ def depth_to_runs(
 
 @inline_kernel
 def _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z):
-    """Depths z (W,) [m] of the pixels in row v, 0 for those without information."""
+    """Write the depths of row ``v`` into ``z`` (W,) float64 [m], 0 without information; see depth_to_runs."""
     for u in range(z.size):
         raw = depth_image[v, u]
         value = raw * depth_unit
@@ -110,10 +126,15 @@ def _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z):
 
 @allocating_kernel
 def depth_to_points(depth_image, depth_unit, slopes, farthest, largest, special, meanings, points):
-    """The points (H W, 3) of a depth image, in the sensor's frame, where a lens distorts: 0 without information.
+    """Compute the points of a depth image with lens distortion.
 
-    ``slopes`` (2, H, W) are x / z and y / z of each pixel; depths are limited to ``farthest`` [m], the rest is as for
-    depth_to_runs. There the pinhole has a way of its own, which would take a tenth longer if it had to read slopes.
+    depth_to_runs has its own path for pinhole images, which would take 10 % longer if it read slopes.
+
+    - ``depth_image``, ``depth_unit``: as for depth_to_runs.
+    - ``slopes`` (2, H, W) float32: x / z and y / z of each pixel.
+    - ``farthest``: limit of the depths [m].
+    - ``largest``, ``special``, ``meanings``: as for depth_to_runs.
+    - ``points`` (H W, 3) float64: output, in the sensor's frame [m]; 0 without information.
     """
     height, width = depth_image.shape
     z = np.empty(width)
@@ -131,9 +152,15 @@ def points_to_runs(
     points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, keys, kinds, lengths, sums, ends,
     end_keys, counters,
 ):  # fmt: skip
-    """Runs of a point cloud's end cells; as depth_to_runs, for points (p, 3) in the sensor's frame.
+    """Find the runs of a point cloud's end cells. Points that are not finite, or are 0, carry no information.
 
-    Points that are not finite, or in the sensor itself, carry no information.
+    Loop invariant: the outputs hold the runs and end points of the points before ``first``.
+
+    - ``points`` (p, 3) float32 or float64: in the sensor's frame [m].
+    - ``class_ids`` (p,) uint8: size 0 for class 1 everywhere.
+    - ``pose``, ``resolution``, ``min_range``, ``max_range``: as for depth_to_runs.
+    - ``confidences`` (p,) uint8: label confidences in 1 / 255; size 0 for full confidence.
+    - ``boxes``, ``keys``, ``kinds``, ``lengths``, ``sums``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
     """
     labelled = class_ids.size > 0
     least, most = min_range * min_range, max_range * max_range
@@ -173,7 +200,7 @@ def points_to_runs(
             for i in range(size):
                 world[axis, i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
         if boxes.size + confidences.size > 0:
-            _leave_out(world, size, first, confidences, boxes, block_kinds)
+            _filter_points(world, size, first, confidences, boxes, block_kinds)
         num_runs = counters[NUM_RUNS]
         _add_runs(
             world, block_kinds, size, resolution, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters
@@ -184,7 +211,16 @@ def points_to_runs(
 
 @allocating_kernel
 def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
-    """Append the runs of ``size`` points, given in the world."""
+    """Append the runs of points to the outputs of depth_to_runs.
+
+    - ``world`` (3, >= size) float64: points in the team's frame [m].
+    - ``point_kinds`` (>= size,) int16: kinds of the points.
+    - ``size``: number of points.
+    - ``resolution``: edge of a cell [m].
+    - ``point_keys`` (3, >= size) int32: output, keys of the points.
+    - ``starts`` (>= size + 1,) int32: output, first point of each run, then ``size``.
+    - ``keys``, ``kinds``, ``lengths``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
+    """
     _coords_to_keys(world, size, resolution, point_keys)
     is_start = np.empty(size + 1, np.uint8)
     is_start[0] = 1
@@ -220,11 +256,19 @@ def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, ki
 
 
 @kernel
-def _leave_out(world, size, first, confidences, boxes, point_kinds):
-    """The kinds of points without confidence or within boxes; the ``size`` points begin at ``first`` in the scan."""
+def _filter_points(world, size, first, confidences, boxes, point_kinds):
+    """Set the kinds of points with zero confidence or within boxes.
+
+    - ``world`` (3, >= size) float64: points in the team's frame [m].
+    - ``size``: number of points.
+    - ``first``: position of the first point in the scan.
+    - ``confidences``, ``boxes``: as for depth_to_runs.
+    - ``point_kinds`` (>= size,) int16: in place.
+    """
     for i in range(size if confidences.size > 0 else 0):
-        is_vain = (confidences[first + i] == 0) & (point_kinds[i] != _NONE) & (point_kinds[i] != _CUT)
-        point_kinds[i] = _UNUSABLE if is_vain else point_kinds[i]
+        is_measured = (point_kinds[i] != _NONE) & (point_kinds[i] != _CUT)
+        has_zero_confidence = (confidences[first + i] == 0) & is_measured
+        point_kinds[i] = _UNUSABLE if has_zero_confidence else point_kinds[i]
     for box in range(boxes.shape[0]):
         kind = _NONE if boxes[box, IS_OWN, 0] != 0.0 else _UNUSABLE
         for i in range(size):
@@ -240,7 +284,14 @@ def _leave_out(world, size, first, confidences, boxes, point_kinds):
 
 @kernel
 def _sum_over_runs(confidences, first, starts, size, point_kinds, sums, place):
-    """Write the sums of the points' confidences over each of their runs, which begin at ``place``."""
+    """Sum the confidences over each run.
+
+    - ``confidences`` (p,) uint8: of the scan.
+    - ``first``: position of the first point in the scan.
+    - ``starts`` int32, ``size``, ``point_kinds`` int16: as for _add_runs.
+    - ``sums`` int32: output, from position ``place`` on.
+    - ``place``: number of runs before these.
+    """
     run = 0
     while starts[run] < size:
         total = 0
@@ -253,7 +304,7 @@ def _sum_over_runs(confidences, first, starts, size, point_kinds, sums, place):
 
 @inline_kernel
 def _coords_to_keys(coords, size, resolution, keys):
-    """Keys = floor(coords / resolution) (3, size), by multiplication where that cannot make a difference."""
+    """Write floor(coords / resolution) into ``keys`` (3, >= size) int32; multiplies where the floor is the same."""
     inverse = 1.0 / resolution
     for axis in range(keys.shape[0]):
         num_close = 0
@@ -268,8 +319,8 @@ def _coords_to_keys(coords, size, resolution, keys):
 
 
 @kernel
-def widen_to_keys(keys, low, high):
-    """Widen the box from ``low`` (3,) to ``high`` (3,) so that it holds all keys (n, 3)."""
+def extend_bounds(keys, low, high):
+    """Extend the box from ``low`` to ``high`` (3,) int64, in place, so that it holds all ``keys`` (n, 3) int32."""
     for axis in range(3):
         least, most = low[axis], high[axis]
         for i in range(keys.shape[0]):
@@ -279,8 +330,8 @@ def widen_to_keys(keys, low, high):
 
 
 @inline_kernel
-def _place_of(cell, table, end_cells):
-    """Where in the hash table a cell's number is, or belongs."""
+def _slot_of(cell, table, end_cells):
+    """Slot of ``cell`` int64 in the hash ``table``: entries are positions in ``end_cells``, -1 for an empty slot."""
     mask = table.size - 1
     place = np.int64((np.uint64(cell) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)) & mask
     while table[place] >= 0 and end_cells[table[place]] != cell:
@@ -290,10 +341,16 @@ def _place_of(cell, table, end_cells):
 
 @kernel
 def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, end_cells, end_keys, end_marks):
-    """The distinct cells of runs (m,), with 1 + the class that most points in each have, 0 where none has a class.
+    """Find the distinct cells of runs, each with the class of most of its points; returns their number n.
 
-    ``low`` and ``edges`` (3,) are the box of the keys. ``table``, a power of two of at least 2 m, is filled with -1
-    and holds what it likes afterwards. Returns the number of cells, written to ``end_keys`` (n, 3) and ``end_marks``.
+    - ``keys`` (m, 3) int32, ``kinds`` (>= m,) uint8, ``lengths`` (>= m,) int32: runs.
+    - ``low``, ``edges`` (3,) int64: lowest key and edges of a box that holds the keys.
+    - ``num_classes``: C.
+    - ``table`` int32: hash table of -1, its size a power of two of at least 2 m; overwritten.
+    - ``votes`` (>= n, C) int32: output, points of each class in each cell.
+    - ``end_cells`` (>= n,) int64: output, numbers of the cells in the box.
+    - ``end_keys`` (>= n, 3) int32: output, keys of the cells.
+    - ``end_marks`` (>= n,) uint8: output, 1 + class_id; 0 where no point has a class. Ties go to the lower class_id.
     """
     num_ends = 0
     last_cell, slot = np.int64(-1), np.int64(0)
@@ -302,7 +359,7 @@ def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, e
         cell = (z * edges[1] + y) * edges[0] + x
         if cell != last_cell:
             last_cell = cell
-            place = _place_of(cell, table, end_cells)
+            place = _slot_of(cell, table, end_cells)
             slot = np.int64(table[place])
             if slot < 0:
                 slot = num_ends
@@ -328,11 +385,16 @@ def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, e
 def weigh_ends(
     keys, kinds, sums, low, edges, num_classes, table, votes, vote_sums, end_cells, end_marks, end_strengths
 ):
-    """Let the class with the largest sum of confidences win each cell, and give the mean of its points as strength.
+    """Choose the class with the largest sum of confidences in each cell, after distinct_ends.
 
-    ``sums`` (m,) are those of the points in each run; the rest is as distinct_ends has left it. ``vote_sums`` (n, C) is
-    0 and gets the sums by cell, ``end_marks`` (n,) 1 + the classes, and ``end_strengths`` (n,) the means, rounded half
-    up; both stay as they are where no point has a class.
+    - ``keys``, ``kinds``: runs, as for distinct_ends.
+    - ``sums`` (>= m,) int32: confidences summed over each run.
+    - ``low``, ``edges``, ``num_classes``, ``table``, ``votes``: as left by distinct_ends.
+    - ``vote_sums`` (n, C) int64: output from 0, confidences summed by cell and class.
+    - ``end_cells``: as left by distinct_ends.
+    - ``end_marks`` (n,) uint8: output, 1 + class_id; not set where no point has a class.
+    - ``end_strengths`` (n,) uint8: output, mean confidence of the class's points in 1 / 255, rounded half up; not set
+      where no point has a class.
     """
     last_cell, slot = np.int64(-1), np.int64(0)
     for run in range(keys.shape[0]):
@@ -340,7 +402,7 @@ def weigh_ends(
         cell = (z * edges[1] + y) * edges[0] + x
         if cell != last_cell:
             last_cell = cell
-            slot = np.int64(table[_place_of(cell, table, end_cells)])
+            slot = np.int64(table[_slot_of(cell, table, end_cells)])
         if 0 < kinds[run] <= num_classes:
             vote_sums[slot, kinds[run] - 1] += sums[run]
     for slot in range(end_marks.size):

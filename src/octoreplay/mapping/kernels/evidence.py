@@ -1,4 +1,9 @@
-"""What a scan adds to an octree: one update for each cell that it touches."""
+"""Evidence of one scan added to an octree: one update for each cell that the scan touches.
+
+A *mark* is one byte for each cell of the scan's scratch grid: 0 untouched, 1 free, c + 2 a hit of class c (from 0).
+Eight marks, those of an octet, are one uint64 word. In shapes, n is the number of bricks, C of classes, and
+W = ceil(C / 8) of mask words.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +16,21 @@ from octoreplay.mapping.kernels.storage import (
     BRICK_CELLS,
     OCTETS,
     ROW_BYTES,
-    collapse,
     octets_of,
+    prune_brick,
     share_first_class,
 )
 
 PREFETCH_AHEAD = 8
+"""Number of bricks between the prefetched one and the current one."""
 
 EVERY_BYTE = np.uint64(0x0101010101010101)
 LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 
 
 @kernel
-def _marked(marks):
-    """The bytes of eight marks that are not 0, as eight bits."""
+def _marked_cells(marks):
+    """Return one bit for each of eight ``marks`` uint64 that is not 0."""
     tops = (((marks & LOW_BITS) + LOW_BITS) | marks) & ~LOW_BITS
     # The product gathers the eight top bits in the top byte.
     return ((tops >> np.uint64(7)) * np.uint64(0x0102040810204080)) >> np.uint64(56)
@@ -32,20 +38,27 @@ def _marked(marks):
 
 @kernel
 def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
-    """Which classes the marks of a scan hit in each octet of the bricks ``indices`` (n,), as masks ``wanted`` (n, W).
+    """Find the class rows that the hits of a scan need.
 
-    ``touched`` (n,) are the scratch bricks of the marks, ``words`` the marks, eight to a word: 0 for no mark, 1 for a
-    free cell, c + 2 for a hit of class c. ``known`` (n,) gets the marked cells. ``changes`` (n,) says which bricks
-    change at all: one that is free and clamped does not. A map of one class has no rows of single classes, and takes
-    every hit as its own.
+    A map of one class has no class rows; all hits go to the shared rows.
+
+    - ``bricks``: Bricks of the octree.
+    - ``indices`` (n,) int64: brick indices.
+    - ``touched`` (n,) int64: brick of the scratch grid with the marks.
+    - ``words`` uint64: marks of the scratch grid.
+    - ``num_classes``: C.
+    - ``miss``, ``clamp_min``, ``clamp_max``: float32, log-odds increment of a free cell and limits.
+    - ``wanted`` (n, W) uint64: output from 0, class rows of the octets and classes that are hit.
+    - ``known`` (n,) uint64: output, marked cells.
+    - ``changes`` (n,) bool: output, False where a brick does not change because it is free and at the limit.
     """
     for t in range(indices.size):
         any_hit = np.uint64(0)
         known[t] = 0
         for e in range(OCTETS):
             marks = words[touched[t] * OCTETS + e]
-            known[t] |= _marked(marks) << np.uint64(8 * e)
-            # Bits above the lowest of a byte say that a cell was hit.
+            known[t] |= _marked_cells(marks) << np.uint64(8 * e)
+            # A mark above 1 is a hit.
             hits = marks & ~EVERY_BYTE
             any_hit |= hits
             if num_classes == 1:
@@ -64,7 +77,7 @@ def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, c
 
 @inline_kernel
 def _prefetch_block(bricks, rows_at, index):
-    """Ask for the block of a brick that comes soon, ahead of its use: bricks lie anywhere."""
+    """Prefetch the block of brick ``index`` of ``bricks``; ``rows_at`` is the address of the rows."""
     ahead = np.int64(bricks.blocks[index])
     for offset in range(0, BRICK_CELLS * 4, 64):
         prefetch_line(rows_at + ahead * ROW_BYTES + offset)
@@ -72,9 +85,13 @@ def _prefetch_block(bricks, rows_at, index):
 
 @inline_kernel
 def _gather_rows(words, touched, bricks, index, row_words, row_hits):
-    """The words of a scratch brick in the order of the rows of a block, and the mark of each row's own class.
+    """Copy the words of a scratch brick into the order of a block's rows; returns the numbers of shared and all rows.
 
-    Returns the number of rows that classes share, which come first, and of all.
+    - ``words`` uint64: marks of the scratch grid.
+    - ``touched``: brick of the scratch grid.
+    - ``bricks``, ``index``: brick of the octree.
+    - ``row_words`` (rows,) uint64: output, word of each row's octet.
+    - ``row_hits`` (rows,) uint64: output, mark of a hit of the row's class in each byte, 0 for shared rows.
     """
     octets = octets_of(bricks.known[index])
     rows = 0
@@ -96,24 +113,32 @@ def _gather_rows(words, touched, bricks, index, row_words, row_hits):
 
 @inline_kernel
 def _finish_brick(bricks, index, block, has_own_rows, revision, num_classes):
-    """Store what a changed brick's values allow: classes that share the first one's, or one value for all."""
+    """Set the revision of a changed brick, fill its shared rows or prune it."""
     bricks.revisions[index] = revision
     if has_own_rows:
         share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
     elif bricks.known[index] == ALL_CELLS:
-        collapse(bricks, index)
+        prune_brick(bricks, index)
 
 
 @kernel
 def apply_marks(
     bricks, indices, touched, words, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision, scratch
 ):
-    """Add one scan's log-odds to the bricks ``indices`` (n,), raised beforehand.
+    """Add one scan's log-odds to bricks that were expanded by the rows of ``wanted_rows``.
 
     A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped. The marks are those of ``wanted_rows``. ``scratch`` (2, 9 + 8 C) uint64 is set.
+    are clamped.
+
+    - ``bricks``: Bricks, in place.
+    - ``indices`` (n,) int64: brick indices.
+    - ``touched`` (n,) int64, ``words`` uint64, ``num_classes``: as for wanted_rows.
+    - ``hit``, ``miss``, ``hit_other``: float32 log-odds increments.
+    - ``clamp_min``, ``clamp_max``: float32 limits of the log-odds.
+    - ``revision``: revision of the bricks.
+    - ``scratch`` (2, 9 + 8 C) uint64.
     """
-    # The marks, and the mark that says a row's own class was hit, of every value of a block.
+    # For every value of a block: the cell's mark, and the mark of a hit of the row's class.
     row_marks, row_hits = scratch[0], scratch[1]
     all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)
     flat = bricks.rows.reshape(bricks.rows.size)
@@ -139,9 +164,12 @@ def apply_weighted_marks(
     bricks, indices, touched, words, strengths, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision,
     scratch,
 ):  # fmt: skip
-    """As apply_marks, where each cell's ``hit`` has a factor: its strength in 255ths.
+    """Add one scan's log-odds like apply_marks, with ``hit`` multiplied by the cell's strength / 255.
 
-    ``strengths`` are parallel to the marks and eight to a word, and ``scratch`` is (3, 9 + 8 C).
+    - ``bricks``, ``indices``, ``touched``, ``words``: as for apply_marks.
+    - ``strengths`` uint64: one byte for each cell of the scratch grid, parallel to ``words``.
+    - ``num_classes``, ``hit``, ``miss``, ``hit_other``, ``clamp_min``, ``clamp_max``, ``revision``: as for apply_marks.
+    - ``scratch`` (3, 9 + 8 C) uint64.
     """
     row_marks, row_hits, row_strengths = scratch[0], scratch[1], scratch[2]
     all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)

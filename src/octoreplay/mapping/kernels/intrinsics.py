@@ -1,6 +1,6 @@
-"""Single machine instructions that numba has no name for, as functions for kernels."""
+"""Machine instructions that numba does not expose, as functions for kernels."""
 
-# The names and the number of an intrinsic's parameters are numba's, also of those that are not needed.
+# numba fixes the names and the number of an intrinsic's parameters, including unused ones.
 # ruff: noqa: ARG001
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numba.np import arrayobj
 
 @intrinsic
 def float_array(typing_context: Any, address: Any, shape: Any) -> Any:
-    """The float32 array of a shape (a tuple) at an integer address, which owns no memory."""
+    """Return a float32 array with the ``shape`` (a tuple) at the integer ``address``; it owns no memory."""
     result = types.Array(types.float32, len(shape), "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -31,7 +31,7 @@ def float_array(typing_context: Any, address: Any, shape: Any) -> Any:
         arrayobj.populate_array(
             array, builder.inttoptr(arguments[0], array.data.type), sizes, strides, strides[-1], meminfo=None
         )
-        # numba's own name for the finished structure.
+        # numba's accessor of the finished structure.
         return array._getvalue()  # noqa: SLF001
 
     return result(types.int64, shape), generate
@@ -39,7 +39,7 @@ def float_array(typing_context: Any, address: Any, shape: Any) -> Any:
 
 @intrinsic
 def same_bits(typing_context: Any, value: Any) -> Any:
-    """The int32 with the bits of a float32, or the float32 with the lowest 32 bits of an integer."""
+    """Return the int32 with the bits of a float32, or the float32 with the lowest 32 bits of an integer."""
     result = types.int32 if isinstance(value, types.Float) else types.float32
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -53,7 +53,7 @@ def same_bits(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
-    """The float32 a x b + c, rounded once: one instruction, with the same result on every machine."""
+    """Return the float32 a x b + c, rounded once, with the same result on every machine."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.fma(*arguments)
@@ -63,7 +63,7 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def count_ones(typing_context: Any, mask: Any) -> Any:
-    """Number of ones in a uint64."""
+    """Return the number of ones in a uint64."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -73,7 +73,7 @@ def count_ones(typing_context: Any, mask: Any) -> Any:
 
 @intrinsic
 def lowest_one(typing_context: Any, mask: Any) -> Any:
-    """Place of the lowest one in a uint64 that is not 0."""
+    """Return the position of the lowest one in a uint64 that is not 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.IntType(1)(1))
@@ -83,7 +83,7 @@ def lowest_one(typing_context: Any, mask: Any) -> Any:
 
 @intrinsic
 def highest_one(typing_context: Any, mask: Any) -> Any:
-    """Place of the highest one in a uint64 that is not 0."""
+    """Return the position of the highest one in a uint64 that is not 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = ir.IntType(64)
@@ -93,13 +93,13 @@ def highest_one(typing_context: Any, mask: Any) -> Any:
 
 
 def _octets(builder: Any, addresses: Any) -> list[Any]:
-    """Pointers to eight float32 each. A loop over eight values would be unrolled into single ones."""
+    """Return pointers to vectors of eight float32: the compiler would unroll a loop over eight values."""
     return [builder.inttoptr(address, ir.VectorType(ir.FloatType(), 8).as_pointer()) for address in addresses]
 
 
 @intrinsic
 def copy_octet(typing_context: Any, target: Any, source: Any) -> Any:
-    """Copy eight float32 from one integer address to another."""
+    """Copy eight float32 from the integer address ``source`` to ``target``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, source = _octets(builder, arguments)
@@ -110,8 +110,8 @@ def copy_octet(typing_context: Any, target: Any, source: Any) -> Any:
 
 
 @intrinsic
-def raise_octet(typing_context: Any, target: Any, source: Any) -> Any:
-    """Raise eight float32 at an integer address to those at another where these are higher."""
+def max_octet(typing_context: Any, target: Any, source: Any) -> Any:
+    """Replace eight float32 at the integer address ``target`` by their maxima with those at ``source``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, source = _octets(builder, arguments)
@@ -124,7 +124,7 @@ def raise_octet(typing_context: Any, target: Any, source: Any) -> Any:
 
 @intrinsic
 def add_octet(typing_context: Any, target: Any, source: Any) -> Any:
-    """Add the eight float32 at an integer address to those at another, the target."""
+    """Add eight float32 at the integer address ``source`` to those at ``target``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, source = _octets(builder, arguments)
@@ -137,7 +137,7 @@ def add_octet(typing_context: Any, target: Any, source: Any) -> Any:
 
 @intrinsic
 def prefetch_line(typing_context: Any, address: Any) -> Any:
-    """Ask for the cache line at an integer address."""
+    """Prefetch the cache line at an integer address."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())

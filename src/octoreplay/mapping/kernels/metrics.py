@@ -1,4 +1,8 @@
-"""The maps of a team compared brick by brick, in loops over the cells of a brick that become vector instructions."""
+"""Comparison of a team's maps, brick by brick. The loops over a brick's cells compile to vector instructions.
+
+In shapes, N is the number of robots, n of bricks, L of links and C of classes; *width* is C, or 1 for a brick in which
+the classes are equal in all maps.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from octoreplay.mapping.kernels.storage import BRICK_CELLS, OCTETS, ROW_BYTES, o
 
 @inline_kernel
 def _log(x):
-    """Natural logarithm of a float32 from 1 to 1e30: exponent and polynomial (Cephes' logf, Moshier 1992)."""
+    """Natural logarithm of a float32 ``x`` from 1 to 1e30: exponent and polynomial (Cephes' logf, Moshier 1992)."""
     # The exponent counts from sqrt(1/2), so that the mantissa m lies in [sqrt(1/2), sqrt(2)).
     exponent = np.int32(np.int32(same_bits(x) - np.int32(0x3F3504F3)) >> np.int32(23))
     m = same_bits(same_bits(x) - (exponent << np.int32(23))) - np.float32(1.0)
@@ -30,7 +34,12 @@ def _log(x):
 
 @kernel
 def _load_classes(target_at, table, n, column, width):
-    """Write the brick ``n`` of a table's column to an address, 64 values for each of ``width`` classes (1 or all)."""
+    """Write a brick to an address as (width, 64) float32; unknown cells get 0.
+
+    - ``target_at``: address of the values.
+    - ``table``, ``n``, ``column``: the brick is row ``n`` of the table's ``column``.
+    - ``width``: number of classes, or 1.
+    """
     target = float_array(target_at, (width, BRICK_CELLS))
     address = table.addresses[column, n]
     if address == 0:
@@ -62,7 +71,7 @@ def _load_classes(target_at, table, n, column, width):
 
 @kernel
 def _total(cells):
-    """Sum of ``cells`` (64,) float32 in a fixed order."""
+    """Sum of ``cells`` (64,) float32 in a fixed order; overwrites them."""
     for i in range(8):
         cells[i] += cells[i + 8] + cells[i + 16] + cells[i + 24]
         cells[i] += cells[i + 32] + cells[i + 40] + cells[i + 48] + cells[i + 56]
@@ -74,9 +83,14 @@ def _total(cells):
 
 @kernel
 def _label_cells(rows, oracle, prior, labels, best, oracle_there):
-    """Argmax class (64,) of a brick (width, 64) and its log-odds; free is 0, ties go to the lower id.
+    """Find the most probable class of each cell; free is 0, ties go to the lower id.
 
-    ``oracle_there`` gets the log-odds that the oracle (width, 64) gives to this class.
+    - ``rows`` (width, 64) float32: deviations of the map.
+    - ``oracle`` (width, 64) float32: deviations of the oracle.
+    - ``prior``: float32 log-odds h_0.
+    - ``labels`` (64,) int32: output, class ids.
+    - ``best`` (64,) float32: output, log-odds of the label.
+    - ``oracle_there`` (64,) float32: output, the oracle's log-odds of the same label.
     """
     for i in range(BRICK_CELLS):
         labels[i] = np.int32(0)
@@ -93,7 +107,15 @@ def _label_cells(rows, oracle, prior, labels, best, oracle_there):
 
 @kernel
 def _brick_entropy(rows, terms, prior, best, seen, total, weighted):
-    """Sum of the entropies of the cells with ``seen`` (64,) 1, in nats; a row stands for ``terms`` equal classes."""
+    """Sum of the cells' entropies [nat].
+
+    - ``rows`` (width, 64) float32: deviations of the map.
+    - ``terms``: float32, number of equal classes that a row stands for.
+    - ``prior``: float32 log-odds h_0.
+    - ``best`` (64,) float32: largest log-odds of each cell.
+    - ``seen`` (64,) int32: 1 for the cells that are summed, else 0.
+    - ``total``, ``weighted`` (64,) float32: scratch.
+    """
     for i in range(BRICK_CELLS):
         total[i] = np.float32(0.0)
         weighted[i] = np.float32(0.0)
@@ -113,9 +135,12 @@ def _brick_entropy(rows, terms, prior, best, seen, total, weighted):
 
 @kernel
 def _pair_distance(bricks, square, mean):
-    """Squared differences of the robots' bricks (N, width, 64), summed over all pairs of robots.
+    """Sum of the squared differences over all pairs of robots.
 
-    With differences d_i to robot 0, which are exact where the maps are close, this is N sum_i d_i^2 - (sum_i d_i)^2.
+    It is N sum_i d_i^2 - (sum_i d_i)^2 with the differences d_i to robot 0, which are exact where the maps are close.
+
+    - ``bricks`` (N, width, 64) float32: deviations of the robots.
+    - ``square``, ``mean`` (64,) float32: scratch.
     """
     robots = bricks.shape[0]
     distance = 0.0
@@ -138,7 +163,12 @@ def _pair_distance(bricks, square, mean):
 
 @kernel
 def _link_distance(bricks, link_ends, square):
-    """Squared differences of the robots' bricks (N, width, 64), summed over the links."""
+    """Sum of the squared differences over the links.
+
+    - ``bricks`` (N, width, 64) float32: deviations of the robots.
+    - ``link_ends`` (L, 2) int64: robot indices.
+    - ``square`` (64,) float32: scratch.
+    """
     for i in range(BRICK_CELLS):
         square[i] = np.float32(0.0)
     for k in range(link_ends.shape[0]):
@@ -151,21 +181,32 @@ def _link_distance(bricks, link_ends, square):
 
 
 @kernel
-def compare_maps(table, link_ends, prior, num_classes, scratch, int_scratch, places, distances, counts, entropies):
-    """Each brick's part of the metrics, for N robots (columns 0..N-1 of ``table``) and the oracle (column N).
+def compare_maps(
+    table, link_ends, prior, tie_tolerance, num_classes, scratch, int_scratch, places, distances, counts, entropies
+):
+    """Contribution of each brick to the metrics.
 
-    ``link_ends`` (L, 2) the links' robots; ``scratch`` float32 has room for
-    N + 1 bricks of all classes and 5 of one, ``int_scratch`` int32 for 5. Outputs, in the row ``places`` (n,) of each
-    brick: ``distances`` (m, 2): sum of squared differences over the links, and over all pairs of robots;
-    ``counts`` (m, 4 + 3 N): cells known to any robot, those that the oracle calls occupied, those with differing
-    labels, cells known to either end of each link; then per robot known cells, agreeing cells, agreeing cells that the
-    oracle calls occupied; ``entropies`` (m, N): sum over the robot's known cells in nats.
+    Loop invariant: the rows ``places[:b]`` of the outputs are complete, and no other row is written.
+
+    - ``table``: BrickTable (N + 1, n) of the robots' maps and, in the last column, the oracle.
+    - ``link_ends`` (L, 2) int64: robot indices.
+    - ``prior``: float32 log-odds h_0.
+    - ``tie_tolerance``: float32 log-odds; a label agrees where the oracle's log-odds of it are this close to its best.
+    - ``num_classes``: C.
+    - ``scratch`` float32: room for N + 1 bricks of all classes and 5 of one class.
+    - ``int_scratch`` (5, 64) int32.
+    - ``places`` (n,) int64: row of each brick in the outputs.
+    - ``distances`` (m, 2) float64: output, squared differences summed over the links and over all pairs of robots.
+    - ``counts`` (m, 4 + 3 N) int32: output, cells known to any robot, of these the oracle's occupied ones, cells with
+      differing labels, cells known to either end summed over the links; then for each robot its known cells, agreeing
+      cells, and agreeing cells that are occupied in the oracle.
+    - ``entropies`` (m, N) float64: output, entropies summed over the robot's known cells [nat].
     """
     robots = table.known.shape[0] - 1
     is_complete = link_ends.shape[0] == robots * (robots - 1) // 2
     cells_at = np.int64(scratch.ctypes.data)
     bricks_at = cells_at + 5 * BRICK_CELLS * 4
-    # Arrays made of addresses, because those that own memory are counted at every use.
+    # Arrays are made from addresses: slices of arrays that own memory are reference-counted at every use.
     cells = float_array(cells_at, (5, BRICK_CELLS))
     best, oracle_best, oracle_there, total, weighted = cells[0], cells[1], cells[2], cells[3], cells[4]
     labels, first, differs = int_scratch[0], int_scratch[1], int_scratch[2]
@@ -202,13 +243,13 @@ def compare_maps(table, link_ends, prior, num_classes, scratch, int_scratch, pla
                     seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
             _label_cells(bricks[r], oracle, prior, labels, best, oracle_there)
             entropies[place, r] = _brick_entropy(bricks[r], terms, prior, best, seen, total, weighted)
-            # Sums of int32 have to be kept as such, or they would take half as many lanes.
+            # Casts keep the sums int32; int64 sums use half as many vector lanes.
             agreeing, agreeing_occupied = np.int32(0), np.int32(0)
             for i in range(BRICK_CELLS):
-                agrees = seen[i] if oracle_there[i] >= oracle_best[i] - np.float32(1e-3) else np.int32(0)
+                agrees = seen[i] if oracle_there[i] >= oracle_best[i] - tie_tolerance else np.int32(0)
                 agreeing = np.int32(agreeing + agrees)
                 agreeing_occupied = np.int32(agreeing_occupied + (agrees & occupied[i]))
-                # An unknown cell has a label of its own.
+                # Unknown counts as a label.
                 label = labels[i] if seen[i] > 0 else np.int32(-1)
                 first[i] = label if r == 0 else first[i]
                 differs[i] |= label ^ first[i]

@@ -1,14 +1,20 @@
-"""Octrees as depth-first streams, and back.
+"""Conversion of octrees to depth-first streams and back, and the codes of packets.
 
-Inside a brick three masks of 64 bits say everything but the values: which cells are ``known``, at which cells a leaf
-``starts`` (each leaf's first cell), and which of those leaves are ``vector`` leaves, whose classes differ. A brick of
-which all cells are known and only cell 0 starts a leaf is that one leaf.
+Three 64-bit masks describe the leaves of a brick: the ``known`` cells, the ``starts`` (first cell of each leaf), and
+the ``vector`` leaves (first cells of leaves in which the classes differ). A brick is one leaf where all cells are known
+and only cell 0 starts a leaf.
 
-A vector leaf is one value and a mask of the classes with another one. The value is the one that most classes have (the
-lowest such class's where several have as many), so that equal maps are equal streams, however they are stored.
+A vector leaf is stored as one value, a mask of the classes with other values, and these values. The one value is that
+of most classes (ties go to the lowest class), so equal maps give equal streams, however they are stored.
 
-Before they are compressed numbers become codes of one byte: the slot in which a recent number stands, or 0 for a new
-one, a literal.
+Before compression each number becomes a code of one byte: the slot of an equal recent number, or 0 for a *literal*, a
+number that is stored in full.
+
+A *stream* has ``words`` (uint16, one for each inner node: two bits for each of its eight children), ``values``
+(float32, one for each leaf), ``masks`` (uint8, ceil(C / 8) bytes for each vector leaf) and ``own_values`` (float32, the
+other values of the vector leaves). ``totals`` (4,) int64 counts what is written of each.
+
+In shapes, n is the number of bricks, C of classes, L of leaves, V of vector leaves, and W = ceil(C / 8) of mask words.
 """
 
 from __future__ import annotations
@@ -37,29 +43,38 @@ from octoreplay.records import Float32Array, Int64Array, UInt8Array
 
 CHILD_UNKNOWN, CHILD_INNER, CHILD_SCALAR, CHILD_VECTOR = 0, 1, 2, 3
 ALL_LEAVES = 0xAAAA
-"""The bits that a word has when all its children are leaves."""
+"""Bits of a word in which all children are leaves."""
 
 ZERO, ONE = np.uint64(0), np.uint64(1)
-EIGHT_CELLS = np.uint64(0xFF)
-"""An octet: a byte of a brick's mask."""
+FIRST_OCTET = np.uint64(0xFF)
+"""The cells of the first octet: a byte of a brick's mask."""
 LAST_CELLS = np.uint64(0x8080808080808080)
-"""The last cell of each octet."""
+"""Mask of the last cell of each octet."""
 NO_SIGN = np.float32(0.0)
-"""Added to a value it makes 0 of -0, so that equal maps are equal bytes."""
+"""Added to values: it turns -0 into 0, so that equal maps give equal bytes."""
 
 
 SLOTS = 256
-"""Slots for recent numbers; slot 0 stays empty."""
+"""Number of slots for recent numbers; slot 0 is not used."""
 
 
 class EncoderScratch(NamedTuple):
-    """What encode_bricks works in.
+    """Scratch memory of encode_bricks.
 
-    The block of one brick: its values (8 + 8 C, 8), and the octet and class of each row; flags (2, 64) of its cells;
-    the rows of each octet (8, C) and their number (8,); the values of one leaf (C,). Then the open nodes from the root
-    down to the brick: what was written before each (BRICK_DEPTH + 1, 4), its children's states (BRICK_DEPTH, 8), and
-    the bounds ``low`` and ``high`` (BRICK_DEPTH + 1, 8, C) of their values; without a tolerance the bounds are equal,
-    and one array serves as both.
+    Of one brick:
+
+    - ``block`` (8 + 8 C, 8): rows; the first eight are the shared rows of the octets.
+    - ``octets`` (8 + 8 C,), ``classes`` (8 + 8 C,): octet and class of each row; ``octets`` starts with 0 to 7.
+    - ``flags`` (2, 64): flags of the cells.
+    - ``octet_rows`` (8, C), ``octet_sizes`` (8,): class rows of each octet, and their number.
+    - ``class_values`` (C,): values of one leaf.
+
+    Of the open nodes from the root down to the brick:
+
+    - ``before`` (BRICK_DEPTH + 1, 4): the totals before each node was written.
+    - ``states`` (BRICK_DEPTH, 8): states of each node's children.
+    - ``low``, ``high`` (BRICK_DEPTH + 1, 8, C): bounds of their values; one and the same array without a tolerance,
+      because the bounds are then equal.
     """
 
     block: Float32Array
@@ -77,9 +92,11 @@ class EncoderScratch(NamedTuple):
 
 @kernel
 def _copy_block(bricks, index, block, octets, classes):
-    """Copy a brick's rows to ``block`` (8 + 8 C, 8), all eight shared ones; one value is spelt out.
+    """Copy a brick's rows, with shared rows for all eight octets; returns the number of rows.
 
-    Returns the number of rows. Row r >= 8 holds the values of class ``classes[r]`` in octet ``octets[r]``.
+    - ``bricks``, ``index``: brick of an octree; it may be stored as one value.
+    - ``block`` (8 + 8 C, 8) float32: output, rows.
+    - ``octets``, ``classes`` (8 + 8 C,) int64: output from row 8 on, octet and class of each class row.
     """
     rows = OCTETS
     for w in range(bricks.masks.shape[1]):
@@ -106,10 +123,13 @@ def _copy_block(bricks, index, block, octets, classes):
 
 @kernel
 def _compare_cells(block, rows, octets, is_vector, changes):
-    """Masks of the cells whose classes differ, and of those that differ from the next cell of their octet.
+    """Return the masks of cells in which classes differ, and of cells that differ from the next cell of their octet.
 
-    ``block`` (8 + 8 C, 8) int32 are the bits of its values: what is no number equals itself. ``is_vector`` and
-    ``changes`` (64,) are scratch: comparing them cell by cell lets the loops run as vectors.
+    - ``block`` (8 + 8 C, 8) int32: bits of the values, so that a NaN equals itself.
+    - ``rows``: number of rows.
+    - ``octets`` (rows,) int64: octet of each row.
+    - ``is_vector``, ``changes`` (64,) uint8: scratch; one byte for each cell lets the loops compile to vector
+      instructions.
     """
     shared = block.reshape(block.size)
     for i in range(BRICK_CELLS):
@@ -129,22 +149,22 @@ def _compare_cells(block, rows, octets, is_vector, changes):
 
 
 @kernel
-def _whole_eights(mask):
-    """FIRST_CELLS of those eight sibling cells that are all in ``mask``."""
+def _uniform_octets(mask):
+    """Return the first cell of each octet that is completely in the ``mask`` uint64."""
     mask &= mask >> np.uint64(4)
     mask &= mask >> np.uint64(2)
     return mask & (mask >> ONE) & FIRST_CELLS
 
 
 @kernel
-def _middle(low, high):
-    """The middle of a range, exact where its ends are equal, and never -0."""
+def _midpoint(low, high):
+    """Midpoint of the range ``low`` to ``high`` float32; exact where both are equal, and never -0."""
     return low + (high - low) / np.float32(2.0) if high > low else low + NO_SIGN
 
 
 @kernel
 def _row_bounds(block, r):
-    """The lowest and the highest value of a row."""
+    """Return the lowest and the highest value of row ``r`` of ``block`` (k, 8) float32."""
     least = most = block[r, 0]
     for k in range(1, OCTETS):
         least = min(least, block[r, k])
@@ -154,7 +174,11 @@ def _row_bounds(block, r):
 
 @kernel
 def _class_bounds(block, rows, octets, classes, low, high):
-    """Bounds ``low`` and ``high`` (8, C) of each octet's values, class by class."""
+    """Find the bounds of each octet's values, class by class.
+
+    - ``block``, ``rows``, ``octets``, ``classes``: as left by _copy_block.
+    - ``low``, ``high`` (8, C) float32: output.
+    """
     for r in range(rows):
         least, most = _row_bounds(block, r)
         if r < OCTETS:
@@ -166,25 +190,34 @@ def _class_bounds(block, rows, octets, classes, low, high):
 
 @kernel
 def _smooth_octets(block, rows, octets, known, tolerance):
-    """Set the rows of each octet that is known and within the tolerance in all of them to the middle of their range."""
+    """Replace the rows of an octet by their midpoints if all its cells are known and all its rows are within tolerance.
+
+    - ``block``, ``rows``, ``octets``: as left by _copy_block; ``block`` in place.
+    - ``known`` uint64: known cells.
+    - ``tolerance``: float32, largest range of a row.
+    """
     apart = ZERO
     for r in range(rows):
         least, most = _row_bounds(block, r)
         e = np.uint64(octets[r])
-        is_known = (known >> (np.uint64(8) * e)) & EIGHT_CELLS == EIGHT_CELLS
+        is_known = (known >> (np.uint64(8) * e)) & FIRST_OCTET == FIRST_OCTET
         apart |= np.uint64(not (is_known and most - least <= tolerance)) << e
     for r in range(rows):
         if not (apart >> np.uint64(octets[r])) & ONE:
             least, most = _row_bounds(block, r)
             for k in range(OCTETS):
-                block[r, k] = _middle(least, most)
+                block[r, k] = _midpoint(least, most)
 
 
 @kernel
 def _write_leaf(class_values, place, values, masks, own_values, totals):
-    """Write the values (C,) of a leaf: the one that most classes have at ``place``; then mask and other values.
+    """Write a leaf: the value of most classes, then mask and other values; returns the number of other values.
 
-    They are compared bit by bit, so that what is no number equals itself. Returns how many have a value of their own.
+    Values are compared bit by bit, so that a NaN equals itself.
+
+    - ``class_values`` (C,) float32: values of the leaf.
+    - ``place``: position of the leaf in ``values``.
+    - ``values``, ``masks``, ``own_values``, ``totals``: stream; the number of values is not changed.
     """
     num_classes = class_values.size
     best, most = 0, 0
@@ -212,7 +245,13 @@ def _write_leaf(class_values, place, values, masks, own_values, totals):
 
 @kernel
 def _merge(depth, place, tolerance, before, low, high, class_values, values, masks, own_values, totals):
-    """Make the node at ``depth``, child ``place`` of its parent, one leaf if its bounds allow; returns its state."""
+    """Make a node one leaf if all its children are within tolerance; returns its state.
+
+    - ``depth``, ``place``: the node is child ``place`` of its parent at depth - 1; its children are at ``depth``.
+    - ``tolerance``: float32, largest difference of the leaves.
+    - ``before``, ``low``, ``high``, ``class_values``: of EncoderScratch.
+    - ``values``, ``masks``, ``own_values``, ``totals``: stream; cut back to its size before the node.
+    """
     for c in range(class_values.size):
         least, most = low[depth, 0, c], high[depth, 0, c]
         for k in range(1, 8):
@@ -221,7 +260,7 @@ def _merge(depth, place, tolerance, before, low, high, class_values, values, mas
         if most - least > tolerance:
             return CHILD_INNER
         low[depth - 1, place, c], high[depth - 1, place, c] = least, most
-        class_values[c] = _middle(least, most)
+        class_values[c] = _midpoint(least, most)
     for i in range(4):
         totals[i] = before[depth, i]
     num_own = _write_leaf(class_values, totals[1], values, masks, own_values, totals)
@@ -231,7 +270,7 @@ def _merge(depth, place, tolerance, before, low, high, class_values, values, mas
 
 @kernel
 def _interleave(low, high):
-    """A word whose even bits are the 8 bits of ``low`` and whose odd bits are those of ``high``."""
+    """Return the word with the 8 bits of ``low`` uint64 as even bits and those of ``high`` uint64 as odd bits."""
     x = low | high << np.uint64(32)
     x = (x | x << np.uint64(4)) & np.uint64(0x0F0F00000F0F)
     x = (x | x << np.uint64(2)) & np.uint64(0x333300003333)
@@ -243,17 +282,20 @@ def _interleave(low, high):
 def _write_words(known, starts, vector, words, totals):
     """Append the words of one brick that is not a leaf.
 
-    No branches: what is no word is overwritten by the next. Unsigned places need no check of their sign.
+    Free of branches: an entry that is no word is overwritten by the next one. Unsigned positions need no sign check.
+
+    - ``known``, ``starts``, ``vector`` uint64: masks of the brick.
+    - ``words``, ``totals``: stream.
     """
     word = ZERO
     place = np.uint64(totals[0] + 1)
     for e in range(8):
         shift = np.uint64(8 * e)
-        eight = (known >> shift) & EIGHT_CELLS
-        is_vector = (vector >> shift) & EIGHT_CELLS
-        is_leaf = np.uint64(eight == EIGHT_CELLS) & np.uint64((starts >> shift) & EIGHT_CELLS == ONE)
-        is_inner = np.uint64(eight != ZERO) & ~is_leaf
-        words[place] = _interleave(is_vector, eight)
+        octet_cells = (known >> shift) & FIRST_OCTET
+        is_vector = (vector >> shift) & FIRST_OCTET
+        is_leaf = np.uint64(octet_cells == FIRST_OCTET) & np.uint64((starts >> shift) & FIRST_OCTET == ONE)
+        is_inner = np.uint64(octet_cells != ZERO) & ~is_leaf
+        words[place] = _interleave(is_vector, octet_cells)
         place += is_inner
         word |= (is_inner | (is_leaf << ONE) | (is_leaf & is_vector)) << np.uint64(2 * e)
     words[totals[0]] = np.uint16(word)
@@ -265,9 +307,12 @@ def _write_vectors(
     block, rows, octets, classes, octet_rows, octet_sizes, class_values, starts, vector, values, masks, own_values,
     totals,
 ):  # fmt: skip
-    """Append the masks and other values of a brick's vector leaves, the first of which stands at ``totals[1]``.
+    """Append the masks and other values of a brick's vector leaves.
 
-    ``octet_rows``, ``octet_sizes`` and ``class_values`` are set.
+    - ``block``, ``rows``, ``octets``, ``classes``: as left by _copy_block.
+    - ``octet_rows``, ``octet_sizes``, ``class_values``: of EncoderScratch; overwritten.
+    - ``starts``, ``vector`` uint64: masks of the brick.
+    - ``values``, ``masks``, ``own_values``, ``totals``: stream; the brick's values start at ``totals[1]``.
     """
     num_classes = class_values.size
     for e in range(OCTETS):
@@ -295,7 +340,7 @@ def _write_vectors(
             totals[2] += 1
             totals[3] += num_own
             continue
-        # The shared value may not be the one that most classes have.
+        # The shared value may differ from that of most classes.
         for c in range(num_classes):
             class_values[c] = shared
         for j in range(octet_sizes[e]):
@@ -306,8 +351,8 @@ def _write_vectors(
 
 
 @kernel
-def _num_shared(code, other):
-    """How many nodes, from the root down, hold both of two bricks."""
+def _num_common_nodes(code, other):
+    """Number of nodes, from the root down, that contain both bricks with the Morton codes ``code`` and ``other``."""
     difference = (code ^ other) >> 3
     shared = BRICK_DEPTH
     while difference:
@@ -318,7 +363,7 @@ def _num_shared(code, other):
 
 @kernel
 def _word(states):
-    """The word of a node with these states (8,) of its children."""
+    """Return the word of a node whose children have the ``states`` (8,) uint8."""
     word = 0
     for k in range(8):
         word |= np.int64(states[k]) << (2 * k)
@@ -327,12 +372,20 @@ def _word(states):
 
 @kernel
 def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, values, masks, own_values, totals):
-    """Write the octree over the bricks ``order`` (n,), sorted by code, each with a known cell, depth-first.
+    """Write the octree over some bricks as a depth-first stream.
 
-    ``words`` gets 16 bits per inner node, two for each child; ``values``, ``masks`` and ``own_values`` the leaves.
-    There is room for more than is needed: one word, one leaf, one mask, and C values. Eight leaves that differ by at
-    most ``tolerance`` are one leaf; nothing is merged without ``prune``. ``totals`` (4,) counts what is written of
-    each, from 0. ``scratch`` is an EncoderScratch whose first octets are 0 to 7.
+    Loop invariant: the stream holds the bricks before ``n``. The words of the nodes that contain brick n - 1 and brick
+    n are still open: their places are reserved, and their children's states and bounds are in ``scratch``.
+
+    - ``bricks``: Bricks of the octree.
+    - ``order`` (n,) int64: brick indices in the order of their codes; each brick has a known cell.
+    - ``num_classes``: C.
+    - ``prune``: True where eight equal sibling leaves become one leaf.
+    - ``tolerance``: float32; siblings that differ by at most as much are equal.
+    - ``scratch``: EncoderScratch.
+    - ``words``, ``values``, ``masks``, ``own_values``: output, stream, with room for one word, one leaf, one mask and
+      C other values more than needed.
+    - ``totals`` (4,) int64: output from 0.
     """
     lossy = prune and tolerance > 0
     block, octets, classes, flags, octet_rows, octet_sizes, class_values, before, states, low, high = scratch
@@ -362,7 +415,7 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
                 _class_bounds(block, rows, octets, classes, low[BRICK_DEPTH], high[BRICK_DEPTH])
                 _smooth_octets(block, rows, octets, known, tolerance)
             vector, change = _compare_cells(block.view(np.int32), rows, octets, flags[0], flags[1])
-            merged = _whole_eights(known & (~change | LAST_CELLS)) if prune else ZERO
+            merged = _uniform_octets(known & (~change | LAST_CELLS)) if prune else ZERO
             if merged == FIRST_CELLS:
                 if not lossy:
                     _class_bounds(block, rows, octets, classes, low[BRICK_DEPTH], high[BRICK_DEPTH])
@@ -373,7 +426,7 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
                     own_values, totals,
                 )  # fmt: skip
             if state == CHILD_INNER:
-                starts = known & ~(merged * (EIGHT_CELLS - ONE))
+                starts = known & ~(merged * (FIRST_OCTET - ONE))
                 vector &= starts
                 _write_words(known, starts, vector, words, totals)
                 last = np.uint64(totals[1])
@@ -388,10 +441,10 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
                     )  # fmt: skip
                 totals[1] = np.int64(last)
         states[BRICK_DEPTH - 1, place] = state
-        # The nodes that the next brick is not in are complete; the root always stays a node.
+        # Nodes that do not contain the next brick are complete; the root is never merged.
         shared = 1
         if n + 1 < order.size:
-            shared = _num_shared(code, bricks.codes[order[n + 1]])
+            shared = _num_common_nodes(code, bricks.codes[order[n + 1]])
         for depth in range(BRICK_DEPTH - 1, shared - 1, -1):
             word = _word(states[depth])
             place = (code >> (3 * (BRICK_DEPTH - depth))) & 7
@@ -408,17 +461,17 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
 
 
 @kernel
-def _gather(word):
-    """The even bits of a word, as 8 bits."""
+def _even_bits(word):
+    """Return the even bits of ``word`` uint64 as 8 bits."""
     x = word & np.uint64(0x5555)
     x = (x | x >> ONE) & np.uint64(0x3333)
     x = (x | x >> np.uint64(2)) & np.uint64(0x0F0F)
-    return (x | x >> np.uint64(4)) & EIGHT_CELLS
+    return (x | x >> np.uint64(4)) & FIRST_OCTET
 
 
 @kernel
 def _read_brick(words, used):
-    """The masks known, starts and vector of the brick with word ``used``, and the next word; 0 for malformed words."""
+    """Return the masks known, starts and vector of the brick with word ``used``, and the next word; 0 if malformed."""
     known, starts, vector = ZERO, ZERO, ZERO
     word = np.uint64(words[used])
     used += 1
@@ -428,17 +481,17 @@ def _read_brick(words, used):
         if state == np.uint64(CHILD_INNER):
             if used == words.size:
                 return known, starts, vector, 0
-            is_vector = _gather(np.uint64(words[used]))
-            eight = _gather(np.uint64(words[used]) >> ONE)
+            is_vector = _even_bits(np.uint64(words[used]))
+            octet_cells = _even_bits(np.uint64(words[used]) >> ONE)
             used += 1
-            # A finest cell is no inner node.
-            if is_vector & ~eight:
+            # A finest cell cannot be an inner node.
+            if is_vector & ~octet_cells:
                 return known, starts, vector, 0
-            known |= eight << shift
-            starts |= eight << shift
+            known |= octet_cells << shift
+            starts |= octet_cells << shift
             vector |= is_vector << shift
         elif state:
-            known |= EIGHT_CELLS << shift
+            known |= FIRST_OCTET << shift
             starts |= ONE << shift
             vector |= (state & ONE) << shift
     return known, starts, vector, used
@@ -446,14 +499,21 @@ def _read_brick(words, used):
 
 @kernel
 def read_words(words, path, codes, spans, known, starts, vector):
-    """The bricks of a depth-first octree: code, number of bricks from there on, and the three masks, (L,) each.
+    """Read the bricks of a stream; returns the number of entries, -1 where the words are no octree of at most L leaves.
 
-    Only a leaf is larger than a brick. Returns the number of entries, or -1 when the words are no octree with at most
-    L leaves. ``path`` (3, BRICK_DEPTH) int64 is set.
+    Only leaves are larger than a brick.
+
+    Loop invariant: ``path[:, : depth + 1]`` are the open nodes, and the outputs hold all bricks before the next child
+    of the last one.
+
+    - ``words`` uint16: of the stream.
+    - ``path`` (3, BRICK_DEPTH) int64: scratch; word, next child and first brick's code of each open node.
+    - ``codes`` (L,) int64: output, Morton code of the first brick of each entry.
+    - ``spans`` (L,) int64: output, number of bricks of each entry.
+    - ``known``, ``starts``, ``vector`` (L,) uint64: output, masks of each entry.
     """
     if words.size == 0:
         return 0
-    # The open nodes from the root down: word, next child, and code of the first brick.
     path_word, path_child, path_code = path[0], path[1], path[2]
     path_word[0], path_child[0], path_code[0] = words[0], 0, 0
     depth = 0
@@ -498,9 +558,11 @@ def read_words(words, path, codes, spans, known, starts, vector):
 
 @kernel
 def read_class_masks(entries, masks, class_masks):
-    """Which classes have values of their own in each octet of the bricks that ``read_words`` gave: ``class_masks``.
+    """Find the class rows of the bricks of a stream; returns the number of rows that they take.
 
-    They are (n, W), from 0; ``masks`` (V, W) are those of the vector leaves. Returns the rows that the bricks take.
+    - ``entries``: arrays (n,) filled by read_words.
+    - ``masks`` (V, W) uint8: of the stream.
+    - ``class_masks`` (n, W) uint64: output from 0, class rows of each entry.
     """
     leaf = 0
     total = 0
@@ -520,15 +582,21 @@ def read_class_masks(entries, masks, class_masks):
 
 @kernel
 def _fill_shared(bricks, block, known, starts, values, first):
-    """Write the shared values of a block from its leaves' values, from ``first`` on; returns the number of leaves."""
+    """Write the shared rows of a block; returns the number of its leaves.
+
+    - ``bricks``: Bricks, in place.
+    - ``block``: first row of the block.
+    - ``known``, ``starts`` uint64: masks of the brick.
+    - ``values`` float32, ``first``: of the stream; the brick's leaves start at ``first``.
+    """
     count, row = ZERO, block
     for e in range(OCTETS):
-        cells = (known >> np.uint64(8 * e)) & EIGHT_CELLS
+        cells = (known >> np.uint64(8 * e)) & FIRST_OCTET
         if cells == ZERO:
             continue
         for k in range(OCTETS):
             count += (starts >> np.uint64(8 * e + k)) & ONE
-            # The last leaf that started.
+            # The leaf that contains the cell is the last one that started.
             value = values[first + max(count, ONE) - ONE]
             bricks.rows[row, k] = value if (cells >> np.uint64(k)) & ONE else np.float32(0.0)
         row += 1
@@ -536,10 +604,13 @@ def _fill_shared(bricks, block, known, starts, values, first):
 
 
 @kernel
-def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
-    """Write the rows of single classes of a brick from its vector leaves, from ``leaf`` and value ``first`` on.
+def _fill_class_rows(bricks, index, entries, n, masks, leaf, own_values, first):
+    """Write the class rows of a brick; returns the positions of the next vector leaf and other value.
 
-    Returns the next leaf and value.
+    - ``bricks``, ``index``: brick, in place.
+    - ``entries``, ``n``: entry of the brick.
+    - ``masks`` (V, W) uint8, ``leaf``: of the stream; the brick's vector leaves start at ``leaf``.
+    - ``own_values`` float32, ``first``: of the stream; the brick's other values start at ``first``.
     """
     block = np.int64(bricks.blocks[index])
     present = octets_of(entries.known[n])
@@ -560,7 +631,7 @@ def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
         vector &= vector - ONE
         # The leaf is the whole brick, an octet or a cell.
         shift = i & ~np.uint64(7)
-        is_octet = (starts >> shift) & EIGHT_CELLS == ONE and (known >> shift) & EIGHT_CELLS == EIGHT_CELLS
+        is_octet = (starts >> shift) & FIRST_OCTET == ONE and (known >> shift) & FIRST_OCTET == FIRST_OCTET
         first_bit, end_bit = (ZERO, np.uint64(64)) if is_leaf else (shift, shift + ONE)
         first_cell, end_cell = (0, OCTETS) if is_octet else (np.int64(i & np.uint64(7)), np.int64(i & np.uint64(7)) + 1)
         before = 0
@@ -582,9 +653,16 @@ def _fill_own(bricks, index, entries, n, masks, leaf, own_values, first):
 
 @kernel
 def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_values):
-    """Write the bricks that ``read_words`` gave (n,) into an octree without bricks. Room must be there.
+    """Write the bricks of a stream into an octree without bricks. Needs room for bricks and rows.
 
-    ``class_masks`` (n, W) are those of ``read_class_masks``.
+    Loop invariant: the entries before ``n`` are written; ``first_value``, ``first_leaf`` and ``first_own`` are the
+    positions of the next entry's leaf, vector leaf and other value in the stream.
+
+    - ``bricks``: Bricks, in place.
+    - ``entries``: arrays (n,) filled by read_words.
+    - ``class_masks`` (n, W) uint64: class rows found by read_class_masks.
+    - ``num_classes``: C.
+    - ``values`` (L,) float32, ``masks`` (V, W) uint8, ``own_values`` float32: of the stream.
     """
     first_value, first_leaf, first_own = ZERO, 0, 0
     for n in range(entries.codes.size):
@@ -602,7 +680,9 @@ def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_va
             if entries.vector[n]:
                 for w in range(class_masks.shape[1]):
                     bricks.masks[index, w] = class_masks[n, w]
-                next_leaf, next_own = _fill_own(bricks, index, entries, n, masks, first_leaf, own_values, first_own)
+                next_leaf, next_own = _fill_class_rows(
+                    bricks, index, entries, n, masks, first_leaf, own_values, first_own
+                )
                 share_first_class(bricks.rows, block, entries.known[n], bricks.masks, index, num_classes)
         first_value += num_leaves
         first_leaf, first_own = next_leaf, next_own
@@ -610,16 +690,22 @@ def fill_bricks(bricks, entries, class_masks, num_classes, values, masks, own_va
 
 @kernel
 def _slot(number):
-    """The slot, 1 to SLOTS - 1, in which a number of at most 32 bits stands when it is a recent one."""
+    """Return the slot, 1 to SLOTS - 1, of ``number`` (at most 32 bits)."""
     return max(np.int64((np.uint64(number) * np.uint64(0x9E3779B1)) >> np.uint64(24)) & (SLOTS - 1), 1)
 
 
 @kernel
 def write_codes(numbers, recent, codes, literals):
-    """Write the slot in which each number (n,) uint32 already stands as its code (n,), or 0 and its bytes as a literal.
+    """Write numbers as codes and literals; returns the number of literals.
 
-    ``recent`` (SLOTS,) uint32 are the numbers in the slots, from 0. ``literals`` (4, n) get their bytes, the lowest
-    first; returns their number. No branches: what is no literal is overwritten by the next.
+    Free of branches: an entry that is no literal is overwritten by the next one.
+
+    Loop invariant: ``recent`` holds the last number of each slot among those before ``i``, as in read_codes.
+
+    - ``numbers`` (n,) uint32.
+    - ``recent`` (SLOTS,) uint32: scratch from 0, numbers in the slots.
+    - ``codes`` (n,) uint8: output, slot of the number if it is there, else 0.
+    - ``literals`` (4, n) uint8: output, bytes of the numbers with code 0, lowest byte first.
     """
     count = 0
     for i in range(numbers.size):
@@ -638,9 +724,14 @@ def write_codes(numbers, recent, codes, literals):
 
 @kernel
 def read_codes(codes, literals, recent, numbers):
-    """The ``numbers`` (n,) uint32 of which ``write_codes`` made the codes (n,) and the literals.
+    """Read the numbers that write_codes wrote.
 
-    ``recent`` is from 0, and ``literals`` (4, at least 1 + the codes that are 0).
+    Loop invariant: ``recent`` holds the last number of each slot among those before ``i``, as in write_codes.
+
+    - ``codes`` (n,) uint8.
+    - ``literals`` (4, at least 1 + number of codes 0) uint8.
+    - ``recent`` (SLOTS,) uint32: scratch from 0, numbers in the slots.
+    - ``numbers`` (n,) uint32: output.
     """
     count = 0
     for i in range(codes.size):

@@ -1,8 +1,10 @@
-"""Ratio consensus with running sums, brick by brick: what a robot gives, what it takes, and the map that follows.
+"""Ratio consensus with running sums, brick by brick: shares that are sent, differences that are received, maps.
 
-Masses and their running sums are integers modulo 2^30 that stand in the place of an octree's float32 values, as their
-bits: 0 to 2^30 - 1 are the non-negative floats below 2, so none is a NaN or -0. Many are denormal; they are moved as
-floats and computed with as integers only.
+Masses and running sums are integers modulo 2^30, stored as the bits of an octree's float32 values: 0 to 2^30 - 1 are
+the bits of the non-negative floats below 2, so none is a NaN or -0. Many are denormal, so they are copied as floats and
+computed with as integers only.
+
+In shapes, R is the number of robots, n of bricks, C of classes, and W = ceil(C / 8) of mask words.
 """
 
 from __future__ import annotations
@@ -21,43 +23,49 @@ SIGN_SHIFT = np.int32(32 - NUM_BITS)
 UNITS_PER_LOG_ODDS = np.float32(1 << 17)
 
 TARGET, SOURCE = 0, 1
-"""Columns of a table with two: the octree whose layout the other takes, and what it is made from."""
+"""Columns of a table of two octrees: the one that has the layout, and the one that is brought into it."""
 
 NUM_SCRATCH_BLOCKS = 3
-"""Blocks that a kernel works in, one for each octree that may have another layout."""
+"""Scratch blocks of a kernel, one for each octree that may have another layout."""
 
 PREFETCH_AHEAD = 4
+"""Number of bricks between the prefetched one and the current one."""
 
 
 @inline_kernel
 def _signed(bits):
-    """The number from -2^29 to 2^29 - 1 that equals ``bits`` modulo 2^30. Int32 must be said: numba widens sums."""
+    """Return the number from -2^29 to 2^29 - 1 that equals ``bits`` int32 modulo 2^30. Without casts numba widens."""
     return np.int32(np.int32(bits << SIGN_SHIFT) >> SIGN_SHIFT)
 
 
 @inline_kernel
 def _units(log_odds):
-    """A float32 log-odds in units, rounded to nearest, ties to even."""
+    """Return a float32 log-odds in units, rounded to nearest, ties to even."""
     return np.int32(np.rint(log_odds * UNITS_PER_LOG_ODDS))
 
 
 @inline_kernel
 def _integers(address, size):
-    """The int32 array (size,) at an address."""
+    """Return the int32 array (size,) at an address."""
     return float_array(address, (size,)).view(np.int32)
 
 
 @inline_kernel
 def _prefetch_ahead(table, b, column):
-    """Ask for a brick of an octree that comes soon."""
+    """Prefetch the brick PREFETCH_AHEAD bricks after ``b`` in ``column`` of ``table``."""
     prefetch(table, min(b + PREFETCH_AHEAD, table.known.shape[1] - 1), column)
 
 
 @kernel
 def _share_rows(mass_at, total_at, size, num_receivers):
-    """Move the shares of so many receivers from a mass (size,), and one of them into the sum; the largest share."""
+    """Take the shares of all receivers from a mass and add one of them to its running sum; returns the largest |share|.
+
+    - ``mass_at``, ``total_at``: addresses of the mass and the running sum (size,) int32, both in place.
+    - ``size``: number of values.
+    - ``num_receivers``: number of shares.
+    """
     mass, total = _integers(mass_at, size), _integers(total_at, size)
-    # The float64 quotient of such small integers lies on the same side of each half as the exact one.
+    # For integers this small, rounding the float64 quotient gives the same result as rounding the exact one.
     parts, receivers = np.float64(num_receivers + 1), np.int32(num_receivers)
     largest = np.int32(0)
     for i in range(size):
@@ -70,10 +78,17 @@ def _share_rows(mass_at, total_at, size, num_receivers):
 
 @kernel
 def share_out(table, layout, known, num_receivers, num_classes, scratch, shares):
-    """Move shares from a mass, the table's SOURCE, and add one to its running sum, the TARGET, both in place.
+    """Take the shares of all receivers from a mass and add one of them to its running sum, both in place.
 
-    ``layout`` (n, W) and ``known`` (n,) are the sum's, which hold the mass's. ``shares`` (n,) int32 get the largest
-    |share| of each brick. What is one value is left in the table.
+    Loop invariant: bricks before ``b`` of both octrees are updated. The layout includes that of the mass. Where a brick
+    is one value, its new value is written to ``table``.
+
+    - ``table``: BrickTable (2, n) of the running sum (TARGET) and the mass (SOURCE).
+    - ``layout`` (n, W) uint64, ``known`` (n,) uint64: class rows and known cells of the running sum.
+    - ``num_receivers``: number of shares.
+    - ``num_classes``: C.
+    - ``scratch`` float32: room for NUM_SCRATCH_BLOCKS blocks with all rows.
+    - ``shares`` (n,) int32: output, largest |share| of each brick [unit].
     """
     room = (num_classes + 1) * BRICK_CELLS * 4
     mass_scratch = np.int64(scratch.ctypes.data)
@@ -93,14 +108,20 @@ def share_out(table, layout, known, num_receivers, num_classes, scratch, shares)
         if table.addresses[SOURCE, b] == 0:
             table.values[SOURCE, b] = float_array(mass_at, (size,))[0]
         elif mass_at == mass_scratch:
-            # The sum has other rows: what left the copy leaves the mass itself too.
+            # The running sum has another layout, so the shares were taken from a copy of the mass.
             own_size = num_rows(table.known[SOURCE, b], table.masks[SOURCE], b) * OCTETS
             _share_rows(table.addresses[SOURCE, b], unused_at, own_size, num_receivers)
 
 
 @kernel
 def _add_rows(mass_at, new_at, old_at, size, of_evidence):
-    """Mass (size,) += new - old, which are sums or else log-odds; whether any value differs."""
+    """Add new - old to a mass; returns True if any value differs.
+
+    - ``mass_at``: address of the mass (size,) int32, in place.
+    - ``new_at``, ``old_at``: addresses of the new and old values (size,).
+    - ``size``: number of values.
+    - ``of_evidence``: True where the values are float32 log-odds, False where they are int32 running sums.
+    """
     mass, different = _integers(mass_at, size), np.int32(0)
     if of_evidence:
         now, last = float_array(new_at, (size,)), float_array(old_at, (size,))
@@ -121,13 +142,20 @@ def _add_rows(mass_at, new_at, old_at, size, of_evidence):
 def add_differences(
     start, end, table, columns, first_columns, of_evidence, layouts, known, num_classes, scratch, is_changed
 ):
-    """Add differences to the masses of R robots, brick by brick for all of them, in place.
+    """Add differences to the masses of R robots, in place.
 
-    ``table`` says where the bricks ``start`` to ``end`` lie. Robot r's ``columns`` of it are those from
-    ``first_columns[r]`` to ``first_columns[r + 1]``: its mass, then new, old, new, old, ..., which are running sums, or
-    log-odds if ``of_evidence``. ``layouts`` (R n, W) and ``known`` (R n,) are those of the masses, which hold those of
-    all the robot's columns. ``is_changed`` (R, n) float32 is 1 where a difference is not 0. What is one value is left
-    in the table.
+    Loop invariant: all robots' bricks before ``b`` are updated. The layout of a mass includes those of all the robot's
+    columns. Where a brick is one value, its new value is written to ``table``.
+
+    - ``start``, ``end``: bricks of the table, ``end`` excluded.
+    - ``table``: BrickTable of all octrees, (J, n).
+    - ``columns`` int64: columns of the table, robot by robot: its mass, then new, old, new, old, ...
+    - ``first_columns`` (R + 1,) int64: robot r has the entries ``first_columns[r]`` to ``first_columns[r + 1]``.
+    - ``of_evidence``: True where new and old are float32 log-odds, False where they are running sums.
+    - ``layouts`` (R n, W) uint64, ``known`` (R n,) uint64: class rows and known cells of the masses.
+    - ``num_classes``: C.
+    - ``scratch`` float32: room for NUM_SCRATCH_BLOCKS blocks with all rows.
+    - ``is_changed`` (R, n) float32: output, 1 where a difference is not 0, else 0.
     """
     room = (num_classes + 1) * BRICK_CELLS * 4
     mass_scratch = np.int64(scratch.ctypes.data)
@@ -155,10 +183,19 @@ def add_differences(
 
 @kernel
 def recover(table, layout, known, scale, tolerance, num_classes, scratch, changes, is_even):
-    """Write the mass in the table's SOURCE times ``scale`` into the map in its TARGET, if it differs by ``tolerance``.
+    """Write mass x ``scale`` into a map where a value differs by more than ``tolerance``.
 
-    ``layout`` (n, W) and ``known`` (n,) are the map's, which hold the mass's. ``changes`` (n,) get the largest changes,
-    ``is_even`` (n,) where all values are equal then. What is one value is left in the table.
+    Loop invariant: bricks before ``b`` of the map are written. The layout includes that of the mass. Where a brick is
+    one value, its new value is written to ``table``.
+
+    - ``table``: BrickTable (2, n) of the map (TARGET) and the mass (SOURCE).
+    - ``layout`` (n, W) uint64, ``known`` (n,) uint64: class rows and known cells of the map.
+    - ``scale``: float64, log-odds of one unit of the mass.
+    - ``tolerance``: float32 [log-odds].
+    - ``num_classes``: C.
+    - ``scratch`` float32: room for NUM_SCRATCH_BLOCKS blocks with all rows.
+    - ``changes`` (n,) float32: output, largest change of each brick [log-odds].
+    - ``is_even`` (n,) bool: output, True where a changed brick's values are all equal.
     """
     room = (num_classes + 1) * BRICK_CELLS * 4
     map_scratch = np.int64(scratch.ctypes.data)
@@ -171,7 +208,7 @@ def recover(table, layout, known, scale, tolerance, num_classes, scratch, change
         size = num_rows(known[b], layout, b) * OCTETS
         mass = _integers(rows_at(table, b, SOURCE, layout, known, b, map_scratch + room, num_classes), size)
         values = float_array(rows_at(table, b, TARGET, layout, known, b, map_scratch, num_classes), (size,))
-        # Numbers that are not negative are in the order of their bits.
+        # The bits of non-negative floats have the order of the floats.
         largest = np.int32(0)
         for i in range(size):
             value = np.float32(np.float64(_signed(mass[i])) * scale)

@@ -1,4 +1,4 @@
-"""Acknowledgements: what a robot has of others' maps, as bytes. docs/packet-format.md describes every byte."""
+"""Bytes of acknowledgements: the versions of maps that a robot holds (format: docs/packet-format.md)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ VERSION = 1
 _HEADER = struct.Struct("<4sBBH")
 """magic, version, 0, number of entries."""
 _ENTRY = struct.Struct("<HIBI")
-"""origin, epoch, whether there is a map, its version."""
+"""origin, epoch, 1 for a map and 0 for none, version."""
 _CHECKSUM = struct.Struct("<I")
 
 
 class Possession(NamedTuple):
-    """Which version of a map a robot has: the map of robot ``origin`` in its life ``epoch``; None where it has none."""
+    """Version that a robot holds of the map of robot ``origin`` in its restart epoch ``epoch``; None: no version."""
 
     origin: int
     epoch: int
@@ -28,7 +28,7 @@ class Possession(NamedTuple):
 
 
 def encode_acknowledgement(entries: Sequence[Possession]) -> bytes:
-    """The bytes of an acknowledgement."""
+    """Encode an acknowledgement."""
     data = _HEADER.pack(MAGIC, VERSION, 0, len(entries)) + b"".join(
         _ENTRY.pack(origin, epoch, version is not None, version or 0) for origin, epoch, version in entries
     )
@@ -36,7 +36,7 @@ def encode_acknowledgement(entries: Sequence[Possession]) -> bytes:
 
 
 def decode_acknowledgement(data: bytes) -> tuple[Possession, ...]:
-    """The entries of an acknowledgement. Raises PacketError for anything that is not a whole one."""
+    """Decode an acknowledgement. Raises PacketError where it is damaged or of an unknown format."""
     end = len(data) - _CHECKSUM.size
     if end < _HEADER.size or data[:4] != MAGIC:
         raise PacketError("not an acknowledgement")
@@ -44,10 +44,10 @@ def decode_acknowledgement(data: bytes) -> tuple[Possession, ...]:
         raise PacketError("acknowledgement damaged: its checksum does not match")
     _, version, zero, count = _HEADER.unpack_from(data)
     if version != VERSION or zero or end != _HEADER.size + count * _ENTRY.size:
-        raise PacketError("acknowledgement of a format that this octoreplay does not know")
+        raise PacketError("acknowledgement of an unknown format version")
     found = []
     for origin, epoch, has_map, number in _ENTRY.iter_unpack(data[_HEADER.size : end]):
         if has_map > 1:
-            raise PacketError("acknowledgement of a format that this octoreplay does not know")
+            raise PacketError("acknowledgement of an unknown format version")
         found.append(Possession(origin, epoch, number if has_map else None))
     return tuple(found)

@@ -6,11 +6,12 @@ import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.streams import TreeStreams
 
 
 class Source(NamedTuple):
-    """Whose map: a robot's index, and which of its lives."""
+    """Origin of a map: a robot's index and its restart epoch."""
 
     origin: int
     epoch: int
@@ -18,10 +19,10 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeldMap:
-    """A state of a robot's map, at the robot itself or at another; never changed once it is here.
+    """Immutable state of a robot's map, at the robot itself or at another.
 
     All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio',
-    ``streams`` are those of the octree where they are there already.
+    ``streams`` the octree's streams if they are computed already.
     """
 
     octree: SemanticOctree
@@ -31,15 +32,15 @@ class HeldMap:
 
 
 def _with_flipped_bit(data: bytes, place: int) -> bytes:
-    """A copy with the lowest bit of one byte flipped."""
+    """Copy with the lowest bit of the byte at ``place`` flipped."""
     return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
 
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
-    """One packet of a message, and what a receiver that can use it has afterwards, decoded once for all receivers.
+    """One packet of a message.
 
-    Without ``held`` the receiver decodes the packet itself.
+    ``held`` is the state of the map after the packet, shared by the sender; None: receivers decode the packet.
     """
 
     data: bytes
@@ -50,7 +51,7 @@ class MapPart:
 
 @dataclass(frozen=True, eq=False)
 class MapMessage:
-    """Packets of one or more robots' maps that travel together."""
+    """Packets of the maps of one or more robots in one message. It waits while its link is busy."""
 
     parts: tuple[MapPart, ...]
 
@@ -58,11 +59,11 @@ class MapMessage:
 
     @property
     def num_bytes(self) -> int:
-        """Length of its packets [bytes]."""
+        """Length of the packets [bytes]."""
         return sum(len(part.data) for part in self.parts)
 
     def damaged(self, share: float) -> MapMessage:
-        """The same message with one bit flipped, ``share`` in [0, 1) of the way through."""
+        """Copy with one bit flipped, at the fraction ``share`` in [0, 1) of the message."""
         place = int(share * self.num_bytes)
         parts = list(self.parts)
         for index, part in enumerate(parts):
@@ -75,7 +76,7 @@ class MapMessage:
 
 @dataclass(frozen=True)
 class Acknowledgement:
-    """What a robot has of some maps after a message."""
+    """Versions of maps that a robot holds after a message. It is sent beside the queue of its link."""
 
     data: bytes
 
@@ -87,7 +88,7 @@ class Acknowledgement:
         return len(self.data)
 
     def damaged(self, share: float) -> Acknowledgement:
-        """The same with one bit flipped, ``share`` in [0, 1) of the way through."""
+        """Copy with one bit flipped, at the fraction ``share`` in [0, 1) of the packet."""
         return Acknowledgement(_with_flipped_bit(self.data, int(share * len(self.data))))
 
 
@@ -96,7 +97,7 @@ Content: TypeAlias = MapMessage | Acknowledgement
 
 @dataclass
 class Receipt:
-    """What became of a message's packets at its receiver, and the maps that it brought anything new of."""
+    """Result of receiving messages: maps with a new version, and numbers of packets that were not used."""
 
     fresh: list[Source] = dataclasses.field(default_factory=list)
     num_stale: int = 0
@@ -104,7 +105,7 @@ class Receipt:
     num_damaged: int = 0
 
     def add(self, other: Receipt) -> None:
-        """Count another message's packets too."""
+        """Add the receipt of another message."""
         self.fresh += other.fresh
         self.num_stale += other.num_stale
         self.num_gaps += other.num_gaps

@@ -1,53 +1,63 @@
-"""What robots send each other, and what each has of the others' maps.
+"""Exchange of maps by one robot: maps that it holds, and versions that its neighbours hold.
 
-A map that a robot gives away has a linear history: its *version* is the tick in which it was published, and every brick
-carries as its revision the tick in which it got its value, so that the bricks with revisions from ``base`` on are those
-that changed after version ``base``. A delta from ``base`` to ``version`` holds all of them, whole. Applied to any state
-from ``base`` on it gives the map of ``version``, whatever was lost, repeated or overtaken before; applied to an older
-one it would not, and is refused: that is the gap after which only a delta with an older base, or a whole map, helps.
-A robot that forgot everything starts another life (``epoch``), whose maps are other maps.
+A published map has a linear history. Its *version* is the tick in which it was published. Each brick's *revision* is
+the tick in which the brick got its value, so that the bricks with revisions from ``base`` on are those that changed
+after version ``base``. A delta from ``base`` to ``version`` holds all of these bricks. Applied to any state from
+``base`` on, it gives the map of ``version``, in spite of lost, repeated and reordered packets before. An older state
+cannot use it: this is a *gap*, and the receiver needs a delta with an older base, or a full map. A robot that restarts
+without memory begins a new ``epoch``, whose maps have a history of their own.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
 from octoreplay.config.packets import PacketConfig
 from octoreplay.errors import PacketError
-from octoreplay.mapping import codec
-from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.acknowledgement import Possession, decode_acknowledgement, encode_acknowledgement
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, MapPart, Receipt, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec, PacketStamp
 
 NOTHING = 0
-"""The base of a delta that builds on nothing; versions are greater."""
+"""Base of a delta that holds every brick; all versions are greater."""
 
 
 class Exchange:
-    """One robot's side of the exchange: the maps that it has, and what each neighbour is known to have.
+    """Maps that one robot holds, and versions that its neighbours are known to hold.
 
-    Only newer states replace older ones, and only packets whose bases are here are applied. Without acknowledgements
-    a delta's base is what the last packet to that neighbour held, and every so many packets are whole maps.
+    A newer state replaces an older one. A delta is applied only if its base is held. Without acknowledgements the base
+    of a delta is the version of the last packet to that neighbour, and every ``key_frame_every``-th packet is a full
+    map.
     """
 
-    def __init__(self, config: PacketConfig, encoder: PacketEncoder) -> None:
-        self.held: dict[Source, HeldMap] = {}
+    def __init__(self, config: PacketConfig, packet_codec: PacketCodec) -> None:
+        self._held: dict[Source, HeldMap] = {}
         self._config = config
-        self._encoder = encoder
+        self._codec = packet_codec
         self._known: dict[tuple[int, Source], int] = {}
         self._num_sent: dict[int, int] = {}
         self._epochs: dict[int, int] = {}
 
+    @property
+    def held(self) -> Mapping[Source, HeldMap]:
+        """Newest state of each map that is here, the robot's own published one included; read-only."""
+        return MappingProxyType(self._held)
+
+    def hold(self, source: Source, held: HeldMap) -> None:
+        """Store a state of the robot's own map, to be sent by ``outbox``."""
+        self._held[source] = held
+
     def outbox(
         self, receivers: Sequence[int], sources: Sequence[Source], *, keep_alive: bool
     ) -> list[tuple[tuple[int, ...], MapMessage]]:
-        """What to send to whom in this tick, of the maps ``sources``; the same message goes to several where it can.
+        """Messages of this tick with the maps ``sources``; receivers with equal needs share a message.
 
-        A neighbour that is known to have a map's state gets nothing of it, or with ``keep_alive`` an empty delta.
+        A neighbour that is known to hold a map's newest version gets no packet of it, or with ``keep_alive`` an empty
+        delta.
         """
         if not receivers:
             return []
@@ -68,46 +78,46 @@ class Exchange:
             outgoing.append((tuple(group), message))
             if self._config.packets == "delta" and not self._config.acknowledge:
                 for receiver in group:
-                    self._known.update({(receiver, p.source): self.held[p.source].version for p in message.parts})
+                    self._known.update({(receiver, p.source): self._held[p.source].version for p in message.parts})
         return outgoing
 
     def receive(self, sender: int, message: MapMessage) -> tuple[Receipt, Acknowledgement | None]:
-        """Take in a message; what became of its packets, and what to answer."""
+        """Store the maps of a message; its receipt, and the acknowledgement to send (None: none)."""
         receipt = Receipt()
         answers: dict[Source, Possession] = {}
         for part in message.parts:
             try:
                 source, version, base = self._stamp(part)
-                mine = self.held.get(source)
+                mine = self._held.get(source)
                 if mine is not None and mine.version >= version:
                     receipt.num_stale += 1
                 elif base is not None and (mine.version if mine else NOTHING) < base:
                     receipt.num_gaps += 1
                 else:
-                    self.held[source] = part.held or self._decoded(part.data, version, mine)
+                    self._held[source] = part.held or self._codec.state(part.data, mine)
                     receipt.fresh.append(source)
             except PacketError:
                 receipt.num_damaged += 1
                 continue
             if source.origin == sender and source.epoch > self.epoch_of(sender):
-                # The sender started anew, and has nothing of what it had.
+                # The sender restarted without memory.
                 self._epochs[sender] = source.epoch
                 self._known = {key: known for key, known in self._known.items() if key[0] != sender}
             if source.origin != sender or source.epoch == self.epoch_of(sender):
-                # Who sends a state has it.
+                # The sender of a version holds it.
                 self._learn(sender, source, version)
-            held = self.held.get(source)
+            held = self._held.get(source)
             answers[source] = Possession(*source, held.version if held else None)
         if not answers or self._config.packets != "delta" or not self._config.acknowledge:
             return receipt, None
         return receipt, Acknowledgement(encode_acknowledgement(list(answers.values())))
 
     def epoch_of(self, robot: int) -> int:
-        """The newest life of a robot that was heard of from itself."""
+        """Newest restart epoch that a robot has sent itself."""
         return self._epochs.get(robot, 0)
 
     def acknowledged(self, sender: int, answer: Acknowledgement) -> None:
-        """Take note of what a neighbour has; a damaged answer says nothing."""
+        """Note the versions that a neighbour holds; a damaged acknowledgement is ignored."""
         with contextlib.suppress(PacketError):
             for origin, epoch, version in decode_acknowledgement(answer.data):
                 if version is None:
@@ -116,11 +126,11 @@ class Exchange:
                     self._learn(sender, Source(origin, epoch), version)
 
     def _learn(self, neighbour: int, source: Source, version: int) -> None:
-        """A neighbour has at least this version of a map."""
+        """Note that a neighbour holds at least this version of a map."""
         self._known[neighbour, source] = max(version, self._known.get((neighbour, source), version))
 
     def _bases(self, receiver: int, sources: Sequence[Source], keep_alive: bool) -> dict[Source, int | None]:
-        """The maps to send a neighbour, and the version that each packet builds on (None: a whole map)."""
+        """Maps to send to a neighbour, each with the base of its packet (None: a full map)."""
         is_delta = self._config.packets == "delta"
         is_key_frame = not self._config.acknowledge and self._num_sent[receiver] % self._config.key_frame_every == 0
         bases: dict[Source, int | None] = {}
@@ -129,14 +139,14 @@ class Exchange:
             if known is None or not is_delta or is_key_frame:
                 bases[source] = None
             else:
-                bases[source] = min(known, self.held[source].version)
-            is_there = known is not None and known >= self.held[source].version
+                bases[source] = min(known, self._held[source].version)
+            is_there = known is not None and known >= self._held[source].version
             if is_there and not keep_alive and not (is_delta and is_key_frame):
                 del bases[source]
         return bases
 
     def _oldest(self, bases: Iterable[Mapping[Source, int | None]]) -> dict[Source, int | None]:
-        """What serves all of several neighbours."""
+        """Bases that every one of several neighbours can use."""
         merged: dict[Source, int | None] = {}
         for of_receiver in bases:
             for source, base in of_receiver.items():
@@ -145,12 +155,9 @@ class Exchange:
         return merged
 
     def _parts(self, bases: Sequence[tuple[Source, int | None]], turn: int) -> list[MapPart]:
-        """The packets of a message; where a budget leaves room for some only, the sources take turns."""
+        """Packets of a message; with a budget the sources take turns in being first."""
         if self._config.budget is None:
-            return [
-                MapPart(self._encoder.packet(source, self.held[source], base), source, base, self.held[source])
-                for source, base in bases
-            ]
+            return [self._whole_part(source, base) for source, base in bases]
         parts: list[MapPart] = []
         left = self._config.budget
         first = turn % max(len(bases), 1)
@@ -161,13 +168,18 @@ class Exchange:
                 left -= len(data)
         return parts
 
-    def _within(self, source: Source, base: int, size: int) -> bytes | None:
-        """A packet of at most ``size`` bytes: all that changed after version ``base``, or else what changed first.
+    def _whole_part(self, source: Source, base: int | None) -> MapPart:
+        """The packet from a base to the newest state of a map."""
+        held = self._held[source]
+        return MapPart(self._codec.packet(source, held, base), source, base, None if self._codec.decodes else held)
 
-        Bricks that got their values in the same tick stay together; they fitted into a packet when they were published.
+    def _within(self, source: Source, base: int, size: int) -> bytes | None:
+        """Packet of at most ``size`` bytes: all changes after version ``base``, or else the oldest of them.
+
+        Bricks of the same revision stay together; they fitted into one packet when they were published.
         """
-        held = self.held[source]
-        fitting = self._encoder.packet(source, held, base)
+        held = self._held[source]
+        fitting = self._codec.packet(source, held, base)
         if len(fitting) <= size:
             return fitting
         revisions = held.octree.revisions
@@ -178,34 +190,15 @@ class Exchange:
             middle = (fits + fails) // 2
             version = int(steps[middle - 1]) + 1
             chosen = np.flatnonzero((revisions >= base) & (revisions < version))
-            data = self._encoder.encode(source, HeldMap(held.octree, version), base, chosen)
+            data = self._codec.encode(source, HeldMap(held.octree, version), base, chosen)
             if len(data) <= size:
                 best, fits = data, middle
             else:
                 fails = middle
         return best
 
-    @staticmethod
-    def _stamp(part: MapPart) -> tuple[Source, int, int | None]:
-        """Whose state a packet brings, its version, and its base. Raises PacketError for a damaged packet."""
-        if part.held is not None:
-            return part.source, part.held.version, part.base
-        header = codec.read_header(part.data)
-        stamp = header.map_version
-        is_delta = header.kind == codec.DELTA
-        return Source(stamp.origin, stamp.epoch), stamp.version, stamp.base if is_delta else None
-
-    @staticmethod
-    def _decoded(data: bytes, version: int, mine: HeldMap | None) -> HeldMap:
-        """The state that a packet brings. Raises PacketError, and leaves what is here as it was."""
-        header = codec.read_header(data)
-        if header.kind == codec.FULL:
-            octree = codec.decode_packet(data)
-            octree.revisions[:] = version - 1
-        else:
-            octree = mine.octree.copy() if mine else SemanticOctree(header.resolution, header.num_classes)
-            # What is not in the delta did not change after its base, whatever an earlier packet made of it.
-            base = header.map_version.base
-            octree.revisions[octree.revisions >= base] = base - 1
-            codec.apply_delta(octree, data, version - 1)
-        return HeldMap(octree, version, header.map_version.weight)
+    def _stamp(self, part: MapPart) -> PacketStamp:
+        """Stamp of a packet. Raises PacketError for a damaged packet."""
+        if part.held is None:
+            return self._codec.stamp(part.data)
+        return PacketStamp(part.source, part.held.version, part.base)

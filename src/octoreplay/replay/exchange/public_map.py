@@ -1,46 +1,57 @@
-"""A robot's map as it gives it to others: as exact as its packets are, and as new as its budget allows."""
+"""Published map of a robot: rounded as its packets are, and within the budget."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from octoreplay.config.packets import PacketConfig
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
+from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Step, team_step
-from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_DEPTH
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.metrics import MapComparer
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams, mask_bytes, octree_from_streams
+from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.mapping.streams import TreeStreams, mask_bytes
 from octoreplay.records import Int64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 
 FIT_TRIES = 6
-"""Packets that are encoded at most to find one that fits the budget."""
+"""Largest number of packets that are encoded to find one that fits the budget."""
 
 ZSTD_FRAME_BYTES = 64
-"""More than zstd adds to parts that it cannot compress."""
+"""Upper bound of what zstd adds to parts that it cannot compress [bytes]."""
 
 
 def least_budget(packet: PacketConfig, num_classes: int) -> int:
-    """Bytes in which any brick fits into a packet of its own: header, words, masks, and every value with its code."""
+    """Number of bytes that a packet of one brick never exceeds: header, words, masks, and all values with codes."""
     number_bytes = {"float32": 5, "float16": 3, "int8": 1}[packet.content]
     per_cell = number_bytes * (num_classes + 1) + mask_bytes(num_classes)
     return codec.HEADER_BYTES + 2 * (BRICK_DEPTH + 9) + BRICK_CELLS * per_cell + ZSTD_FRAME_BYTES
 
 
-class PublicMap:
-    """What others may know of a map; every version is a new octree, so that those who have an older one keep it.
+def check_budget(packet: PacketConfig, num_classes: int) -> None:
+    """Raise ConfigError where a brick could need more than the budget."""
+    least = least_budget(packet, num_classes)
+    if packet.budget is not None and packet.budget < least:
+        raise ConfigError(
+            f"budget: {packet.budget} bytes may not hold one brick of {num_classes} classes; give at least {least}, or"
+            " a smaller content"
+        )
 
-    ``is_exact`` says that it is the map itself, value by value and at once.
+
+class PublicMap:
+    """Versions of a robot's published map. Every version is an octree of its own, so that older versions stay valid.
+
+    ``is_exact`` is True where the published map equals the map in every tick.
     """
 
-    def __init__(self, config: RunConfig, encoder: PacketEncoder, source: Source) -> None:
+    def __init__(self, config: ResolvedRun, packet_codec: PacketCodec, source: Source) -> None:
         self.is_exact = config.packet.is_exact and config.map.prune_tolerance == 0
         self._packet = config.packet
         self._tolerance = config.map.prune_tolerance
-        self._encoder = encoder
+        self._packet_codec = packet_codec
         self._source = source
         self._octree: SemanticOctree | None = None
         self._comparer = MapComparer(2, 0.0)
@@ -56,9 +67,10 @@ class PublicMap:
         streams: TreeStreams | None = None,
         num_shares: int = 1,
     ) -> HeldMap:
-        """The next version of a map, whose bricks got their values in ``revisions`` (n,), all below ``version``.
+        """Next version of the map.
 
-        ``streams`` are the map's, where they are there already; ``num_shares`` maps share the budget.
+        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``. ``streams`` are the
+        octree's streams if they are computed already. ``num_shares`` maps share the budget.
         """
         octree = octree.copy()
         octree.revisions[:] = revisions
@@ -69,8 +81,8 @@ class PublicMap:
             self._octree = SemanticOctree(octree.resolution, octree.num_classes)
         public = self._octree.copy()
         if self._packet.budget is None:
-            # What did not change keeps its revision, so that no delta holds it.
-            team_step([Step(public, (), (), target, 0.0)], rule="local", revision=version - 1)
+            # Unchanged bricks keep their revisions and stay out of deltas.
+            team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
         else:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(public, target, version, max(self._packet.budget // num_shares, least))
@@ -78,7 +90,7 @@ class PublicMap:
         return HeldMap(public, version)
 
     def _rounded(self, octree: SemanticOctree) -> SemanticOctree:
-        """A map as packets can hold it."""
+        """Map with the values that packets can hold."""
         if self._tolerance > 0:
             pruned = octree_from_streams(
                 octree.streams(tolerance=self._tolerance), octree.resolution, octree.num_classes
@@ -90,11 +102,11 @@ class PublicMap:
         return quantised(octree, self._packet.content, self._packet.int8_step)
 
     def _fill(self, public: SemanticOctree, target: SemanticOctree, version: int, budget: int) -> None:
-        """Bring as many bricks up to date as fit into a packet, those first that change most."""
+        """Update as many bricks as fit into a packet, those with the largest change first."""
         self._comparer.compare([public, target], target, [(0, 1)], self._filled - 1)
         self._filled = version
         codes, distances = self._comparer.brick_distances
-        # Cells that became known without any evidence, and bricks that the map does not have (yet).
+        # Cells can become known without a change of distance, and a brick can be missing in either map.
         here, there = target.find(codes), public.find(codes)
         known = np.zeros((2, codes.size), np.uint64)
         for row, octree, indices in zip(known, (target, public), (here, there), strict=True):
@@ -104,9 +116,9 @@ class PublicMap:
         order = here[waiting[np.argsort(-distances[waiting], kind="stable")]]
         best, wanted = 0, self._guess(order.size, budget)
         for _ in range(FIT_TRIES):
-            size = len(self._encoder.encode(self._source, HeldMap(target, version), version, order[:wanted]))
+            size = len(self._packet_codec.encode(self._source, HeldMap(target, version), version, order[:wanted]))
             self._bytes_per_brick = size / max(wanted, 1)
-            # Some room is left: the same bricks may take more when others of their packet have changed again.
+            # The margin is for bricks whose values compress less well in a later packet.
             if size <= 0.95 * budget:
                 best = max(best, wanted)
             if best == order.size or 0.85 * budget < size <= 0.95 * budget:
@@ -115,5 +127,5 @@ class PublicMap:
         public.overwrite(target, order[:best], version - 1)
 
     def _guess(self, num_bricks: int, budget: int) -> int:
-        """How many of some bricks may fit into a packet, by what the last packet's took."""
+        """Estimate of the number of bricks that fit into a packet, from the last packet's bytes per brick."""
         return min(int(0.9 * budget / self._bytes_per_brick), num_bricks)

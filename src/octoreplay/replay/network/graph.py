@@ -1,9 +1,9 @@
-"""The communication graph of a tick: who hears whom, how much it counts, and how large a step is stable.
+"""Communication graph of a tick: directed links, weights of the maps, and bound of the step size.
 
-L = diag(row sums of A off the diagonal) - A. One consensus step without evidence is h <- (I - 2 epsilon L) h, so it
-contracts exactly when |1 - 2 epsilon mu| < 1 for every non-zero eigenvalue mu of L. A link may carry one way only, so
-the eigenvalues can be complex. Row sums are at most 1, so by Gershgorin every mu lies in the disc |mu - 1| <= 1: any
-epsilon below 0.5 is stable on any graph.
+L = diag(row sums of A off the diagonal) - A. One consensus step without evidence is h <- (I - 2 epsilon L) h. It
+contracts exactly when |1 - 2 epsilon mu| < 1 for every non-zero eigenvalue mu of L. The eigenvalues can be complex,
+since links may be one-way. Row sums are at most 1, so by Gershgorin's theorem every mu lies in the disc
+|mu - 1| <= 1, and any epsilon below 0.5 is stable on any graph.
 """
 
 from __future__ import annotations
@@ -20,26 +20,23 @@ import numpy.typing as npt
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import NetworkConfig
 from octoreplay.errors import ConfigError
-from octoreplay.records import BoolArray, Float64Array
+from octoreplay.records import BoolArray, Float64Array, read_only
 from octoreplay.replay.network.schedule import Availability, Schedule
 from octoreplay.replay.network.topology import POSITION_TOPOLOGIES, Topology
 
 Link: TypeAlias = tuple[int, int]
 
-STEP_SIZE_RULES = ("gradient", "bayes", "natural")
-"""The rules that mix maps with a step size; the others have no bound to keep."""
-
-_ROUNDING = 1e-9  # eigenvalues below this are zero; sums and bounds are compared with this much room
+_ROUNDING = 1e-9  # eigenvalues below this count as zero; tolerance of sums and bounds
 
 
 @dataclass(frozen=True, eq=False)
 class CommunicationGraph:
-    """The links among a team's active robots and the weights A of their maps.
+    """Links among a team's active robots and the weights A of their maps.
 
-    ``active`` holds the indices of the active robots, ascending. ``links`` holds the directed links as (sender,
-    receiver), sorted. ``weights`` is A, (N, N) float64, read-only: A_ij is what receiver i gives to sender j's map,
-    zero where i does not hear j and on the diagonal; A_ii is what a row sum lacks to 1. Other robots count in N and
-    have no links. ``network`` is what the graph was made from.
+    ``active`` holds the indices of the active robots, ascending; other robots count in N and have no links. ``links``
+    holds the directed links (sender, receiver), sorted. ``weights`` is A, (N, N) float64, read-only: A_ij is the
+    weight of sender j's map at receiver i, zero without a link and on the diagonal. A_ii is 1 minus the row sum.
+    ``network`` is the configuration of the graph.
     """
 
     robot_ids: tuple[str, ...]
@@ -50,24 +47,24 @@ class CommunicationGraph:
 
     @cached_property
     def pairs(self) -> tuple[Link, ...]:
-        """The pairs (i, j), i < j, of robots that are linked in either direction, each once, sorted."""
+        """Pairs (i, j), i < j, of robots with a link in either direction, each once, sorted."""
         return tuple(sorted({(min(link), max(link)) for link in self.links}))
 
     def senders(self, robot_index: int) -> tuple[int, ...]:
-        """Indices of the robots that a robot hears, ascending."""
+        """Indices of the robots that send to a robot, ascending."""
         return self._senders[robot_index]
 
     def receivers(self, robot_index: int) -> tuple[int, ...]:
-        """Indices of the robots that hear a robot, ascending."""
+        """Indices of the robots that a robot sends to, ascending."""
         return self._receivers[robot_index]
 
     def degree(self, robot_index: int) -> int:
-        """The number of robots that a robot hears."""
+        """Number of robots that send to a robot."""
         return len(self._senders[robot_index])
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """True when every link carries both ways with the same weight, so that mixing keeps the sum over the robots."""
+        """True when every link is bidirectional with equal weights, so that mixing keeps the sum over the robots."""
         both_ways = {(receiver, sender) for sender, receiver in self.links} == set(self.links)
         return both_ways and np.array_equal(self.weights, self.weights.T)
 
@@ -75,35 +72,34 @@ class CommunicationGraph:
     def laplacian(self) -> Float64Array:
         """L = diag(row sums of A) - A, (N, N) float64, read-only."""
         matrix: Float64Array = np.diag(self.weights.sum(axis=1)) - self.weights
-        matrix.setflags(write=False)
-        return matrix
+        return read_only(matrix)
 
     @cached_property
     def lambda_max(self) -> float:
-        """The largest |eigenvalue| of L; 0 without links."""
+        """Largest |eigenvalue| of L; 0 without links."""
         return float(np.abs(self._non_zero_eigenvalues).max(initial=0.0))
 
     @cached_property
     def epsilon_bound(self) -> float:
-        """The step size below which consensus converges; infinite without links.
+        """Step size below which consensus converges; infinite without links.
 
-        |1 - 2 epsilon mu| reaches 1 at epsilon = Re(mu) / |mu|^2, which is 1 / mu for real mu and never below 0.5,
-        since |mu - 1| <= 1; where it comes out lower, that is rounding.
+        |1 - 2 epsilon mu| reaches 1 at epsilon = Re(mu) / |mu|^2, which is 1 / mu for real mu. It is never below 0.5,
+        since |mu - 1| <= 1; lower values are rounding errors.
         """
         values = self._non_zero_eigenvalues
         return max(0.5, float((values.real / np.abs(values) ** 2).min(initial=math.inf)))
 
     def lambda_2(self, epsilon: float) -> float:
-        """The second largest |eigenvalue| of I - 2 epsilon L: the largest |1 - 2 epsilon mu| over non-zero mu.
+        """Second largest |eigenvalue| of I - 2 epsilon L: the largest |1 - 2 epsilon mu| over non-zero mu.
 
-        The factor by which the disagreement shrinks in a tick; on a graph in several parts, that of the slowest part.
-        0 without links.
+        The disagreement shrinks by this factor in a tick; on a graph of several components, in the slowest one. 0
+        without links.
         """
         return float(np.abs(1.0 - 2.0 * epsilon * self._non_zero_eigenvalues).max(initial=0.0))
 
     @cached_property
     def _senders(self) -> tuple[tuple[int, ...], ...]:
-        """Whom each robot hears."""
+        """Senders of each robot."""
         heard: list[list[int]] = [[] for _ in self.robot_ids]
         for sender, receiver in self.links:
             heard[receiver].append(sender)
@@ -111,7 +107,7 @@ class CommunicationGraph:
 
     @cached_property
     def _receivers(self) -> tuple[tuple[int, ...], ...]:
-        """Who hears each robot."""
+        """Receivers of each robot."""
         hearing: list[list[int]] = [[] for _ in self.robot_ids]
         for sender, receiver in self.links:
             hearing[sender].append(receiver)
@@ -119,18 +115,18 @@ class CommunicationGraph:
 
     @cached_property
     def _non_zero_eigenvalues(self) -> npt.NDArray[np.complex128]:
-        """The eigenvalues of L except its zeros: one for each group of robots that hears nobody outside it."""
+        """Non-zero eigenvalues of L; it has one zero for each group of robots without links from outside."""
         values = np.linalg.eigvals(self.laplacian).astype(np.complex128)
         return values[np.abs(values) > _ROUNDING]
 
 
 class TeamNetwork:
-    """Who can hear whom, from tick to tick.
+    """Communication graphs of a team over time.
 
-    The topology is induced on the robots that are active and on; pairs that are one-way lose the other direction; then
-    the schedule has the last word: its links_up carry both ways, its links_down neither, silent robots send to nobody.
+    The topology is restricted to the robots that are active and on. One-way pairs lose their other direction. Then the
+    schedule applies: its links_up are bidirectional, its links_down are removed, silent robots do not send.
 
-    Raises ConfigError where the schedule contradicts itself, or brings up a link that has no weight.
+    Raises ConfigError where the schedule contradicts itself, or adds a link that has no weight.
     """
 
     def __init__(self, network: NetworkConfig, consensus: ConsensusConfig, robot_ids: Sequence[str]) -> None:
@@ -145,11 +141,11 @@ class TeamNetwork:
             _check_given_weights(network)
 
     def at(self, elapsed_s: float, active: Sequence[bool] | BoolArray, positions: Float64Array) -> CommunicationGraph:
-        """The graph at a time since the run's start; the same object as last time when nothing has changed.
+        """Graph at a time since the run's start; the same object as before if nothing has changed.
 
-        ``active`` (N,) are the robots that take part, those that the schedule has off included; ``positions`` (N, 3) in
-        metres in the team's frame, NaN for robots without a pose. Call it in the order of time, once a tick: topology
-        'range' remembers its links.
+        ``active`` (N,) bool are the robots that take part, including those that the schedule has off. ``positions``
+        (N, 3) float64 are in metres in the team's frame, NaN for robots without a pose. Call it in the order of time,
+        once a tick: topology 'range' keeps its links for the hysteresis.
 
         Raises ConfigError where a robot's weights sum to more than 1, or epsilon is not below the graph's bound.
         """
@@ -170,7 +166,7 @@ class TeamNetwork:
         return self._graph
 
     def _hears(self, present: BoolArray, positions: Float64Array, available: Availability) -> BoolArray:
-        """Who hears whom, (N, N): row i are the robots that i hears."""
+        """Directed links (N, N) bool: row i holds the senders of robot i."""
         hears = self._topology.links(present, positions) & ~self._blocked
         hears = (hears | available.links_up) & ~available.links_down
         hears &= present[:, None] & (present & ~available.robots_silent)
@@ -180,33 +176,33 @@ class TeamNetwork:
 def build_graph(
     network: NetworkConfig, robot_ids: Sequence[str], active: Sequence[bool] | BoolArray, hears: BoolArray
 ) -> CommunicationGraph:
-    """The graph in which robot i hears the robots of row i of ``hears`` (N, N), with the weights of that graph.
+    """Graph with the directed links ``hears`` (N, N) bool, whose row i holds the senders of robot i.
 
-    ``active`` has one entry per robot. Nobody hears itself.
+    ``active`` (N,) bool has one entry per robot. The diagonal of ``hears`` is False.
 
     Raises ConfigError where the given weights of a robot sum to more than 1.
     """
     indices = tuple(index for index, (_, is_active) in enumerate(zip(robot_ids, active, strict=True)) if is_active)
     weights = _weights(network, robot_ids, hears)
     _check_row_sums(weights, robot_ids)
-    weights.setflags(write=False)
-    return CommunicationGraph(tuple(robot_ids), indices, _links(hears), weights, network)
+    return CommunicationGraph(tuple(robot_ids), indices, _links(hears), read_only(weights), network)
 
 
 def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
-    """The consensus step size epsilon on a graph, as configured or by default.
+    """Consensus step size epsilon on a graph, as configured or by default.
 
-    The default is 0.5 with Metropolis and max-degree weights: a robot that hears d others gives them d / (1 + d) < 1 in
-    all, so I - L is row-stochastic with a positive diagonal, and by Gershgorin its eigenvalues other than 1 are inside
-    the unit circle. Else it is min(0.5, 0.9 x the bound). Rules without a step size have no bound.
+    The default with Metropolis and max-degree weights is 0.5: the weights of d senders sum to at most d / (1 + d) < 1,
+    so I - L is row-stochastic with a positive diagonal, and by Gershgorin's theorem its eigenvalues other than 1 are
+    inside the unit circle. With other weights the default is min(0.5, 0.9 x the bound). Rules without a step size have
+    no bound.
 
     Raises ConfigError where a configured epsilon is not below the graph's bound.
     """
     if consensus.epsilon is None:
         always_stable = graph.network.weights in ("metropolis", "max-degree")
         return 0.5 if always_stable else min(0.5, 0.9 * graph.epsilon_bound)
-    # No bound is below 0.5, so smaller steps need no eigenvalues.
-    has_bound = consensus.rule in STEP_SIZE_RULES and consensus.epsilon >= 0.5 * (1.0 - _ROUNDING)
+    # Bounds are at least 0.5, so smaller steps need no eigenvalues.
+    has_bound = consensus.traits.has_step_size and consensus.epsilon >= 0.5 * (1.0 - _ROUNDING)
     if has_bound and not consensus.epsilon < graph.epsilon_bound * (1.0 - _ROUNDING):
         raise ConfigError(
             f"epsilon: {consensus.epsilon} is not below {graph.epsilon_bound:.6g}, the bound of this graph (topology"
@@ -216,25 +212,11 @@ def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
     return consensus.epsilon
 
 
-def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsilon: float) -> int:
-    """The most settling ticks on a graph: ``settle_max``, or ``settle`` + 12 / -log10 lambda_2 rounded up; 0 without
-    settling.
-
-    So many ticks after gamma's ramp shrink the disagreement by 1e12.
-    """
-    if consensus.settle == 0:
-        return 0
-    if consensus.settle_max is not None:
-        return consensus.settle_max
-    rate = min(max(graph.lambda_2(epsilon), 1e-12), 1.0 - 1e-9)  # one tick at least, and a finite number of them
-    return consensus.settle + math.ceil(12.0 / -math.log10(rate))
-
-
 def check_team_graph(network: NetworkConfig, consensus: ConsensusConfig, robot_ids: Sequence[str]) -> None:
-    """Check the schedule, and the graph of the whole team whenever the schedule changes it, before a run.
+    """Check the schedule, and the whole team's graph at each of its changes, before a run.
 
-    Parts of the team are checked when they occur, since the bound of a part can be lower, and so are the graphs of
-    topologies that depend on positions.
+    Graphs of a part of the team, whose bound can be lower, and of topologies that depend on positions are checked when
+    they occur.
 
     Raises ConfigError as TeamNetwork does.
     """
@@ -246,13 +228,13 @@ def check_team_graph(network: NetworkConfig, consensus: ConsensusConfig, robot_i
 
 
 def _links(hears: BoolArray) -> tuple[Link, ...]:
-    """The links (sender, receiver), sorted, of who hears whom."""
+    """Links (sender, receiver), sorted, of a matrix whose row i holds the senders of robot i."""
     senders, receivers = np.nonzero(hears.T)
     return tuple(zip(senders.tolist(), receivers.tolist(), strict=True))
 
 
 def _one_way_block(network: NetworkConfig, robot_ids: Sequence[str]) -> BoolArray:
-    """What one-way pairs take away, (N, N): True at [i, j] where i cannot hear j."""
+    """Directions that one-way pairs remove, (N, N) bool: True at [i, j] for the direction from j to i."""
     index_of = {robot_id: index for index, robot_id in enumerate(robot_ids)}
     blocked = np.zeros((len(robot_ids), len(robot_ids)), dtype=bool)
     for sender, receiver in network.one_way:
@@ -261,12 +243,12 @@ def _one_way_block(network: NetworkConfig, robot_ids: Sequence[str]) -> BoolArra
 
 
 def _weights(network: NetworkConfig, robot_ids: Sequence[str], hears: BoolArray) -> Float64Array:
-    """A (N, N) of a graph; a robot's degree is the number of robots that it hears.
+    """A (N, N) float64 of a graph; a robot's degree is its number of senders.
 
     Metropolis: 1 / (1 + max(degree_i, degree_j)). Max-degree: 1 / (1 + the largest degree of the graph), the
     maximum-degree weights of Xiao, Boyd and Kim, Distributed average consensus with least-mean-square deviation, J.
-    Parallel Distrib. Comput. 67, 2007. Degree: 1 / degree_i. Given: the list's, the same in both directions; of an edge
-    that is listed twice the later weight counts.
+    Parallel Distrib. Comput. 67, 2007. Degree: 1 / degree_i. Given: the weights of the edge list, the same in both
+    directions; if an edge is listed twice, the later weight counts.
     """
     degrees = hears.sum(axis=1)
     weights = np.zeros(hears.shape)
@@ -286,7 +268,7 @@ def _weights(network: NetworkConfig, robot_ids: Sequence[str], hears: BoolArray)
 
 
 def _check_given_weights(network: NetworkConfig) -> None:
-    """Refuse links that the schedule brings up and the edge list has no weight for."""
+    """Raise ConfigError where the schedule adds a link that the edge list has no weight for."""
     listed = {frozenset((a, b)) for a, b, _ in network.edges}
     for entry in network.schedule:
         for a, b in entry.links_up:
@@ -297,7 +279,7 @@ def _check_given_weights(network: NetworkConfig) -> None:
 
 
 def _check_row_sums(weights: Float64Array, robot_ids: Sequence[str]) -> None:
-    """Refuse rows that leave nothing for A_ii; NaN is refused too."""
+    """Raise ConfigError for a row sum above 1 or NaN."""
     for robot_id, total in zip(robot_ids, weights.sum(axis=1), strict=True):
         if not total <= 1.0 + _ROUNDING:
             raise ConfigError(f"edges: the weights of robot '{robot_id}' sum to {total:.6g}; lower them to at most 1")

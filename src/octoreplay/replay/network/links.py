@@ -1,7 +1,8 @@
-"""The radio links: when a packet arrives, in what state, or that it never does.
+"""Radio links: delay, loss, damage and queueing of packets.
 
-Every direction of a link has a generator of its own, seeded by the run's seed and the two robots, and takes the same
-number of draws from it for every packet: what happens on one link does not depend on the others.
+Losses, delays and damage are drawn independently per direction: each direction of a link has its own random generator,
+seeded by the run's seed and the two robots, and draws the same number of values for every packet. A change on one link
+therefore leaves all others as they are.
 """
 
 from __future__ import annotations
@@ -15,24 +16,24 @@ from typing import Generic, Protocol, Self, TypeVar
 import numpy as np
 
 from octoreplay.config.network import LinkConfig
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 
 
 class Transmission(Protocol):
-    """What a link carries."""
+    """Content of a transmission over a link."""
 
     @property
     def num_bytes(self) -> int:
-        """Its length [bytes]."""
+        """Length [bytes]."""
         ...
 
     @property
     def waits(self) -> bool:
-        """True for what takes its turn in the queue of a busy link; false for what is sent beside it."""
+        """True for content that queues while the link is busy, False for content that is sent beside the queue."""
         ...
 
     def damaged(self, share: float) -> Self:
-        """The same with one bit flipped, ``share`` in [0, 1) of the way through."""
+        """Copy with one bit flipped, at the fraction ``share`` in [0, 1) of the content."""
         ...
 
 
@@ -41,7 +42,7 @@ T = TypeVar("T", bound=Transmission)
 
 @dataclass(frozen=True)
 class Delivery(Generic[T]):
-    """What arrived from a robot at another."""
+    """Content that arrived from one robot at another."""
 
     sender: int
     receiver: int
@@ -52,7 +53,7 @@ class Delivery(Generic[T]):
 
 @dataclass
 class LinkCounts:
-    """What happened on one direction of a link since it was last asked. Packets are those that wait their turn."""
+    """Counts of one direction of a link since the last call. Only content that queues counts as a packet."""
 
     num_sent: int = 0
     sent_bytes: int = 0
@@ -76,12 +77,12 @@ class _Link(Generic[T]):
 
 
 class Links(Generic[T]):
-    """All links of a team, between robots given by their indices. Times are of the shared clock [ns].
+    """All links of a team, between robots given by their indices. Times are on the shared clock [ns].
 
-    ``longest_transmission`` is the longest time [s] that a packet kept a link with a rate busy.
+    ``longest_transmission`` is the longest time that a packet kept a link busy [s].
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: ResolvedRun) -> None:
         self._config = config
         self._ids = [robot.robot_id for robot in config.robots]
         self._links: dict[tuple[int, int], _Link[T]] = {}
@@ -90,7 +91,7 @@ class Links(Generic[T]):
         self.longest_transmission = 0.0
 
     def send(self, sender: int, receiver: int, content: T, now_ns: int) -> None:
-        """Hand something to a link. It is on its way, in the link's queue, or gone."""
+        """Send content over a link: it is transmitted, queued or dropped."""
         link = self._link(sender, receiver)
         link.counts.num_sent += content.waits
         link.counts.sent_bytes += content.num_bytes
@@ -107,9 +108,9 @@ class Links(Generic[T]):
         link.waiting.append((now_ns, content))
 
     def deliver(self, now_ns: int, listening: Collection[int]) -> list[Delivery[T]]:
-        """What has arrived by now at the robots that are ``listening``, in the order of (arrival, sender, receiver).
+        """Deliveries up to now at the robots ``listening``, in the order of (arrival, sender, receiver).
 
-        What arrives at others is lost.
+        Content that arrives at other robots is lost.
         """
         for (sender, receiver), link in self._links.items():
             self._start_waiting(sender, receiver, link, now_ns)
@@ -128,7 +129,7 @@ class Links(Generic[T]):
         return arrived
 
     def cut(self, links: Iterable[tuple[int, int]]) -> None:
-        """Empty the queues of all links (sender, receiver) but these: the others do not exist now."""
+        """Drop the queues of all links (sender, receiver) that are not in ``links``."""
         standing = set(links)
         for ends, link in self._links.items():
             if ends not in standing:
@@ -136,14 +137,14 @@ class Links(Generic[T]):
                 link.waiting.clear()
 
     def take_counts(self) -> dict[tuple[int, int], LinkCounts]:
-        """What happened on each direction of each link since the last call."""
+        """Counts of each direction of each link since the last call."""
         counts = {ends: link.counts for ends, link in self._links.items()}
         for link in self._links.values():
             link.counts = LinkCounts()
         return counts
 
     def _link(self, sender: int, receiver: int) -> _Link[T]:
-        """One direction of a link; made at its first use."""
+        """One direction of a link, made at its first use."""
         if (sender, receiver) not in self._links:
             config = self._config.link_config(self._ids[sender], self._ids[receiver])
             random = np.random.default_rng([self._config.network.network_seed, sender, receiver])
@@ -151,13 +152,13 @@ class Links(Generic[T]):
         return self._links[sender, receiver]
 
     def _start_waiting(self, sender: int, receiver: int, link: _Link[T], now_ns: int) -> None:
-        """Start what waited for the link to become free, as far as that happened by now."""
+        """Transmit queued content for as long as the link has become free by now."""
         while link.waiting and link.busy_until_ns <= now_ns:
             sent_ns, content = link.waiting.popleft()
             self._start(sender, receiver, link, sent_ns, max(link.busy_until_ns, sent_ns), content)
 
     def _start(self, sender: int, receiver: int, link: _Link[T], sent_ns: int, start_ns: int, content: T) -> None:
-        """Put something on the air; decides whether, when and how it arrives."""
+        """Transmit content: draw its loss, delay and damage."""
         config = link.config
         turn, loss, delay, corruption, place = link.random.random(5)
         if config.rate is not None and content.waits:

@@ -1,4 +1,4 @@
-"""Which links a team has by itself, before one-way pairs and the schedule: a fixed pattern, or by where robots are."""
+"""Links of a topology, before one-way pairs and the schedule: a fixed pattern, or a function of the positions."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     import networkx as nx
 
 POSITION_TOPOLOGIES = ("nearest", "range")
-"""Topologies whose links follow the robots' positions; the others are fixed over a run."""
+"""Topologies whose links depend on the robots' positions; the others are fixed over a run."""
 
 
 class Topology:
-    """The undirected links among a team's robots from tick to tick.
+    """Undirected links among a team's robots in each tick.
 
-    Fixed topologies are drawn over the whole team and induced on the robots that are present: a ring without one robot
-    is a line, a star without its centre, the first robot, has no links. ``nearest`` and ``range`` are made anew among
-    the robots that are present and have a position; ``range`` remembers its links from call to call.
+    A fixed topology is built over the whole team and restricted to the robots that are present: a ring without one
+    robot is a line, and a star without its centre, the first robot, has no links. 'nearest' and 'range' are computed
+    among the robots that are present and have a position; 'range' keeps its links from call to call for the hysteresis.
     """
 
     def __init__(self, network: NetworkConfig, robot_ids: Sequence[str]) -> None:
@@ -34,14 +34,14 @@ class Topology:
         self._in_range = np.zeros((len(robot_ids), len(robot_ids)), dtype=bool)
 
     def links(self, present: BoolArray, positions: Float64Array) -> BoolArray:
-        """The links of a tick, (N, N) bool, symmetric, without diagonal.
+        """Links of a tick, (N, N) bool, symmetric, False on the diagonal.
 
-        ``present`` (N,); ``positions`` (N, 3) in metres in the team's frame, NaN for a robot without a pose, are looked
-        at by 'nearest' and 'range' only.
+        ``present`` (N,) bool are the robots that take part. ``positions`` (N, 3) float64 are in metres in the team's
+        frame, NaN for a robot without a pose; only 'nearest' and 'range' use them.
         """
         if self._fixed is not None:
             return self._fixed & present & present[:, None]
-        # Robots without a distance have no links: NaN positions make NaN distances, and no comparison holds for them.
+        # NaN positions give NaN distances, for which no comparison holds: these robots have no links.
         distances = _distances(np.where(present[:, None], positions, np.nan))
         if self._network.topology == "nearest":
             return _nearest_links(distances, self._network.num_nearest)
@@ -49,7 +49,7 @@ class Topology:
         return self._in_range
 
     def _range_links(self, distances: Float64Array) -> BoolArray:
-        """Links come up below radio_range and stand up to radio_range + range_hysteresis."""
+        """Links appear below radio_range and last up to radio_range + range_hysteresis."""
         network = self._network
         stands = self._in_range & (distances <= network.radio_range + network.range_hysteresis)
         links: BoolArray = stands | (distances < network.radio_range)
@@ -58,7 +58,7 @@ class Topology:
 
 
 def _fixed_graph(network: NetworkConfig, robot_ids: Sequence[str]) -> nx.Graph:
-    """A topology that does not depend on positions, over all robots; its nodes are their indices."""
+    """Graph of a fixed topology over all robots; nodes are robot indices."""
     import networkx as nx
 
     num_robots = len(robot_ids)
@@ -78,22 +78,22 @@ def _fixed_graph(network: NetworkConfig, robot_ids: Sequence[str]) -> nx.Graph:
 
 
 def _adjacency(links: Iterable[tuple[int, int]], num_robots: int) -> BoolArray:
-    """Undirected links as a symmetric matrix."""
+    """Symmetric matrix (N, N) bool of undirected links."""
     matrix = np.zeros((num_robots, num_robots), dtype=bool)
     for i, j in links:
         matrix[i, j] = matrix[j, i] = True
-    np.fill_diagonal(matrix, False)  # networkx closes a ring of one robot on itself
+    np.fill_diagonal(matrix, False)  # networkx gives a ring of one robot a self-loop
     return matrix
 
 
 def _distances(positions: Float64Array) -> Float64Array:
-    """Distances (N, N) between positions (N, 3), NaN where one of them is."""
+    """Distances (N, N) between positions (N, 3); NaN where a position is NaN."""
     distances: Float64Array = np.sqrt(((positions[:, None] - positions) ** 2).sum(axis=2))
     return distances
 
 
 def _nearest_links(distances: Float64Array, num_nearest: int) -> BoolArray:
-    """Links from each robot to its nearest ones, ties by index; a link stands where either end wants it."""
+    """Links from each robot to its nearest robots, ties by index; a link exists if either end selects it."""
     others = np.where(np.isnan(distances), np.inf, distances)
     np.fill_diagonal(others, np.inf)
     order = np.argsort(others, axis=1, kind="stable")[:, :num_nearest]

@@ -1,71 +1,53 @@
-"""The robots that mix their neighbours' maps into their own: rules gradient, natural, bayes, merge and local."""
+"""Rules gradient, natural, bayes, merge and local: robots that mix their neighbours' maps into their own."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Self
 
 import numpy as np
 
-from octoreplay.config.run import RunConfig
-from octoreplay.mapping.consensus import Step, gamma_at, team_step
+from octoreplay.config.resolved import ResolvedRun
+from octoreplay.mapping.consensus import Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import Float64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 
 class ConsensusRobot(Robot):
-    """A robot that publishes h_i, and iterates on the h_j that arrive from its neighbours."""
+    """Robot that publishes h_i and iterates with the maps h_j of its neighbours."""
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
-        self._rule = config.consensus.rule
-        self._public = PublicMap(config, encoder, self.source)
+    def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int, update: Update) -> None:
+        super().__init__(index, config, packet_codec, epoch)
+        self._rule = config.consensus.traits
+        self._update = update
+        self._public = PublicMap(config, packet_codec, self.source)
         self._published: HeldMap | None = None
         self._has_budget = config.packet.budget is not None
         self._used: dict[Source, int] = {}
         self._last_step_tick = -1
         self._last_conditions: tuple[object, ...] = ()
-        self._nothing = SemanticOctree(config.map.resolution, num_classes)
+        self._nothing = SemanticOctree(config.map.resolution, config.classes.num_classes)
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
-        """The robot's map, for its neighbours; an empty packet where nothing changed says that it is still there."""
+        """Messages with the robot's map; without changes an empty delta, which keeps the link alive."""
         self._published = self._public.advance(self.map, self.map.revisions, tick, streams=self.streams)
-        self.exchange.held[self.source] = self._published
+        self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 
-    @classmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """One iteration with all that arrived, which the team does brick by brick; on-arrival one for each map."""
-        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
-        is_sync = config.consensus.mode == "sync"
-        together = [turn for turn in turns if is_sync or not turn.arrived]
-        alone = [turn for turn in turns if not is_sync and turn.arrived]
-        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, factor, tick), together))
-        changes = team_step(
-            steps, rule=config.consensus.rule, revision=tick, clamp=config.sensor.clamp, threads=threads
-        )
-        list(threads.map(lambda turn: turn.robot.end_step(tick), together))
-        return changes + list(
-            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, factor, tick), alone)
-        )
-
     def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> Step:
-        """The one iteration of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
+        """Step of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
         newest = {arrival.source: arrival for arrival in arrived}
         arrived = [newest[source] for source in sorted(newest)]
         self._update_log_likelihood(tick)
         gamma = factor * gamma_at(self._config.consensus, self.num_iterations)
-        # Differences of published maps keep the sum over robots, whatever publishing rounds away.
+        # Differences of published maps keep the sum over the robots in spite of rounding in packets.
         base = None if self._public.is_exact else self._published_octree(tick)
-        # Bricks rest where the same step, with maps that changed nowhere since, changed nothing.
+        # A brick rests if the same step with the same values changed nothing in it.
         conditions = (gamma, *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived))
         is_steady = conditions == self._last_conditions and all(held.version == tick for _, held in arrived)
         since = self._last_step_tick if is_steady and base is None else None
@@ -73,36 +55,36 @@ class ConsensusRobot(Robot):
         return self._step(arrived, step_weights, gamma, base, since)
 
     def end_step(self, tick: int) -> None:
-        """Take note of the iteration that ``next_step`` described."""
+        """Complete the iteration of ``next_step``."""
         self._finish_step(tick)
         self._update_streams()
 
     def iterate_on_arrival(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int
     ) -> float:
-        """One iteration for each of the maps that ``arrived``, in their order; the largest change of a log-odds."""
+        """Iterate once for each of the maps that ``arrived``, in order; the largest change of a log-odds."""
         consensus = self._config.consensus
         self._update_log_likelihood(tick)
-        # bayes keeps the sum over robots only when both ends of a link exchange the same difference.
-        needs_base = self._rule == "bayes" or not self._public.is_exact
+        # The sum over robots is kept only when both ends of a link exchange the same difference.
+        needs_base = self._rule.needs_symmetric_links or not self._public.is_exact
         base = self._published_octree(tick) if needs_base else None
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
             step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], rule=self._rule, revision=tick, clamp=self._config.sensor.clamp)
+            team_step([step], update=self._update, revision=tick, clamp=self._config.sensor.clamp)
             self._finish_step(tick)
         self._update_streams()
-        # What one arrival changes another may undo; what counts is the change over the tick.
+        # One arrival may undo the change of another, so the change over the whole tick counts.
         return self._change_since(before, tick)
 
     def _step(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, gamma: float, base: SemanticOctree | None,
         since: int | None = None,
     ) -> Step:  # fmt: skip
-        """An iteration with some neighbours' maps; bricks at rest ``since`` the last one are skipped."""
+        """Step with the maps that ``arrived``; bricks at rest ``since`` a revision are skipped."""
         neighbours = [held.octree for _, held in arrived]
-        if self._rule == "merge":
+        if not self._rule.mixes_differences:
             base = self._nothing
         elif base is not None and self._has_budget:
             neighbours = [self._used_once(base, source, held) for source, held in arrived]
@@ -113,16 +95,16 @@ class ConsensusRobot(Robot):
         )  # fmt: skip
 
     def _published_octree(self, tick: int) -> SemanticOctree | None:
-        """What the others know of this robot's map; None where they know nothing or, without budget, an older one."""
+        """The published map of this tick; None where nothing was published or, without budget, an older version."""
         if self._published is None or (self._published.version < tick and not self._has_budget):
             return None
         return self._published.octree
 
     def _used_once(self, own: SemanticOctree, source: Source, held: HeldMap) -> SemanticOctree:
-        """A neighbour's map, and this robot's ``own`` where neither has sent anything new since the last time.
+        """A neighbour's map, with the bricks of ``own`` where neither robot has sent the brick since the last use.
 
-        Bricks that wait for the budget keep their difference for many ticks. Both ends use it once, when one of them
-        sends the brick anew: adding it again and again would never end.
+        The difference of a brick that waits for the budget stays for many ticks. Both ends of the link use it once,
+        when one of them sends the brick; adding it in every tick would not converge.
         """
         since = self._used.get(source, 0)
         self._used[source] = held.version
@@ -133,14 +115,41 @@ class ConsensusRobot(Robot):
         return mixed
 
     def _finish_step(self, tick: int) -> None:
-        """Count an iteration, and keep the evidence that it used."""
+        """Count an iteration and store its evidence."""
         self.num_iterations += 1
-        if self._rule in ("bayes", "merge"):
+        if self._rule.keeps_last_evidence:
             self._keep_log_likelihood(tick)
 
 
+class ConsensusTeam(Team[ConsensusRobot]):
+    """Robots that mix maps; ``update`` is the branch of the kernel that the rule takes."""
+
+    def __init__(self, config: ResolvedRun, packet_codec: PacketCodec, *, update: Update) -> None:
+        self._update = update
+        super().__init__(config, packet_codec)
+
+    def _new_robot(self, index: int, epoch: int) -> ConsensusRobot:
+        return ConsensusRobot(index, self._config, self._packet_codec, epoch, self._update)
+
+    def iterate(
+        self, turns: Sequence[Turn[ConsensusRobot]], gamma_factor: float, tick: int, threads: Executor
+    ) -> list[float]:
+        """One iteration per robot, all robots brick by brick; in mode 'on-arrival' one iteration per arrived map."""
+        consensus, clamp = self._config.consensus, self._config.sensor.clamp
+        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
+        is_sync = consensus.mode == "sync"
+        together = [turn for turn in turns if is_sync or not turn.arrived]
+        alone = [turn for turn in turns if not is_sync and turn.arrived]
+        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, gamma_factor, tick), together))
+        changes = team_step(steps, update=self._update, revision=tick, clamp=clamp, threads=threads)
+        list(threads.map(lambda turn: turn.robot.end_step(tick), together))
+        return changes + list(
+            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, gamma_factor, tick), alone)
+        )
+
+
 def _from_neighbours(turn: Turn[Robot]) -> list[Arrival]:
-    """What arrived over links that stand in this tick, without maps of a sender's earlier lives."""
+    """Arrivals over links of this tick's graph, without maps of a sender's earlier restart epochs."""
     epoch_of = turn.robot.exchange.epoch_of
     return [
         arrival

@@ -1,107 +1,93 @@
-"""The robots that share out their evidence in running sums: rule ratio (mapping/running_sums.py has the source)."""
+"""Rule ratio: robots that exchange running sums (source: mapping/running_sums.py)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Self
 
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import running_sums
-from octoreplay.mapping.consensus import Step, team_step
+from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
-from octoreplay.replay.robots.robot import Arrival, Robot, Turn
+from octoreplay.replay.exchange.packet_codec import PacketCodec
+from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
 
 REST = 8.0
-"""Units by which a map may be off: rounding moves masses by up to six in every tick for ever."""
+"""Change of a map below which it rests [units]: rounding keeps moving masses by up to six units a tick."""
 
 _HEADROOM = 4
-"""A mass stays below this many times the largest log-odds times the number of robots."""
+"""Factor by which a mass may exceed the largest log-odds times the number of robots."""
 
 
 class RatioRobot(Robot):
-    """A robot that keeps a mass y_i and a weight z_i, and gives equal shares of both to its receivers; h_i = y_i / z_i.
+    """Robot with a mass y_i and a weight z_i, of which it gives equal shares to its receivers; h_i = y_i / z_i.
 
-    Receivers get the running sum of all shares so far. While a link is down it is given nothing: its receiver's sum
-    stands still, and goes on from there when the link is back.
+    A receiver gets the running sum of all its shares so far. The sum is paused while the link is down.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
-        super().__init__(index, config, num_classes, encoder, epoch)
-        _check_range(config)
-        self.mass = SemanticOctree(config.map.resolution, num_classes)
+    def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
+        super().__init__(index, config, packet_codec, epoch)
+        self.mass = SemanticOctree(config.map.resolution, config.classes.num_classes)
         self._weight = running_sums.WHOLE_WEIGHT
-        self._total = SemanticOctree(config.map.resolution, num_classes)
+        self._total = SemanticOctree(config.map.resolution, config.classes.num_classes)
         self._total_weight = 0
-        # What a receiver's sum is short of the total; where its link is down, the sum itself.
+        # Difference between the total and a receiver's sum; for a link that is down, the sum itself.
         self._offsets: dict[int, HeldMap] = {}
         self._paused: dict[int, HeldMap] = {}
         self._receivers: frozenset[int] = frozenset()
         self._taken: dict[Source, HeldMap] = {}
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
-        """Share out the mass, and send the running sums."""
+        """Share the mass among the receivers, and send the running sums."""
         self._pause(self._receivers.difference(receivers), tick)
         self._resume(frozenset(receivers).difference(self._receivers), tick)
         self._receivers = frozenset(receivers)
-        # Who hears little keeps what it has: giving on and on would leave it nothing to divide by.
+        # A robot with little weight keeps it: a weight near 0 cannot be divided by.
         num_shares = len(receivers) if self._weight >= running_sums.LEAST_WEIGHT else 0
         running_sums.share_out(self.mass, self._total, num_shares, tick - 1)
         share, self._weight = running_sums.share_weight(self._weight, num_shares)
         self._total_weight += share
-        held = self.exchange.held
         outgoing = []
         together = tuple(receiver for receiver in receivers if receiver not in self._offsets)
         for group in filter(None, (together, *((receiver,) for receiver in receivers if receiver in self._offsets))):
-            held[self.source] = self._sum_for(group[0], tick)
+            self.exchange.hold(self.source, self._sum_for(group[0], tick))
             outgoing += self.exchange.outbox(group, [self.source], keep_alive=True)
         return outgoing
 
-    @classmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """Every robot takes in what the sums that arrived grew by, and its own new evidence."""
-        del factor, config
-        masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
-        running_sums.team_take_in(masses, tick, threads)
-        return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
-
     def growths(self, arrived: Sequence[Arrival]) -> list[running_sums.Arrival]:
-        """The newest sums that arrived, each with the one that was there before; their weights are taken in."""
+        """Newest sums that arrived, each with the one used before; adds their weights to the robot's weight."""
         growths: list[running_sums.Arrival] = []
         for source, new in sorted(dict(arrived).items()):
             old = self._taken.get(source)
             self._taken[source] = new
             if old is None and self.source.epoch > 0:
-                # The shares that were sent to an earlier life are lost with it.
+                # Shares that were sent to an earlier restart epoch are lost with it.
                 continue
             self._weight += new.weight - (old.weight if old else 0)
             growths.append((new.octree, old.octree if old else None))
         return growths
 
     def end_iteration(self, tick: int) -> float:
-        """Take in new evidence, and recover the map from the mass; the largest change of a log-odds."""
+        """Add new evidence to the mass and compute the map; the largest change of a log-odds."""
         self._update_log_likelihood(tick)
         running_sums.add_evidence(
             self.mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
         )
         if self._weight >= running_sums.LEAST_WEIGHT:
-            change = running_sums.recovered(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
+            change = running_sums.recover_map(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
         else:
-            # Most of the mass is under way: what is left shows its rounding. New evidence is added to the last map.
+            # Most of the mass is in transit and the rest is too coarse: new evidence is added to the last map instead.
             step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
-            (change,) = team_step([step], rule="bayes", revision=tick)
+            (change,) = team_step([step], update=Update.BAYES, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
         self._update_streams()
         return change
 
     def _sum_for(self, receiver: int, tick: int) -> HeldMap:
-        """The running sum of what one receiver was given."""
+        """Running sum of one receiver's shares."""
         offset = self._offsets.get(receiver)
         if offset is None:
             return HeldMap(self._total.copy(), tick, self._total_weight)
@@ -109,13 +95,13 @@ class RatioRobot(Robot):
         return HeldMap(octree, tick, self._total_weight - offset.weight)
 
     def _pause(self, receivers: frozenset[int], tick: int) -> None:
-        """Links went down: their receivers are given nothing from here on."""
+        """Pause the sums of receivers whose links went down."""
         for receiver in receivers:
             self._paused[receiver] = self._sum_for(receiver, tick)
             self._offsets.pop(receiver, None)
 
     def _resume(self, receivers: frozenset[int], tick: int) -> None:
-        """Links came up, for the first time or again: what was summed up meanwhile is not for their receivers."""
+        """Start or resume the sums of receivers whose links came up; shares in between are not theirs."""
         for receiver in receivers:
             paused = self._paused.pop(receiver, None)
             if paused is None and self._total_weight:
@@ -129,8 +115,28 @@ class RatioRobot(Robot):
         return [*super()._octrees(), self.mass, self._total, *(held.octree for held in kept)]
 
 
-def _check_range(config: RunConfig) -> None:
-    """Refuse a team whose masses could become too large for the sums: raises ConfigError."""
+class RatioTeam(Team[RatioRobot]):
+    """Robots that exchange running sums."""
+
+    def __init__(self, config: ResolvedRun, packet_codec: PacketCodec) -> None:
+        _check_range(config)
+        super().__init__(config, packet_codec)
+
+    def _new_robot(self, index: int, epoch: int) -> RatioRobot:
+        return RatioRobot(index, self._config, self._packet_codec, epoch)
+
+    def iterate(
+        self, turns: Sequence[Turn[RatioRobot]], gamma_factor: float, tick: int, threads: Executor
+    ) -> list[float]:
+        """Add the growth of the received sums and the new evidence to each robot's mass; the rule has no gamma."""
+        del gamma_factor
+        masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
+        running_sums.receive_team(masses, tick, threads)
+        return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))
+
+
+def _check_range(config: ResolvedRun) -> None:
+    """Raise ConfigError where masses could exceed the range of the sums."""
     sensor = config.sensor
     numbers = [sensor.clamp_min, sensor.clamp_max]
     if config.consensus.evidence != "sum":

@@ -1,4 +1,4 @@
-"""One robot of the team: what its own scans say, and the map that it agrees on with the others."""
+"""A robot of the team with its evidence and its map, and the base class of teams."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Self, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from octoreplay.config.run import RunConfig
+from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping import codec
-from octoreplay.mapping.consensus import Evidence, Step, sum_of_evidence, team_step
-from octoreplay.mapping.octree import SemanticOctree, TreeStreams
+from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence, team_step
+from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
     ScanCaster,
@@ -21,27 +21,33 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
+from octoreplay.mapping.streams import TreeStreams
 from octoreplay.records import Float64Array, Frame, Int64Array
-from octoreplay.replay.exchange.encoder import PacketEncoder
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 
 
 class Arrival(NamedTuple):
-    """A state of a robot's map as it arrived."""
+    """State of a robot's map that arrived at another robot."""
 
     source: Source
     held: HeldMap
 
 
-RobotT = TypeVar("RobotT", bound="Robot", covariant=True)
+RobotT = TypeVar("RobotT", bound="Robot")
+RobotT_co = TypeVar("RobotT_co", bound="Robot", covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Turn(Generic[RobotT]):
-    """A robot's turn to iterate: what arrived, in order, and the 2 epsilon A_ij of its links, ``step_weights`` (N,)."""
+class Turn(Generic[RobotT_co]):
+    """A robot's iterations in one tick.
 
-    robot: RobotT
+    ``arrived`` are the states that arrived, in order; ``step_weights`` (N,) float64 are the 2 epsilon A_ij of its
+    links.
+    """
+
+    robot: RobotT_co
     arrived: Sequence[Arrival]
     step_weights: Float64Array
 
@@ -58,32 +64,49 @@ class MapSizes:
 
 @dataclass(frozen=True, eq=False)
 class Publication:
-    """What a robot sent to whom in one tick, and the sizes that its whole map had then."""
+    """Messages of a robot in one tick, each with its receivers, and the sizes of the robot's map."""
 
     outbox: Sequence[tuple[tuple[int, ...], MapMessage]]
     sizes: MapSizes
 
     @property
     def packet_bytes(self) -> int:
-        """What a receiver was sent, in the mean [bytes]; 0 without receivers."""
+        """Mean number of bytes sent to a receiver; 0 without receivers."""
         sizes = [message.num_bytes for receivers, message in self.outbox for _ in receivers]
         return round(sum(sizes) / len(sizes)) if sizes else 0
 
 
 class Robot(ABC):
-    """A robot's evidence s_i and its map h_i. A family of rules says what it sends, and how it iterates.
+    """Evidence s_i and map h_i of one robot. Subclasses implement the messages and the iteration of a family of rules.
 
-    ``tick`` numbers, which grow, mark what changed when. Methods of different robots may run in parallel threads.
+    ``index`` is the robot's index in ``config.robots``, ``epoch`` its restart epoch. Methods take the number of the
+    tick as ``tick``; bricks that change get it as revision. Methods of different robots may run in parallel threads.
+
+    Attributes
+    ----------
+    source : Source
+        Robot and restart epoch of the published map.
+    map : SemanticOctree
+        h_i - h_0.
+    streams : TreeStreams
+        Streams of the map with its leaves merged.
+    exchange : Exchange
+        Maps that the robot holds, and versions that its neighbours hold.
+    T_team_sensor : (4, 4) float64 array or None
+        Pose of the sensor at the last scan; None before the first.
+    num_scans, num_iterations : int
+        Scans and iterations in this restart epoch.
     """
 
-    def __init__(self, index: int, config: RunConfig, num_classes: int, encoder: PacketEncoder, epoch: int = 0) -> None:
+    def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
+        num_classes = config.classes.num_classes
         self.robot_id = config.robots[index].robot_id
         self.index = index
         self.source = Source(index, epoch)
         self.num_scans = 0
         self.num_iterations = 0
         self.T_team_sensor: Float64Array | None = None
-        self.exchange = Exchange(config.packet, encoder)
+        self.exchange = Exchange(config.packet, packet_codec)
         self._config = config
         self._caster = ScanCaster(config.sensor, config.map, num_classes)
         self._increments = clamped_increments(config.sensor)
@@ -106,25 +129,25 @@ class Robot(ABC):
 
     @property
     def evidence(self) -> Evidence:
-        """How log q_i follows from the robot's own sums."""
+        """Evidence that gives log q_i."""
         if self._config.consensus.evidence == "time-average":
             return Evidence(self._own_sum, scale=1.0 / max(self.num_scans, 1))
         return Evidence(self._own_sum, scan_counts=self._scan_counts)
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the robot's own octrees: evidence, map and what the rule keeps beside them."""
+        """Bytes of the robot's octrees: evidence, map and the octrees that the rule adds."""
         return sum(o.memory_bytes for o in {id(o): o for o in self._octrees()}.values())
 
     def _octrees(self) -> list[SemanticOctree]:
-        """The robot's own octrees; one may be there twice."""
+        """The robot's octrees, possibly with repetitions."""
         octrees = [self._own_sum, self._log_likelihood, self._last_log_likelihood, self.map]
         return octrees if self._scan_counts is None else [*octrees, self._scan_counts]
 
     # --- scans --------------------------------------------------------------------------------------------------------
 
     def integrate(self, frames: Iterable[Frame], tick: int) -> None:
-        """Add the robot's scans of one tick to its evidence."""
+        """Add the scans of one tick to the evidence."""
         for frame in frames:
             cells = self._caster.cast(frame)
             add_scan(self._own_sum, cells, self._increments, tick)
@@ -135,27 +158,40 @@ class Robot(ABC):
             self.T_team_sensor = frame.T_team_sensor
 
     def changed_evidence(self, tick: int) -> Int64Array:
-        """Codes of the bricks whose log q_i changed in this tick; all of them when every scan rescales all cells."""
+        """Codes (n,) int64 of the bricks whose log q_i changed in this tick.
+
+        With evidence 'time-average' every scan changes all bricks.
+        """
         changed = self._own_sum.revisions >= tick
         if self._config.consensus.evidence == "time-average" and self._scan_tick >= tick:
             return self._own_sum.codes.copy()
         return self._own_sum.codes[changed]
 
     def _update_log_likelihood(self, tick: int) -> None:
-        """Bring log q_i up to the scans of this tick; for ``sum`` it is the evidence itself."""
+        """Update log q_i with the scans of this tick; with evidence 'sum' it is the evidence itself."""
         if self._is_average:
             sum_of_evidence(self._log_likelihood, [self.evidence], self.changed_evidence(tick), tick)
 
     def _keep_log_likelihood(self, tick: int) -> None:
-        """Keep the evidence that an iteration used."""
+        """Store log q_i as that of the last iteration."""
         changed = np.flatnonzero(self._log_likelihood.revisions > self._likelihood_tick)
         self._last_log_likelihood.overwrite(self._log_likelihood, changed, tick)
         self._likelihood_tick = tick
 
     # --- exchange -----------------------------------------------------------------------------------------------------
 
+    def is_due(self, tick: int) -> bool:
+        """True when the robot publishes in a tick, by its publish_period and publish_phase."""
+        robot, period = self._config.robots[self.index], self._config.network.publish_period
+        every = round((robot.publish_period or period) / period)
+        return tick % every == round(robot.publish_phase / period) % every
+
+    def publication(self, receivers: Sequence[int], tick: int, *, with_unpruned: bool) -> Publication:
+        """The robot's messages to its receivers in one tick, and the sizes of its map."""
+        return Publication(self.publish(receivers, tick), self.map_sizes(with_unpruned=with_unpruned))
+
     def map_sizes(self, *, with_unpruned: bool) -> MapSizes:
-        """Sizes of the robot's map. Those without pruning are 0 unless ``with_unpruned``: they take as long as it."""
+        """Sizes of the robot's map. The sizes without pruning are costly, and 0 unless ``with_unpruned``."""
         unpruned = self.map.streams(prune=False) if with_unpruned else None
         return MapSizes(
             octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
@@ -166,35 +202,68 @@ class Robot(ABC):
 
     @abstractmethod
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
-        """What the robot sends to whom in this tick."""
+        """Messages of this tick, each with the indices of its receivers; ``receivers`` are the robot's links."""
 
     def receive(self, sender: int, message: MapMessage) -> tuple[Receipt, Acknowledgement | None]:
-        """Take in what arrived from a neighbour; what became of it, and what to answer."""
+        """Store the maps of a message; its receipt, and the acknowledgement to send (None: none)."""
         receipt, answer = self.exchange.receive(sender, message)
         self._arrived += [Arrival(source, self.exchange.held[source]) for source in receipt.fresh]
         return receipt, answer
 
     def take_arrivals(self) -> list[Arrival]:
-        """What arrived since the last call, in the order of arrival."""
+        """States that arrived since the last call, in the order of arrival."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
     # --- iterations ---------------------------------------------------------------------------------------------------
 
-    @classmethod
-    @abstractmethod
-    def iterate_team(
-        cls, turns: Sequence[Turn[Self]], factor: float, tick: int, config: RunConfig, threads: Executor
-    ) -> list[float]:
-        """One tick's iterations of several robots; returns each one's largest change of a log-odds.
-
-        ``factor`` scales gamma. The result does not depend on ``threads``.
-        """
-
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
-        """The largest change of a log-odds since ``before``, which is overwritten."""
-        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], rule="local", revision=tick)[0]
+        """Largest change of a log-odds since the map was ``before``; overwrites ``before``."""
+        return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
 
     def _update_streams(self) -> None:
-        """The map's streams, with its leaves merged."""
+        """Update ``streams`` with the map of this tick."""
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
+
+
+class Team(ABC, Generic[RobotT]):
+    """The robots of one family of rules, and their iterations together.
+
+    ``robots`` are in the order of ``config.robots``.
+    """
+
+    def __init__(self, config: ResolvedRun, packet_codec: PacketCodec) -> None:
+        self._config = config
+        self._packet_codec = packet_codec
+        self._past_evidence: list[Evidence] = []
+        self.robots = [self._new_robot(index, 0) for index in range(len(config.robots))]
+
+    def restart(self, index: int) -> None:
+        """Replace a robot by one without memory, in the next restart epoch; ``evidence()`` keeps its old evidence."""
+        old = self.robots[index]
+        self._past_evidence.append(old.evidence)
+        self.robots[index] = self._new_robot(index, old.source.epoch + 1)
+        self.robots[index].T_team_sensor = old.T_team_sensor
+
+    def evidence(self) -> list[Evidence]:
+        """Evidence of all robots, that of earlier restart epochs included."""
+        return [*(robot.evidence for robot in self.robots), *self._past_evidence]
+
+    def positions(self) -> Float64Array:
+        """Sensor positions, (N, 3) float64 in metres in the team's frame; NaN before a robot's first scan."""
+        positions = np.full((len(self.robots), 3), np.nan)
+        for row, robot in zip(positions, self.robots, strict=True):
+            if robot.T_team_sensor is not None:
+                row[:] = robot.T_team_sensor[:3, 3]
+        return positions
+
+    @abstractmethod
+    def _new_robot(self, index: int, epoch: int) -> RobotT:
+        """A robot without evidence, in a restart epoch."""
+
+    @abstractmethod
+    def iterate(self, turns: Sequence[Turn[RobotT]], gamma_factor: float, tick: int, threads: Executor) -> list[float]:
+        """Iterations of one tick at several robots; each robot's largest change of a log-odds.
+
+        ``gamma_factor`` scales gamma. The result does not depend on ``threads``.
+        """

@@ -1,0 +1,258 @@
+"""Topics and frames that a robot's configuration leaves out, found in its logs."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from octoreplay.config.robot import RobotConfig
+from octoreplay.errors import ConfigError, InputError, OctoreplayError, suggestion
+from octoreplay.io.containers.log_reader import TopicInfo
+from octoreplay.io.messages.decoders import ENCODINGS
+from octoreplay.io.messages.sensor_messages import Kind, kind_of
+from octoreplay.io.robots.log_groups import LogGroup
+from octoreplay.io.robots.pose_frames import first_pose_frame, root_frame
+from octoreplay.io.robots.pose_source import POSE_KINDS, moving_tf_names, tf_topics
+from octoreplay.io.robots.survey import CLOUDS, IMAGES
+
+# Poses that are commanded, not measured.
+_NO_POSE_HINTS = ("goal", "initialpose", "initial_pose", "target", "setpoint")
+
+_ROLE_KINDS: Mapping[str, tuple[tuple[Kind, ...], str]] = {
+    "depth_topic": (IMAGES, "image"),
+    "label_topic": (IMAGES, "image"),
+    "confidence_topic": (IMAGES, "image"),
+    "camera_info_topic": ((Kind.CAMERA_INFO,), "CameraInfo"),
+    "cloud_topic": (CLOUDS, "point cloud or laser scan"),
+    "pose_topic": (POSE_KINDS, "pose"),
+    "label_info_topic": ((Kind.LABEL_INFO,), "LabelInfo"),
+}
+
+T = TypeVar("T")
+
+
+def find_topics(robot: RobotConfig, group: LogGroup, problems: list[str] | None = None) -> RobotConfig:
+    """Return the robot with its missing topics and frames filled from its logs.
+
+    Raises ConfigError where several topics fit, InputError where a topic is missing or unfit. With ``problems`` such
+    errors are appended to it instead and the topic is left out.
+    """
+    attempt(lambda: _check_named_topics(robot, group), problems)
+    found = _fill(robot, attempt(lambda: _find_sensor(robot, group), problems))
+    attempt(lambda: _check_named_fields(found, group), problems)
+    if found.depth_topic is not None:
+        found = _fill(found, attempt(lambda: _find_labels(found, group), problems))
+        found = _fill(found, attempt(lambda: _find_confidences(found, group), problems))
+        found = _fill(found, attempt(lambda: _find_camera_info(found, group), problems))
+    found = _fill(found, attempt(lambda: _find_label_info(found, group), problems))
+    found = _fill(found, attempt(lambda: _find_pose(found, group), problems))
+    if found.pose_topic is not None and (found.depth_topic or found.cloud_topic) is not None:
+        found = _fill(found, attempt(lambda: _find_frames(found, group), problems))
+    return found
+
+
+def attempt(step: Callable[[], T], problems: list[str] | None) -> T | None:
+    """Return a step's result; with ``problems`` an error of the step is appended to it, and the result is None."""
+    try:
+        return step()
+    except OctoreplayError as error:
+        if problems is None:
+            raise
+        problems.append(str(error))
+        return None
+
+
+def _fill(robot: RobotConfig, found: Mapping[str, str | None] | None) -> RobotConfig:
+    """The robot with its missing fields taken from ``found``."""
+    missing: dict[str, Any] = {
+        key: value for key, value in (found or {}).items() if getattr(robot, key) is None and value is not None
+    }
+    return dataclasses.replace(robot, **missing) if missing else robot
+
+
+# --- named topics ----------------------------------------------------------------------------------------------------
+
+
+def _check_named_topics(robot: RobotConfig, group: LogGroup) -> None:
+    """Raise InputError where a topic that the robot names is not in its logs, or is of another type."""
+    for role, (kinds, what) in _ROLE_KINDS.items():
+        name = getattr(robot, role)
+        if not name:
+            continue
+        infos = [topic for topic in group.topics if topic.name == name]
+        alike = sorted({topic.name for topic in group.topics if kind_of(topic.type_name) in kinds})
+        offer = f"{what} topics: {', '.join(repr(n) for n in alike)}" if alike else f"there are no {what} topics"
+        if not infos:
+            raise InputError(f"{group.paths}: topic '{name}' not found; {offer}{suggestion(name, alike)}")
+        if not any(kind_of(info.type_name) in kinds for info in infos):
+            raise InputError(
+                f"{group.paths}: topic '{name}' is of type {infos[0].type_name} and cannot be the {role}; {offer}"
+            )
+        bad = next((info for info in infos if info.encoding not in ENCODINGS), None)
+        if bad is not None:
+            raise InputError(
+                f"{group.paths}: topic '{name}' is encoded as {bad.encoding}; {', '.join(ENCODINGS)} can be read"
+            )
+
+
+def _check_named_fields(robot: RobotConfig, group: LogGroup) -> None:
+    """Raise InputError where a field that the robot names is not in its clouds."""
+    sample = group.samples().get(robot.cloud_topic or "")
+    for name in (robot.label_field, robot.confidence_field):
+        if name and sample is not None and sample.fields and name not in sample.fields:
+            raise InputError(
+                f"{group.paths}: the points of '{robot.cloud_topic}' have no field '{name}'; their fields are "
+                f"{', '.join(sample.fields)}"
+            )
+
+
+# --- sensor ----------------------------------------------------------------------------------------------------------
+
+
+def _find_sensor(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """Topic that the map is made from: a depth image, else a point cloud, else a laser scan."""
+    if robot.depth_topic or robot.cloud_topic:
+        return {}
+    samples = group.samples()
+    depths = [topic for topic, sample in samples.items() if sample.is_depth]
+    if len(depths) > 1:
+        # Depth images that are registered to the camera of the labels have their size and frame.
+        label_images = {(sample.size, sample.frame_id) for sample in samples.values() if sample.is_label}
+        registered = [topic for topic in depths if (samples[topic].size, samples[topic].frame_id) in label_images]
+        depths = registered if len(registered) == 1 else depths
+    if depths:
+        return {"depth_topic": _only(depths, "depth_topic", "depth images", robot, group)}
+    for kind, what in ((Kind.CLOUD, "point clouds"), (Kind.SCAN, "laser scans")):
+        clouds = [topic for topic, sample in samples.items() if sample.kind is kind]
+        # The only cloud with labels is preferred to clouds without.
+        labelled = [topic for topic in clouds if samples[topic].has_labels]
+        if clouds:
+            return {"cloud_topic": _only(labelled if len(labelled) == 1 else clouds, "cloud_topic", what, robot, group)}
+    raise InputError(f"{group.paths}: no depth image, point cloud or laser scan to map; {group.contents()}")
+
+
+def _find_labels(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """Label image that goes with the depth image; None where the log has none."""
+    if robot.label_topic is not None:
+        return {}
+    samples = group.samples()
+    labels = [topic for topic, sample in samples.items() if topic != robot.depth_topic and sample.is_label]
+    depth = samples.get(robot.depth_topic or "")
+    alike = [topic for topic in labels if depth is not None and samples[topic].size == depth.size]
+    # Images of ids are preferred: a class may have no colour of its own.
+    ids = [topic for topic in alike or labels if not samples[topic].is_color]
+    nearest = _nearest(ids or alike or labels, str(robot.depth_topic))
+    return {"label_topic": _only(nearest, "label_topic", "label images", robot, group) if nearest else None}
+
+
+def _find_confidences(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """Confidence image that goes with the label image; empty where the log has none."""
+    if robot.confidence_topic is not None or not robot.label_topic:
+        return {}
+    samples = group.samples()
+    depth = samples.get(robot.depth_topic or "")
+    alike = [topic for topic, sample in samples.items() if sample.is_confidence and depth and sample.size == depth.size]
+    nearest = _nearest(alike, robot.label_topic)
+    return (
+        {"confidence_topic": _only(nearest, "confidence_topic", "confidence images", robot, group)} if nearest else {}
+    )
+
+
+def _find_camera_info(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """CameraInfo nearest to the depth image in name."""
+    if robot.camera_info_topic is not None or robot.intrinsics is not None:
+        return {}
+    infos = _nearest(group.topics_of((Kind.CAMERA_INFO,)), str(robot.depth_topic))
+    if not infos:
+        raise InputError(
+            f"{group.paths}: there is no CameraInfo for '{robot.depth_topic}'; "
+            f"give intrinsics: [fx, fy, cx, cy] in the team file"
+        )
+    return {"camera_info_topic": _only(infos, "camera_info_topic", "CameraInfo topics", robot, group)}
+
+
+def _find_label_info(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """LabelInfo that goes with the labels; None where the log has none."""
+    if robot.label_info_topic is not None or not (robot.label_topic or robot.cloud_topic):
+        return {}
+    # A LabelInfo for all robots of a log is owned by none of them.
+    present = group.topics_of((Kind.LABEL_INFO,)) or group.unowned_topics(Kind.LABEL_INFO)
+    infos = _nearest(present, str(robot.label_topic or robot.cloud_topic))
+    return {"label_info_topic": _only(infos, "label_info_topic", "LabelInfo topics", robot, group) if infos else None}
+
+
+# --- poses and frames ------------------------------------------------------------------------------------------------
+
+
+def _find_pose(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """Source of the poses: odometry, else stamped poses that can be used, else TF."""
+    if robot.pose_topic is not None or robot.pose_file is not None:
+        return {}
+    odometry = group.topics_of((Kind.ODOMETRY,))
+    if odometry:
+        return {"pose_topic": _only(odometry, "pose_topic", "odometry topics", robot, group)}
+    stamped = [
+        t for t in group.topics_of((Kind.POSE, Kind.PATH)) if not any(hint in t.lower() for hint in _NO_POSE_HINTS)
+    ]
+    tf = _tf_of(robot, group)
+    moving = moving_tf_names(tf)
+    # A stamped pose does not name the frame that it locates, so TF is preferred unless T_body_sensor is given.
+    if stamped and (robot.T_body_sensor is not None or not moving):
+        return {"pose_topic": _only(stamped, "pose_topic", "pose topics", robot, group)}
+    if moving:
+        return {"pose_topic": moving[0]}
+    still = ", or, if the sensor does not move, pose_topic: /tf_static" if tf else ""
+    raise InputError(
+        f"{group.paths}: no poses (odometry, stamped poses, a path or TF) for robot '{robot.robot_id}'; give "
+        f"pose_file: a trajectory in TUM's or KITTI's format{still}"
+    )
+
+
+def _find_frames(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
+    """Frame of the sensor, and frame that the poses are given in."""
+    sample = group.samples().get(robot.depth_topic or robot.cloud_topic or "")
+    sensor_frame = robot.sensor_frame or (sample.frame_id if sample is not None and sample.frame_id else None)
+    found = {"sensor_frame": sensor_frame}
+    if robot.map_frame is not None:
+        return found
+    infos = [topic for topic in group.topics if topic.name == robot.pose_topic]
+    if any(kind_of(topic.type_name) is Kind.TF for topic in infos):
+        found["map_frame"] = root_frame(str(robot.depth_topic or robot.cloud_topic), sensor_frame, group)
+    else:
+        found["map_frame"] = first_pose_frame(str(robot.pose_topic), group)
+    return found
+
+
+def _tf_of(robot: RobotConfig, group: LogGroup) -> tuple[TopicInfo, ...]:
+    """TF topics that concern a robot."""
+    infos = [topic for topic in group.topics if topic.num_messages]
+    return tf_topics(infos, str(robot.depth_topic or robot.cloud_topic))
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+def _nearest(topics: Iterable[str], to: str) -> list[str]:
+    """Topics whose names share the most leading parts with another topic's."""
+    target = to.strip("/").split("/")
+
+    def num_shared(topic: str) -> int:
+        pairs = zip(topic.strip("/").split("/"), target, strict=False)
+        return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+    names = list(topics)
+    best = max(map(num_shared, names), default=0)
+    return [topic for topic in names if num_shared(topic) == best]
+
+
+def _only(topics: Sequence[str], role: str, what: str, robot: RobotConfig, group: LogGroup) -> str:
+    """The only topic of a list. Raises ConfigError with lines for a team file where there are several."""
+    if len(topics) == 1:
+        return topics[0]
+    lines = "".join(f"\n    {role}: {topic}" for topic in topics)
+    raise ConfigError(
+        f"{group.paths}: robot '{robot.robot_id}' has {len(topics)} {what}; put one of these lines into its entry of "
+        f"a team file:{lines}"
+    )

@@ -1,0 +1,92 @@
+"""Tests of robots in team files: valid and invalid values, writing and reading."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.team_file import dump_team, parse_team
+from octoreplay.errors import ConfigError
+
+FULL = RobotConfig(
+    "a", (Path("/logs/a.mcap"), Path("/logs/b.mcap")), depth_topic="/depth", label_topic="", confidence_topic="/sure",
+    camera_info_topic="/info", pose_file=Path("/logs/a.txt"), pose_times=Path("/elsewhere/times.txt"),
+    map_frame="map", sensor_frame="camera", intrinsics=(1.0, 2.0, 3.0, 4.0), rectified=False, depth_unit=0.01,
+    clock_offset=-1.5, T_team_map=(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0),
+    T_body_sensor=(0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0), body_frame="base",
+    body_box=(-1.0, -1.0, 0.0, 1.0, 1.0, 0.5), publish_period=2.0, publish_phase=1.0,
+)  # fmt: skip
+CLOUD = RobotConfig("b", (Path("/logs/b.mcap"),), cloud_topic="/points", label_field="kind", confidence_field="sure")
+
+
+@pytest.mark.parametrize("folder", [None, Path("/logs"), Path("/other")])
+def test_every_field_is_written_and_read(folder):
+    config = RunConfig(robots=(FULL, CLOUD)).with_parameters({"hide_robots": True, "start": 2.0, "every": 3})
+    config = config.with_parameters({"duration": 10.5, "rate_limit": 2.0})
+    text = dump_team(config, folder)
+    assert parse_team(text, name="team", folder=folder or Path("/nowhere")) == config
+    assert ("pose_file: a.txt" in text) == (folder == Path("/logs"))
+    assert "pose_times: /elsewhere/times.txt" in text
+
+
+def test_the_robots_above_set_every_field():
+    """Fields added to RobotConfig must be set in the robots above."""
+    untested = set(RobotConfig.__dataclass_fields__) - {"pose_topic", "label_info_topic"}
+    blank = RobotConfig("x", (Path("x"),))
+    assert all(
+        getattr(FULL, name) != getattr(blank, name) or getattr(CLOUD, name) != getattr(blank, name) for name in untested
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"depth_topic": "/a", "cloud_topic": "/b"}, "give depth_topic or cloud_topic, not both"),
+        ({"pose_topic": "/a", "pose_file": Path("a")}, "give pose_topic or pose_file, not both"),
+        ({"pose_times": Path("a")}, "pose_times goes with pose_file"),
+        ({"body_box": (0.0, 0.0, 0.0, 1.0, 1.0)}, "body_box expects 6 numbers XMIN, YMIN, ZMIN, XMAX, YMAX, ZMAX"),
+        ({"body_box": (0.0, 0.0, 2.0, 1.0, 1.0, 1.0)}, "every minimum below its maximum"),
+        ({"body_box": (0.0, 0.0, math.nan, 1.0, 1.0, 1.0)}, "every minimum below its maximum"),
+        ({"depth_unit": 0.0}, "depth_unit must be greater than 0"),
+        ({"clock_offset": 1e300}, "clock_offset must not hold numbers above 1e+12"),
+        ({"T_team_map": (-1e13, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}, "T_team_map must not hold numbers above 1e+12"),
+        ({"intrinsics": (1.0, 0.0, 1.0, 1.0)}, "intrinsics expects 4 numbers fx, fy, cx, cy"),
+        ({"T_body_sensor": (0.0,) * 6}, "T_body_sensor expects 7 numbers"),
+        ({"T_team_map": (0.0,) * 7}, "T_team_map's quaternion must have length 1"),
+        ({"T_team_map": (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}, "T_team_map must be finite, not "),
+        ({"T_body_sensor": (0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 1.0)}, "T_body_sensor must be finite, not "),
+        ({"intrinsics": (math.nan, 1.0, 1.0, 1.0)}, "intrinsics must be finite, not "),
+        ({"intrinsics": (1.0, 1.0, math.inf, 1.0)}, "intrinsics must be finite, not "),
+        ({"depth_unit": math.nan}, "depth_unit must be finite, not "),
+        ({"clock_offset": math.inf}, "clock_offset must be finite, not inf"),
+    ],
+)
+def test_contradicting_fields_are_refused(fields, sentence):
+    with pytest.raises(ConfigError, match=f"^robot 'r': .*{re.escape(sentence)}"):
+        RobotConfig("r", (Path("a"),), **fields)
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("rectified: perhaps", "rectified"), ("depth_unit: [1]", "depth_unit"), ("body_box: 3", "body_box"),
+        ("body_box: [a, 0, 0, 1, 1, 1]", "body_box"), ("pose_file: [a]", "pose_file"), ("pose_fil: a", "pose_fil"),
+        ("label_field: [1]", "label_field"), ("depth_unit: .nan", "depth_unit"), ("clock_offset: .inf", "clock_offset"),
+    ],
+)  # fmt: skip
+def test_values_of_the_wrong_type_are_refused_by_name(line, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_team(f"robots:\n- id: r\n  log: a.mcap\n  {line}\n", name="team.yaml", folder=Path("/x"))
+
+
+def test_the_files_of_a_robot_are_its_logs_and_pose_files(tmp_path, monkeypatch):
+    assert FULL.files == (*FULL.logs, FULL.pose_file, FULL.pose_times)
+    assert CLOUD.files == CLOUD.logs
+    monkeypatch.chdir(tmp_path)
+    found = RobotConfig("r", (Path("a.mcap"),), pose_file=Path("p.txt"), pose_times=Path("t.txt")).with_absolute_paths()
+    assert found.files == (tmp_path / "a.mcap", tmp_path / "p.txt", tmp_path / "t.txt")
