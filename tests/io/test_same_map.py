@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -49,7 +46,7 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameCounts, SemanticClass
-from support import room
+from support import command_line, room
 from support.log_factory import IDENTITY, SECOND, Entry
 from support.scan_maps import packet_of
 
@@ -189,10 +186,7 @@ def test_runs_on_different_containers_end_with_the_same_map(tmp_path: Path) -> N
         team, result = tmp_path / f"{name}.yaml", tmp_path / f"{name}.result.mcap"
         classes = "".join(f"- {{name: {text}, raw_labels: [{raw}]}}\n" for raw, text in room.NAMES.items())
         team.write_text(f"robots: [{{id: robot, log: {CONTAINERS / name}}}]\nclasses:\n{classes}")
-        done = subprocess.run(
-            [sys.executable, "-m", "octoreplay", "run", str(team), "-o", str(result)],
-            text=True, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-        )  # fmt: skip
+        done = command_line.octoreplay("run", team, "-o", result)
         assert done.returncode == 0, done.stderr
         with octoreplay.open_result(result) as opened:
             leaves = opened.map("robot").leaves()

@@ -2,119 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from octoreplay.errors import ConfigError, InputError, OutputError
-from octoreplay.io.containers.logs import open_log
+from octoreplay.errors import ConfigError
 from octoreplay.io.datasets.cloud_folder import import_clouds
-from octoreplay.io.sensors.clouds import decode_cloud
 from octoreplay.records import ClassTable, SemanticClass
-from support.recordings import RECORDINGS, needs_recordings
-from support.stored_messages import matrix, read_messages
-
-BKI = RECORDINGS / "semantic_pcd" / "bki_sim"
-KITTI = RECORDINGS / "semantic_misc" / "mmdet3d_semantickitti" / "sequences" / "00"
-
-
-def pose(index: int) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("zyx", [0.3 * index + 0.1, 0.1, -0.2]).as_matrix()
-    T[:3, 3] = index, -2.0, 0.5
-    return T
-
-
-def points(index: int) -> np.ndarray:
-    return np.array([[1.0, 2.0, 3.0], [4.0, -5.0, index], [np.nan, 0.0, 0.0], [7.0, 8.0, 9.0]], np.float32)
-
-
-def save_pcd(path: Path, index: int, viewpoint: str | None = None) -> None:
-    if viewpoint is None:
-        T = pose(index)
-        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-        viewpoint = " ".join(map(repr, [*T[:3, 3].tolist(), float(w), float(x), float(y), float(z)]))
-    rows = "\n".join(f"{x!r} {y!r} {z!r} {k + index}" for k, (x, y, z) in enumerate(points(index).tolist()))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(
-        "VERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 2\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\n"
-        f"VIEWPOINT {viewpoint}\nPOINTS 4\nDATA ascii\n{rows}\n"
-    )
-
-
-def pcd_folder(folder: Path, names: tuple[str, ...] = ("scan_2", "scan_9", "scan_10")) -> Path:
-    for index, name in enumerate(names):
-        save_pcd(folder / f"{name}.pcd", index)
-    return folder
-
-
-def kitti(folder: Path, count: int = 3, *, labels: bool = True) -> Path:
-    """A sequence's folder: velodyne/, labels/, poses.txt of the lidar, times.txt."""
-    for name in ("velodyne", "labels"):
-        (folder / name).mkdir(parents=True)
-    for index in range(count):
-        table = np.column_stack([points(index), np.full(4, 0.25 * index)]).astype("<f4")
-        (folder / "velodyne" / f"{index:06d}.bin").write_bytes(table.tobytes())
-        if labels:
-            stored = np.array([40, 3 << 16 | 50, 1, 0], "<u4") + index
-            (folder / "labels" / f"{index:06d}.label").write_bytes(stored.tobytes())
-    np.savetxt(folder / "poses.txt", [pose(index)[:3].ravel() for index in range(count)])
-    (folder / "times.txt").write_text("\n".join(f"{0.1 * index:.6e}" for index in range(count)))
-    return folder
-
-
-def ply_folder(folder: Path, names: tuple[str, ...]) -> Path:
-    folder.mkdir(parents=True)
-    for index, name in enumerate(names):
-        vertices = np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-        for axis, field in enumerate("xyz"):
-            vertices[field] = points(index)[:, axis]
-        vertices["red"], vertices["green"], vertices["blue"] = 1, 2, index
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(folder / f"{name}.ply"))
-    return folder
-
-
-def tum_table(path: Path, stamps: tuple[str, ...]) -> Path:
-    rows = ["# stamp x y z qx qy qz qw"]
-    for index, stamp in enumerate(stamps):
-        T = pose(index)
-        numbers = [*T[:3, 3].tolist(), *Rotation.from_matrix(T[:3, :3]).as_quat().tolist()]
-        rows.append(" ".join([stamp, *map(repr, numbers)]))
-    path.write_text("\n".join(rows))
-    return path
-
-
-def clouds(path: Path) -> list[tuple[int, np.ndarray, np.ndarray | None]]:
-    """(stamp, points, labels) of every cloud of a log, from the reader of a run."""
-    with open_log(path) as log:
-        [topic] = [topic.name for topic in log.topics if topic.name.endswith("/lidar/points")]
-        found = [(message.log_time_ns, message.sensor_message()) for message in log.messages((topic,))]
-    decoded = [(stamp, decode_cloud(cloud, "")) for stamp, cloud in found]
-    return [(stamp, cloud.points, cloud.labels) for stamp, cloud in decoded]
-
-
-def lidar_poses(path: Path) -> list[tuple[int, np.ndarray]]:
-    messages = read_messages(path)
-    [(_, tf)] = messages["/tf_static"]
-    np.testing.assert_array_equal(
-        matrix(tf.transforms[0].transform.translation, tf.transforms[0].transform.rotation), np.eye(4)
-    )
-    [odometry] = [found for topic, found in messages.items() if topic.endswith("/odom")]
-    return [(stamp, matrix(m.pose.pose.position, m.pose.pose.orientation)) for stamp, m in odometry]
-
-
-def finite(index: int) -> np.ndarray:
-    return points(index)[[0, 1, 3]]
-
-
-def in_sensor_frame(index: int) -> np.ndarray:
-    homogeneous = np.column_stack([finite(index), np.ones(3)])
-    return (np.linalg.inv(pose(index)) @ homogeneous.T).T[:, :3]
-
+from support.cloud_folders import (
+    clouds,
+    finite,
+    in_sensor_frame,
+    kitti,
+    lidar_poses,
+    pcd_folder,
+    ply_folder,
+    pose,
+    tum_table,
+)
+from support.stored_messages import read_messages
 
 # --- clouds, poses and labels -----------------------------------------------------------------------------------------
 
@@ -324,154 +230,3 @@ def test_the_same_folder_gives_the_same_bytes(tmp_path):
         (tmp_path / name).parent.mkdir()
         import_clouds(folder, tmp_path / name)
     assert (tmp_path / "x/a.mcap").read_bytes() == (tmp_path / "y/a.mcap").read_bytes()
-
-
-# --- what is wrong ----------------------------------------------------------------------------------------------------
-
-
-def spoil(name: str, data: str | bytes):
-    return lambda folder: (folder / name).write_bytes(data if isinstance(data, bytes) else data.encode())
-
-
-def remove(pattern: str):
-    return lambda folder: [path.unlink() for path in folder.glob(pattern)]
-
-
-@pytest.mark.parametrize(
-    ("spoiler", "message"),
-    [
-        (spoil("velodyne/000001.bin", bytes(40)), r"000001\.bin: 40 bytes are not KITTI's points"),
-        (spoil("labels/000001.label", bytes(12)), r"000001\.label: holds 3 labels of 4 bytes, but its cloud has 4"),
-        (spoil("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2), "has 2 poses; the folder has 3 frames, 3 of them chosen"),
-        (spoil("poses.txt", "1 0 0 0 0 1 0\n" * 3), r"poses\.txt line 1: expects 8 numbers"),
-        (spoil("poses.txt", ""), r"poses\.txt: holds no poses"),
-        (spoil("poses.txt", "nan " * 12 + "\n" + "inf " * 12 + "\n" + "nan " * 12),
-         r"none of the 3 clouds has a usable pose in poses\.txt \(KITTI\)$"),
-        (spoil("poses.txt", "1000 0 0 0 0 0 0 1"), "times are 0.000 to 0.200 s, the poses' 1000.000 to 1000.000 s"),
-        (remove("poses.txt"), "no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one"),
-        (spoil("times.txt", "1\n2\n"), r"times\.txt: has 2 times; the folder has 3 frames"),
-        (spoil("times.txt", "1\n2\n3000000000"), r"times\.txt: times must be below 2\^31 s"),
-        (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; keep clouds of one format in it"),
-        (remove("velodyne/*.bin"), r"no clouds found; looked for \.pcd, \.ply, \.bin, also in velodyne/; the fold"),
-    ],
-)  # fmt: skip
-def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
-    folder = kitti(tmp_path / "00")
-    spoiler(folder)
-    (tmp_path / "out").mkdir()
-    with pytest.raises(InputError, match=message):
-        import_clouds(folder, tmp_path / "out" / "a.mcap")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
-    folder = kitti(tmp_path / "00")
-    import_clouds(folder, tmp_path / "a.mcap")
-    before = (tmp_path / "a.mcap").read_bytes()
-    spoil("velodyne/000002.bin", bytes(40))(folder)
-    with pytest.raises(InputError):
-        import_clouds(folder, tmp_path / "a.mcap", rate=2.0)
-    assert (tmp_path / "a.mcap").read_bytes() == before
-    assert not list(tmp_path.glob("*.partial*"))
-
-
-def test_unset_viewpoints_are_not_poses(tmp_path):
-    folder = pcd_folder(tmp_path / "in")
-    for path in folder.glob("*.pcd"):
-        save_pcd(path, 0, viewpoint="0 0 0 1 0 0 0")
-    with pytest.raises(InputError, match="the VIEWPOINT of every cloud is unset; give a file of poses"):
-        import_clouds(folder, tmp_path / "a.mcap", rate=1.0)
-    # A single cloud may define the map.
-    assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0, last=0).num_frames == 1
-
-
-def test_labels_that_begin_later_are_refused(tmp_path):
-    folder = pcd_folder(tmp_path / "in")
-    first = folder / "scan_2.pcd"
-    first.write_text(first.read_text().replace("x y z label", "x y z nothing"))
-    with pytest.raises(InputError, match=r"scan_9\.pcd: has labels, but the clouds before it have none; choose it as"):
-        import_clouds(folder, tmp_path / "a.mcap", rate=1.0)
-    assert import_clouds(folder, tmp_path / "a.mcap", rate=1.0, first=1).num_labelled == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"rate": 1.0, "times": Path("t.txt")}, ConfigError, "give one of them, not both"),
-        ({"rate": 0.0}, ConfigError, "rate: 0 must be greater than 0"),
-        ({"rate": 1e-11}, InputError, r"times must be below 2\^31 s"),
-        ({"first": 9}, ConfigError, "no frame between first 9 and last None; the folder has 3"),
-        ({"robot_id": "a/b"}, ConfigError, "robot id 'a/b'"),
-        ({"times": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
-        ({"poses": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
-        ({"labels": Path("missing")}, InputError, r"missing: holds no \.label file with the name of a cloud such as"),
-    ],
-)
-def test_options_that_do_not_fit(tmp_path, options, error, message):
-    with pytest.raises(error, match=message):
-        import_clouds(kitti(tmp_path / "00"), tmp_path / "a.mcap", **options)
-    assert not (tmp_path / "a.mcap").exists()
-
-
-def test_missing_input_and_unwritable_output(tmp_path):
-    with pytest.raises(InputError, match="nowhere: is not a folder"):
-        import_clouds(tmp_path / "nowhere", tmp_path / "a.mcap")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"empty: no clouds found; looked for \.pcd, \.ply, \.bin, also in velodyne/$"):
-        import_clouds(tmp_path / "empty", tmp_path / "a.mcap")
-    with pytest.raises(OutputError, match="cannot be written"):
-        import_clouds(kitti(tmp_path / "00"), tmp_path / "none" / "a.mcap")
-
-
-# --- real folders -----------------------------------------------------------------------------------------------------
-
-
-def meeting_points(path: Path) -> tuple[int, float]:
-    """Share of a log's points in the map that have a point of a cloud from another position within 0.1 m.
-
-    And the share of them whose labels are the same.
-    """
-    poses = [T for _, T in lidar_poses(path)]
-    placed = [stored @ T[:3, :3].T + T[:3, 3] for (_, stored, _), T in zip(clouds(path), poses, strict=True)]
-    labels = [found for *_, found in clouds(path)]
-    same = []
-    for T, cloud, own in zip(poses, placed, labels, strict=True):
-        others = [k for k, S in enumerate(poses) if np.linalg.norm(S[:3, 3] - T[:3, 3]) > 1]
-        distances, nearest = cKDTree(np.concatenate([placed[k] for k in others])).query(cloud)
-        near = distances < 0.1
-        same.append(own[near] == np.concatenate([labels[k] for k in others])[nearest[near]])
-    found = np.concatenate(same)
-    return len(found), float(found.mean())
-
-
-@needs_recordings
-def test_real_labelled_scans_line_up_in_the_assumed_frame(tmp_path):
-    summary = import_clouds(BKI, tmp_path / "a.mcap", rate=1.0)
-    assert (summary.num_frames, summary.num_labelled, summary.frame) == (12, 12, "world")
-    [sentence] = summary.warnings
-    assert sentence.endswith(
-        "annotated_1.pcd and 11 more: rows have more columns than the header names; "
-        "those after the named ones were not read"
-    )
-    # Scans from four positions overlap in one room, but not when read as in the sensor's frame.
-    import_clouds(BKI, tmp_path / "b.mcap", rate=1.0, frame="sensor")
-    count, agreement = meeting_points(tmp_path / "a.mcap")
-    assert count > 5000
-    assert agreement > 0.95
-    assert meeting_points(tmp_path / "b.mcap")[0] < 100
-    for (_, stored, labels), (_, T) in zip(clouds(tmp_path / "a.mcap"), lidar_poses(tmp_path / "a.mcap"), strict=True):
-        assert 0.4 < np.linalg.norm(stored, axis=1).min() < 1.0
-        assert set(np.unique(labels)) <= {1, 2, 3}
-        # Label 1 is the floor.
-        assert np.mean((stored @ T[:3, :3].T + T[:3, 3])[labels == 1, 2] < 0.3) > 0.98
-
-
-@needs_recordings
-def test_a_real_kitti_sequence(tmp_path):
-    np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()])
-    summary = import_clouds(KITTI, tmp_path / "a.mcap", rate=10.0, poses=tmp_path / "poses.txt")
-    assert (summary.layout, summary.num_frames, summary.num_points, summary.num_labelled) == ("KITTI", 1, 50, 1)
-    [(_, stored, labels)] = clouds(tmp_path / "a.mcap")
-    raw = np.fromfile(KITTI / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
-    np.testing.assert_array_equal(stored, raw[:, :3])
-    np.testing.assert_array_equal(labels, np.fromfile(KITTI / "labels" / "000000.label", "<u4") & 0xFFFF)

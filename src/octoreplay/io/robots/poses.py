@@ -182,17 +182,17 @@ class FrameTree:
         return result
 
     def why_not_connected(self, a: str, b: str) -> str:
-        """One sentence that says which frames each of two unconnected frames hangs on."""
+        """Return a clause with the reason why no chain joins two frames."""
         a, b = frame_name(a), frame_name(b)
         if not self._parents:
-            return f"no transform from '{b}' to '{a}': the log holds no TF"
+            return f"no transform from '{b}' to '{a}': the log has no TF"
         unknown = [frame for frame in (a, b) if frame not in self.frames]
         if unknown:
             known = ", ".join(self.frames[:12]) + (", ..." if len(self.frames) > 12 else "")
-            return f"no transform from '{b}' to '{a}': TF knows no frame '{unknown[0]}'; its frames are {known}"
+            return f"no transform from '{b}' to '{a}': TF has no frame '{unknown[0]}'; its frames are {known}"
         return (
-            f"no transform from '{b}' to '{a}': '{b}' hangs on '{self.root_of(b)}' and '{a}' on '{self.root_of(a)}', "
-            f"and nothing joins the two"
+            f"no transform from '{b}' to '{a}': the root of '{b}' is '{self.root_of(b)}', that of '{a}' is "
+            f"'{self.root_of(a)}', and no transform joins them"
         )
 
     def forget_before(self, stamp_ns: int) -> None:
