@@ -16,6 +16,7 @@ from octoreplay.replay.exchange.acknowledgement import Possession, encode_acknow
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
 from octoreplay.replay.exchange.packet_codec import PacketCodec
+from support.long_suite import one_in
 from support.octree_factory import octree_of
 
 NUM_BRICKS = 6
@@ -122,9 +123,7 @@ TRIANGLE = [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)]
 CHAIN = [(0, 1), (1, 0), (1, 2), (2, 1)]
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("decodes", [True, False])
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(("name", "decodes", "seed"), one_in(3, CONFIGS, [True, False], range(4)))
 def test_every_received_map_is_a_published_version(name, decodes, seed):
     robots, receipts = _run(CONFIGS[name], seed=seed, num_robots=3, links=TRIANGLE, decodes=decodes, forwards=False)
     newest = {robot.source: robot.exchange.held[robot.source].version for robot in robots}
@@ -134,9 +133,7 @@ def test_every_received_map_is_a_published_version(name, decodes, seed):
     assert sum(receipt.num_damaged for receipt in receipts.values()) > 0
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("decodes", [True, False])
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(("name", "decodes", "seed"), one_in(3, CONFIGS, [True, False], range(4)))
 def test_forwarded_maps_arrive_complete(name, decodes, seed):
     robots, _ = _run(CONFIGS[name], seed=seed, num_robots=3, links=CHAIN, decodes=decodes, forwards=True)
     for robot in robots:
