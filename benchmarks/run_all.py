@@ -26,7 +26,7 @@ QUICK: dict[str, list[str]] = {
     "cold_start": ["--rounds", "2", "--compilations", "1"],
     "roofline": ["--frames", "20", "--rounds", "2"],
     "packets": ["--duration", "20", "--only", "delta", "--only", "ring"],
-    "reading": ["--seconds", "5", "--gigabytes", "0.5", "--rounds", "2"],
+    "reading": ["--seconds", "5", "--gigabytes", "0.5", "--part-gigabytes", "0.3", "--rounds", "2"],
 }
 
 

@@ -67,7 +67,7 @@ CONFIGS = {
     "packets": {
         "packet": PacketConfig(
             packets="delta", content="int8", int8_step=0.1, top_classes=2, packet_compression="none", zstd_level=3,
-            budget=5000, cast="broadcast",
+            budget=5000, cast="broadcast", decode_packets=True,
         )
     },
     "key frames": {"packet": PacketConfig(packets="delta", acknowledge=False, key_frame_every=3, content="float16")},
@@ -168,8 +168,8 @@ def test_a_schedule_file_is_a_list_of_entries(tmp_path):
         ("one_way: [[husky, husky]]", "one_way: 'husky' cannot have a link to itself"),
         ("one_way: [[husky, spot], [spot, husky]]", "husky -> spot and spot -> husky are both listed; keep the one"),
         ("topology: edges\nedges: [[husky, rover]]", "edges: robot 'rover' is not in the team"),
-        ("topology: edges\nweights: given\nedges: [[husky, spot, -0.1]]", "weight of husky - spot must be a finite"),
-        ("topology: edges\nweights: given\nedges: [[husky, spot, .inf]]", "weight of husky - spot must be a finite"),
+        ("topology: edges\nweights: given\nedges: [[husky, spot, -0.1]]", "weight of husky - spot must be finite"),
+        ("topology: edges\nweights: given\nedges: [[husky, spot, .inf]]", "weight of husky - spot must be finite"),
         ("schedule: [{from: 1, robots_off: [rover]}]", "schedule: robot 'rover' is not in the team"),
         ("schedule: [{from: 1, groups: [[husky], [rover]]}]", "schedule: robot 'rover' is not in the team"),
         ("schedule: [{from: 1, links_up: [[husky, rover]]}]", "schedule: robot 'rover' is not in the team"),

@@ -253,11 +253,11 @@ def test_copies_and_packets_keep_all_bits():
     }
     cells |= cube((4, 4, 4), 4, np.full(NUM_CLASSES, 3))
     mass = mass_of(cells)
-    signed = {key: signed(value) for key, value in cells.items()}
+    expected = {key: signed(value) for key, value in cells.items()}
     grown = log_odds_octree({})
     grown.overwrite(mass, np.arange(mass.num_bricks))
     for octree in (mass, mass.copy(), grown, decode_packet(encode_packet(mass))):
-        assert_equal(units_of(octree), signed)
+        assert_equal(units_of(octree), expected)
 
 
 def test_brick_of_two_different_denormals_is_not_pruned():

@@ -45,7 +45,7 @@ class Robot:
         self.mass, self.total, self.map = (log_odds_octree({}) for _ in range(3))
         self.weight, self.total_weight = WHOLE_WEIGHT, 0
         self.evidence, self.last_evidence = log_odds_octree({}), log_odds_octree({})
-        self.heard = {}
+        self.last_received = {}
         self.twin = RatioRobot((len(KEYS), NUM_CLASSES))
 
     def observe(self, log_odds):
@@ -64,15 +64,15 @@ class Robot:
         """Content of a packet: sigma and eta, and those of the reference."""
         return self.total.copy(), self.total_weight, self.twin.total, self.twin.total_weight
 
-    def start_hearing(self, sender, sums):
+    def start_link(self, sender, sums):
         """A link comes up: earlier shares are not for this receiver."""
-        self.heard[sender], self.twin.heard[sender] = sums[:2], sums[2:]
+        self.last_received[sender], self.twin.last_received[sender] = sums[:2], sums[2:]
 
     def receive(self, sender, sums):
-        old, old_weight = self.heard.get(sender, (None, 0))
+        old, old_weight = self.last_received.get(sender, (None, 0))
         receive(self.mass, [(sums[0], old)], 0)
         self.weight += sums[1] - old_weight
-        self.heard[sender] = sums[:2]
+        self.last_received[sender] = sums[:2]
         self.twin.receive(sender, *sums[2:])
 
     def recover(self):
@@ -135,7 +135,7 @@ def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
         masses, weight = sum(_dense(robot.mass) for robot in robots), sum(robot.weight for robot in robots)
         for sender, robot in enumerate(robots):
             for receiver in receivers[sender]:
-                octree, old_weight = robots[receiver].heard.get(sender, (log_odds_octree({}), 0))
+                octree, old_weight = robots[receiver].last_received.get(sender, (log_odds_octree({}), 0))
                 masses = masses + _dense(robot.total) - _dense(octree)
                 weight += robot.total_weight - old_weight
         evidence = sum(robot.twin.evidence for robot in robots)
@@ -192,7 +192,9 @@ def test_no_drift_over_a_day_of_ticks():
     for tick in range(86_400):
         if tick in (0, 43_000, 86_360):
             octrees = [(_of_units(twin.mass), _of_units(twin.total)) for twin in twins]
-            heard = [_of_units(twins[i].heard.get(i - 1, (twins[i].total * 0, 0))[0]) for i in (0, 1, 2)]
+            last_received = [
+                _of_units(twins[i].last_received.get(i - 1, (twins[i].total * 0, 0))[0]) for i in (0, 1, 2)
+            ]
         arrives = rng.random(3) >= 0.3
         for twin in twins:
             twin.share_out(1)
@@ -205,8 +207,8 @@ def test_no_drift_over_a_day_of_ticks():
             share_out(mass, total, 1, tick)
         for i in np.flatnonzero(arrives):
             sums = octrees[i - 1][1].copy()
-            receive(octrees[i][0], [(sums, heard[i])], tick)
-            heard[i] = sums
+            receive(octrees[i][0], [(sums, last_received[i])], tick)
+            last_received[i] = sums
         if tick in (39, 43_039, 86_399):
             for twin, (mass, total) in zip(twins, octrees, strict=True):
                 assert (_dense(mass) == twin.mass).all()
@@ -244,7 +246,7 @@ def test_newcomer_converges_at_the_rate_of_lambda_2():
     num_ticks = math.ceil(math.log(0.01) / math.log(second))
     assert num_ticks == 12
     for sender, receiver in ((0, 5), (4, 5), (5, 0), (5, 4)):
-        robots[receiver].start_hearing(sender, robots[sender].sums())
+        robots[receiver].start_link(sender, robots[sender].sums())
     start = abs(robots[5].recover() - mean).max()
     assert start > 1.0
     for _ in range(num_ticks):

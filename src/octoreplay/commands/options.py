@@ -28,15 +28,20 @@ class SectionedCommand(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, section by section."""
-        groups: dict[str, list[tuple[str, str]]] = {"Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None and isinstance(parameter, click.Option):
-                section = SECTIONS.get(getattr(parameter, "section", ""))
-                groups.setdefault(section.title if section else "Options", []).append(record)
-        for heading, records in groups.items():
+        for heading, records in option_groups(self, ctx).items():
             with formatter.section(heading):
                 formatter.write_dl(records)
+
+
+def option_groups(command: click.Command, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
+    """Return the options of a command with their help texts, by the titles of the configuration's sections."""
+    groups: dict[str, list[tuple[str, str]]] = {"Options": []}
+    for parameter in command.get_params(ctx):
+        record = parameter.get_help_record(ctx)
+        if record is not None and isinstance(parameter, click.Option):
+            section = SECTIONS.get(getattr(parameter, "section", ""))
+            groups.setdefault(section.title if section else "Options", []).append(record)
+    return groups
 
 
 def _option(parameter: Parameter) -> _ParameterOption:

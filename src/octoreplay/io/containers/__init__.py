@@ -1,1 +1,1 @@
-"""From files to raw messages: MCAP, ROS 1 bags and rosbag2, whole or damaged; and writing MCAP."""
+"""Readers of MCAP files, ROS 1 bags and rosbag2 recordings, also damaged ones, and a writer of MCAP files."""

@@ -1,1 +1,1 @@
-"""From bytes to message objects: ROS, protobuf and JSON, and what sensors and poses look like in all of them."""
+"""Decoding of ROS, protobuf and JSON messages, and one form of sensor, pose and label messages for all of them."""
