@@ -7,7 +7,6 @@ oracle, all metrics and settling. Both sides use two threads.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import statistics
 import tempfile
 import threading
@@ -115,20 +114,28 @@ def main() -> None:
     options = arguments(__doc__ or "", rounds=3, add=_add_options)
     report = Report("replay", vars(options))
     config = load_team_file(_logs(options.duration, options.robots) / "team.yaml")
-    config = dataclasses.replace(config, consensus=dataclasses.replace(config.consensus, rule=options.rule))
+    config = config.with_parameters({"rule": options.rule, "packets": options.packets})
     watch = Stopwatch()
     summaries: list[RunSummary] = []
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "result.mcap"
         _replay(config, output, Stopwatch(), [])  # the kernels are loaded
         result_bytes = output.stat().st_size
+        decoding = config.with_parameters({"decode_packets": True})
         times = interleave(
-            {"read": lambda: _read(config), "replay": lambda: _replay(config, output, watch, summaries)}, options.rounds
+            {
+                "read": lambda: _read(config),
+                "replay": lambda: _replay(config, output, watch, summaries),
+                "decoding": lambda: _replay(decoding, output, Stopwatch(), []),
+            },
+            options.rounds,
         )
     report.add(measured("reading and decoding, 2 threads", times["read"], "s"))
     report.add(measured("replay, 2 threads", times["replay"], "s"))
     ratios = [whole / read for read, whole in zip(times["read"], times["replay"], strict=True)]
     report.add(measured("replay / reading and decoding", ratios, "", must=5.0, goal=3.0))
+    ratios = [decoded / whole for whole, decoded in zip(times["replay"], times["decoding"], strict=True)]
+    report.add(measured("replay with decode_packets / replay", ratios, ""))
     speeds = [summaries[0].log_seconds / seconds for seconds in times["replay"]]
     report.add(measured("replay", speeds, "times real time", must=8.0, goal=12.0, more_is_better=True))
     whole = sum(times["replay"])
@@ -151,6 +158,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, default=30.0, help="of the logs in seconds (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=6, help="default: %(default)s")
     parser.add_argument("--rule", default="gradient", help="default: %(default)s")
+    parser.add_argument("--packets", default="full", help="full or delta (default: %(default)s)")
 
 
 def _logs(duration: float, num_robots: int) -> Path:

@@ -11,6 +11,7 @@ import pytest
 import octoreplay
 from octoreplay import cli
 from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
@@ -102,3 +103,24 @@ def test_the_page_on_experiments_has_the_tables_of_the_stored_runs(name: str) ->
     page = (DOCS / "experiments.md").read_text(encoding="utf-8")
     stored = page.partition(f"<!-- {name} -->\n")[2].partition("<!-- end -->")[0]
     assert stored == answer_tables(name, tables)
+
+
+def traits_table() -> str:
+    """Table of the rules' traits as the page on the algorithm shows it."""
+    heads = ("rule", "packets hold", "ε", "γ", "modes", "packets", "exact in spite of losses", "of restarts")
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for rule in RULES.values():
+        flags = ["yes" if flag else "" for flag in (rule.has_step_size, rule.has_gamma)]
+        exact = ["yes" if flag else "no" for flag in (rule.survives_losses, rule.survives_restarts)]
+        sends = rule.exchanges is not Exchanged.NOTHING
+        cells = [
+            f"`{rule.name}`", rule.exchanges.value, *flags, ", ".join(f"`{mode}`" for mode in rule.modes),
+            ", ".join(f"`{kind}`" for kind in rule.packets) if sends else "", *(exact if sends else ("", "")),
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |"))
+    return "\n".join(lines) + "\n"
+
+
+def test_the_page_on_the_algorithm_has_the_traits_of_every_rule() -> None:
+    page = (DOCS / "algorithm.md").read_text(encoding="utf-8")
+    assert page.partition("<!-- traits -->\n")[2].partition("<!-- end -->")[0] == traits_table()

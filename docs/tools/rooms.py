@@ -72,9 +72,9 @@ def _svg(rows: Sequence[Sequence[str]], arrows: Sequence[tuple[str, str]]) -> st
     }
     height = ROW * len(rows)
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
-        ' font-family="sans-serif" font-size="14">',
-        '<marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" orient="auto">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}">',
+        "<style>text { font-family: sans-serif; text-anchor: middle }</style>",
+        '<marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" orient="auto">',
         '<path d="M0 0L8 4L0 8z" fill="#555"/></marker>',
         f'<rect width="{WIDTH}" height="{height}" fill="#fff"/>',
         *(_arrow(centers[start], centers[end]) for start, end in arrows),
@@ -97,7 +97,9 @@ def _imported(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("octoreplay."):
             yield _room((node.module or "").split(".")[1:])
         elif isinstance(node, ast.Import):
-            yield from (_room(alias.name.split(".")[1:]) for alias in node.names if alias.name.startswith("octoreplay."))
+            yield from (
+                _room(alias.name.split(".")[1:]) for alias in node.names if alias.name.startswith("octoreplay.")
+            )
 
 
 def _rows(imports: Mapping[str, set[str]]) -> list[list[str]]:
@@ -141,9 +143,9 @@ def _arrow(start: tuple[int, int], end: tuple[int, int]) -> str:
 def _box(name: str, x: int, y: int) -> str:
     """A box with a name, and with the file of a step below it."""
     title, _, file = name.partition("\n")
-    lines = [f'<text x="{x}" y="{y - 3 if file else y + 5}" text-anchor="middle">{escape(title)}</text>']
+    lines = [f'<text x="{x}" y="{y - 3 if file else y + 5}" font-size="14">{escape(title)}</text>']
     if file:
-        lines.append(f'<text x="{x}" y="{y + 13}" text-anchor="middle" font-size="11">{escape(file)}</text>')
+        lines.append(f'<text x="{x}" y="{y + 13}" font-size="11">{escape(file)}</text>')
     return (
         f'<rect x="{x - BOX_WIDTH // 2}" y="{y - BOX_HEIGHT // 2}" width="{BOX_WIDTH}" height="{BOX_HEIGHT}" rx="5"'
         f' fill="#d9f2ee" stroke="#00796b"/>{"".join(lines)}'

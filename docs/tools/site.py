@@ -23,7 +23,11 @@ from octoreplay.commands.options import option_groups
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
-OUTSIDE = {"benchmarks/README.md": "benchmarks.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+OUTSIDE = {
+    "benchmarks/README.md": "benchmarks.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+}
 """Pages outside docs/ that the site has too, and their names in the site."""
 
 HOME = {"README.md": "index.md"}
@@ -40,7 +44,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, files: Files, **_: MkDocsConfig) -> str:
     """Return the page with its links as the site needs them, and with the options where they belong."""
     names = {name: ROOT / source for source, name in OUTSIDE.items()}
     folder = names.get(page.file.src_uri, DOCS / page.file.src_uri).parent

@@ -18,10 +18,10 @@ from octoreplay.config.team_file import dump_team, load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.records import ClassTable, FrameCounts, SemanticClass
+from support.fixture_paths import PAIR
 from support.recordings import RECORDINGS, needs_recordings
 
 HYDRA = RECORDINGS / "semantic_labels" / "hydra_label_spaces"
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair"
 ROBOTS = "robots: [{id: husky, log: husky.mcap}]\n"
 LIST = "classes: [{name: road, raw_labels: 1}, {name: car, raw_labels: [2, 5]}, {name: bus, raw_labels: 3}]\n"
 

@@ -1,18 +1,16 @@
-"""A run over damaged logs ends with exit code 3 and one sentence for each of them."""
+"""A run of damaged logs ends with exit code 3 and one warning for each log."""
 
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from support.command_line import octoreplay
+from support.fixture_paths import PAIR
 from support.log_damage import mcap_chunks
-
-PAIR = Path(__file__).resolve().parents[1] / "fixtures" / "pair"
 
 
 def rewrite_in_small_chunks(source: Path, target: Path) -> None:
@@ -33,7 +31,7 @@ def rewrite_in_small_chunks(source: Path, target: Path) -> None:
         writer.finish()
 
 
-def test_a_run_over_damaged_logs_says_once_what_was_skipped(tmp_path):
+def test_a_run_of_damaged_logs_warns_once_for_each_log(tmp_path):
     for name in ("team.yaml", "husky_2.mcap"):
         shutil.copy(PAIR / name, tmp_path / name)
     cut, damaged = tmp_path / "husky_2.mcap", tmp_path / "husky_1.mcap"
@@ -44,10 +42,7 @@ def test_a_run_over_damaged_logs_says_once_what_was_skipped(tmp_path):
     for chunk in (chunks[20], chunks[25]):
         data[chunk.end - 3] ^= 1
     damaged.write_bytes(data)
-    done = subprocess.run(
-        [sys.executable, "-m", "octoreplay", "run", str(tmp_path / "team.yaml"), "-o", str(tmp_path / "out.mcap")],
-        text=True, capture_output=True, check=False, timeout=300,
-    )  # fmt: skip
+    done = octoreplay("run", tmp_path / "team.yaml", "-o", tmp_path / "out.mcap")
     assert done.returncode == 3, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith(f"warning: {tmp_path}")]
     assert sorted(lines) == [

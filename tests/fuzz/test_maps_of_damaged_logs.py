@@ -1,4 +1,4 @@
-"""Committed logs that are damaged, or whose messages lie, come to a map or to one sentence; never anything else."""
+"""Damaged logs and logs with false messages give a map, or are refused with a sentence; nothing else is raised."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ from support.hostile_logs import (
 )
 from support.log_factory import write_rows
 
-CASES = 12
+CASES = [pytest.param(range(4), id="few"), pytest.param(range(4, 40), id="many", marks=pytest.mark.long)]
 
 
+@pytest.mark.parametrize("cases", CASES)
 @pytest.mark.parametrize("name", LOGS)
-def test_a_map_or_a_sentence_never_a_traceback(tmp_path, name):
+def test_a_damaged_log_gives_a_map_or_a_sentence(tmp_path, name, cases):
     good = map_of_log(FIXTURES / name, is_run=False)
     assert good.refusal is None
     assert good.num_frames >= 4
     num_maps = 0
-    for case in range(CASES):
+    for case in cases:
         path, what = write_hostile_log(name, tmp_path, random.Random(f"maps of {name} {case}"))
         try:
-            outcome = map_of_log(path, is_run=case == 0)
+            outcome = map_of_log(path, is_run=case % 10 == 0)
         except Exception as error:
             raise AssertionError(f"case {case}: {what}") from error
         num_maps += outcome.num_frames > 0
-    # Something is left of most logs, or they are given up too early; a file compressed as a whole is one block of zstd.
-    assert num_maps >= 2 or name.endswith("file_zstd")
+    # Most damage leaves something of a log; a file compressed as a whole is one block of zstd.
+    assert num_maps >= len(cases) // 6 or name.endswith("file_zstd")
 
 
 @pytest.mark.parametrize("mutation", dict.fromkeys(MESSAGE_MUTATIONS))
@@ -75,6 +76,6 @@ def test_one_broken_pose_does_not_end_a_run(tmp_path):
     assert counts.used > good.used / 2
 
 
-def test_warnings_of_numpy_are_errors_here():
+def test_numpy_warnings_are_errors():
     with pytest.raises(RuntimeWarning):
         np.float64(1e308) * np.array([1e308])

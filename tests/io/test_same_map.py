@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -14,33 +11,24 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import octoreplay
 from fixtures.foxglove_messages import write_protobuf
-from fixtures.make_containers import (
+from fixtures.make_streams import PALETTE, SIDES, clouds, lidar_poses, scan_ranges
+from fixtures.scene import (
     CAMERA,
-    CONTAINERS,
     DEPTH,
     FOXGLOVE,
     FOXGLOVE_TYPES,
     INFO,
     JOINT,
-    JSON,
     LABELS,
-    PALETTE,
     ROS2,
-    SIDES,
     START_NS,
-    STREAMS,
     UNLABELLED,
-    Encoding,
     camera_poses,
-    clouds,
-    idl_definition,
     in_order,
-    lidar_poses,
     pose_entries,
     record,
-    scan_ranges,
-    write_mcap,
 )
+from fixtures.writers import JSON, Encoding, idl_definition, write_mcap
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
@@ -49,7 +37,8 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.sensor_messages import LabelNames
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameCounts, SemanticClass
-from support import room
+from support import command_line, room
+from support.fixture_paths import CONTAINERS, STREAMS
 from support.log_factory import IDENTITY, SECOND, Entry
 from support.scan_maps import packet_of
 
@@ -138,7 +127,7 @@ def test_classes_come_from_the_label_info(name: str) -> None:
         found = resolved(CONTAINERS / name, None).classes
         assert [(c.name, c.raw_labels) for c in found.classes] == [(c.name, c.raw_labels) for c in CLASSES.classes]
     else:
-        with pytest.raises(octoreplay.ConfigError, match=r"labels on '/camera/labels/image_raw' but no LabelInfo"):
+        with pytest.raises(octoreplay.ConfigError, match="no LabelInfo names the labels on '/camera/labels/"):
             resolved(CONTAINERS / name, None)
 
 
@@ -189,10 +178,7 @@ def test_runs_on_different_containers_end_with_the_same_map(tmp_path: Path) -> N
         team, result = tmp_path / f"{name}.yaml", tmp_path / f"{name}.result.mcap"
         classes = "".join(f"- {{name: {text}, raw_labels: [{raw}]}}\n" for raw, text in room.NAMES.items())
         team.write_text(f"robots: [{{id: robot, log: {CONTAINERS / name}}}]\nclasses:\n{classes}")
-        done = subprocess.run(
-            [sys.executable, "-m", "octoreplay", "run", str(team), "-o", str(result)],
-            text=True, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "utf-8"}, check=False, timeout=300,
-        )  # fmt: skip
+        done = command_line.octoreplay("run", team, "-o", result)
         assert done.returncode == 0, done.stderr
         with octoreplay.open_result(result) as opened:
             leaves = opened.map("robot").leaves()

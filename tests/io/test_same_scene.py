@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import octoreplay
-from fixtures.make_containers import write_mcap
+from fixtures.writers import write_mcap
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.robots.robot_log import RobotLog

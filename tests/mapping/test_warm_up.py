@@ -45,6 +45,7 @@ def signatures_used(*arguments):
     return json.loads(done.stdout)
 
 
+@pytest.mark.long
 def test_compiled_signatures_are_those_of_a_replay(tmp_path):
     replay, compiled = signatures_used(TEAM, tmp_path / "result.mcap"), signatures_used()
     assert {name: replay.get(name) for name in compiled} == compiled
@@ -99,7 +100,6 @@ def test_no_process_is_started_with_a_filled_cache(started, tmp_path):
     assert not started
 
 
-@pytest.mark.parametrize("change", [(warm_up, "_num_cores", lambda: 1), (compiler, "_CACHE_FOLDER", None)])
 def test_compile_if_needed_compiles_with_an_empty_cache_only(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(warm_up, "compile_kernels", lambda: calls.append(1))
@@ -111,6 +111,7 @@ def test_compile_if_needed_compiles_with_an_empty_cache_only(tmp_path, monkeypat
     assert calls == [1]
 
 
+@pytest.mark.parametrize("change", [(warm_up, "_num_cores", lambda: 1), (compiler, "_CACHE_FOLDER", None)])
 def test_no_process_is_started_on_one_core_or_without_a_cache(change, started, monkeypatch):
     monkeypatch.setattr(*change)
     with warm_up.second_compiler():

@@ -1,3 +1,5 @@
+"""Body boxes of other robots in maps."""
+
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +22,7 @@ CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
 
 
 def robot_of(tmp_path, name, **fields):
-    """A robot that drives along x and sees a wall 1 m ahead of its camera, all the time."""
+    """Robot that drives along x with a wall 1 m in front of its camera in every image."""
     path = write_mcap(tmp_path / f"{name}.mcap", robot_entries(num_frames=10, labels=False))
     return ResolvedRobot(
         name, (path,), depth_topic="/camera/depth/image_raw", camera_info_topic="/camera/depth/camera_info",
@@ -30,7 +32,7 @@ def robot_of(tmp_path, name, **fields):
 
 @pytest.fixture
 def config(tmp_path):
-    """Robot b drives 1 m ahead of robot a, and is what a sees; b sees a wall."""
+    """Team in which robot b drives 1 m in front of robot a: a observes b, and b observes a wall."""
     robots = (
         robot_of(tmp_path, "a"),
         robot_of(
@@ -41,7 +43,7 @@ def config(tmp_path):
 
 
 def num_occupied(config, *, hides):
-    """Occupied leaves of each robot's map at the end."""
+    """Return the number of occupied leaves of each robot's last map."""
     with ExitStack() as stack:
         logs = [stack.enter_context(RobotLog(robot, config.time, CLASSES)) for robot in config.robots]
         sources = [stack.enter_context(ReadAhead(log)) for log in logs]
@@ -50,15 +52,15 @@ def num_occupied(config, *, hides):
         return [int(np.count_nonzero(octree.leaves(0.0).log_odds[:, 0] > 0)) for octree in last.maps]
 
 
-def test_what_a_robot_sees_of_another_is_not_mapped(config):
+def test_body_boxes_of_other_robots_are_not_mapped(config):
     seen, hidden = num_occupied(config, hides=False), num_occupied(config, hides=True)
     assert seen[0] > 10
-    # The robot in front frees the cells that it drives through, and its own box is no one else's.
+    # Robot b frees the cells that it drives through, and its body box hides nothing from itself.
     assert hidden[0] == 0
     assert hidden[1] == seen[1] > 10
 
 
-def test_a_run_hides_robots_where_it_is_told_to(config):
+def test_hide_robots_changes_the_map_of_the_robot_behind(config):
     volumes = {}
     for hides in (False, True):
         summary = replay_team(config.with_parameters({"hide_robots": hides}), None)

@@ -1,4 +1,4 @@
-"""The maps that a result holds."""
+"""Maps stored in a result."""
 
 from pathlib import Path
 
@@ -9,12 +9,11 @@ from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
+from support.fixture_paths import PAIR_TEAM
 
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 
-
-def test_the_centralised_map_is_the_sum_of_what_the_robots_saw(tmp_path: Path) -> None:
-    config = load_team_file(PAIR).with_parameters({"rule": "local", "state_every": 1.0, "prob_free": 0.7})
+def test_the_centralised_map_is_the_sum_of_the_robots_evidence(tmp_path: Path) -> None:
+    config = load_team_file(PAIR_TEAM).with_parameters({"rule": "local", "state_every": 1.0, "prob_free": 0.7})
     replay_team(config, tmp_path / "result.mcap")
     with open_result(tmp_path / "result.mcap") as result:
         num_stored = 0
@@ -29,6 +28,6 @@ def test_the_centralised_map_is_the_sum_of_what_the_robots_saw(tmp_path: Path) -
         assert result.map("central").num_robots == 1
 
 
-def test_no_robot_may_have_the_name_of_the_centralised_map(tmp_path: Path) -> None:
+def test_the_name_of_the_centralised_map_is_refused_as_a_robot_id(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="robot id 'central': is the name of the centralised map"):
         parse_team("robots: [{id: central, log: a.mcap}]", name="team.yaml", folder=tmp_path)

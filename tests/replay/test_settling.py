@@ -1,4 +1,4 @@
-"""How long settling may take and how long it has to be quiet, where packets are lost or late."""
+"""Largest number of settling ticks and number of quiet ticks, with packets that are lost or late."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ def _ticks(rate):
 
 @pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "ratio", "flood", "merge"])
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
-def test_without_faults_one_quiet_tick_is_enough_and_the_graph_says_how_long(topology, rule):
+def test_without_faults_settling_needs_one_quiet_tick_and_the_graph_limits_its_ticks(topology, rule):
     graph, config = _team(topology=topology, rule=rule)
     assert num_quiet_ticks(graph, config) == 1
     expected = settle_ticks_max(graph, config.consensus, step_size(graph, config.consensus))
     assert num_settle_ticks(graph, config) == expected > RAMP
 
 
-def test_what_is_given_counts_whatever_the_links_do():
+def test_given_numbers_override_the_links():
     for loss in (0.0, 0.5):
         assert num_settle_ticks(*_team(settle_max=7, loss=loss, latency=3.0)) == 7
         assert num_settle_ticks(*_team(settle=0, loss=loss, latency=3.0)) == 0
 
 
 @pytest.mark.parametrize("rule", ["ratio", "flood", "merge", "local"])
-def test_a_step_size_that_a_rule_does_not_use_changes_nothing(rule):
+def test_an_unused_step_size_changes_nothing(rule):
     expected = num_settle_ticks(*_team(rule=rule, topology="line"))
     assert num_settle_ticks(*_team(rule=rule, topology="line", epsilon=5.0)) == expected
 
@@ -66,14 +66,14 @@ def test_a_step_size_that_a_rule_does_not_use_changes_nothing(rule):
 
 
 @pytest.mark.parametrize("loss", [0.0005, 0.002, 0.01, 0.3, 0.5, 0.9, 0.99])
-def test_a_link_is_hardly_ever_silent_for_as_long_as_it_has_to_be_quiet(loss):
+def test_a_link_is_rarely_silent_for_all_quiet_ticks(loss):
     num_quiet = num_quiet_ticks(*_team(loss=loss))
     assert loss**num_quiet <= QUIET_PROB * (1 + 1e-9)
     assert num_quiet == 1 or loss ** (num_quiet - 1) > QUIET_PROB
 
 
 @pytest.mark.parametrize(("loss", "num_quiet"), [(0.3, 6), (0.99, 688)])
-def test_losses_slow_the_team_down(loss, num_quiet):
+def test_losses_lengthen_settling(loss, num_quiet):
     """In a complete graph of four each link has the weight (1 - loss) / 4: a tick leaves ``loss`` of a difference."""
     graph, config = _team(loss=loss)
     assert num_quiet_ticks(graph, config) == num_quiet
@@ -85,14 +85,14 @@ def test_losses_slow_the_team_down(loss, num_quiet):
     [{"loss": 0.3}, {"corruption": 0.3}, {"loss": 0.125, "corruption": 0.2}],
     ids=str,
 )
-def test_what_is_lost_and_what_is_damaged_counts_alike(parameters):
+def test_lost_and_damaged_packets_count_alike(parameters):
     assert LinkConfig(**parameters).mean_loss == pytest.approx(0.3)
     graph, config = _team(**parameters)
     assert num_quiet_ticks(graph, config) == 6
     assert num_settle_ticks(graph, config) == num_settle_ticks(*_team(loss=0.3))
 
 
-def test_a_burst_that_goes_on_is_waited_for():
+def test_long_bursts_lengthen_settling():
     """In a burst that goes on with 0.65, 17 lost packets in a row are one in a thousand."""
     graph, config = _team(burst_start=0.15, burst_end=0.35)
     assert LinkConfig(burst_start=0.15, burst_end=0.35).mean_loss == pytest.approx(0.3)
@@ -101,7 +101,7 @@ def test_a_burst_that_goes_on_is_waited_for():
 
 
 @pytest.mark.parametrize(("loss", "start", "end", "burst_loss"), [(0.1, 0.2, 0.3, 0.9), (0.4, 0.05, 0.5, 0.6)])
-def test_losses_in_a_row_are_as_rare_as_the_links_make_them(loss, start, end, burst_loss):
+def test_successive_losses_have_the_probability_of_the_links(loss, start, end, burst_loss):
     link = LinkConfig(loss=loss, burst_start=start, burst_end=end, burst_loss=burst_loss)
     lost = np.array([1.0 - start / (start + end), start / (start + end)])
     steps = np.array([[1.0 - start, start], [end, 1.0 - end]])
@@ -121,7 +121,7 @@ def test_the_worst_link_counts():
     assert num_quiet_ticks(graph, config) == num_quiet_ticks(*_team(topology="line", loss=0.01)) == 2
 
 
-def test_links_that_carry_nothing_are_not_waited_for():
+def test_links_that_lose_everything_are_ignored():
     graph, config = _team(loss=1.0)
     assert num_quiet_ticks(graph, config) == 1
     assert num_settle_ticks(graph, config) == RAMP + 1
@@ -149,13 +149,13 @@ def test_without_acknowledgements_a_loss_lasts_until_the_next_whole_map():
      ({"latency": 0.5, "publish_period": 0.25}, 2), ({"latency": 0.2, "publish_period": 0.05}, 4)],
     ids=str,
 )  # fmt: skip
-def test_what_is_on_its_way_is_waited_for(parameters, delay):
+def test_delays_lengthen_settling(parameters, delay):
     graph, config = _team(**parameters)
     assert num_quiet_ticks(graph, config) == 1 + delay
     assert num_settle_ticks(graph, config) == RAMP + (1 + delay) + delay
 
 
-def test_the_robot_that_publishes_least_often_counts():
+def test_the_longest_publish_period_counts():
     graph, config = _team(periods={"b": 3.0, "c": 2.0})
     assert num_quiet_ticks(graph, config) == 3
     assert num_settle_ticks(graph, config) == RAMP + 3 + 2

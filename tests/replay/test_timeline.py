@@ -1,3 +1,5 @@
+"""Frames of all robots in the order of time."""
+
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -26,7 +28,7 @@ class FakeLog:
     st.lists(st.lists(st.integers(0, 50), max_size=8).map(sorted), max_size=4),
     st.lists(st.integers(0, 60), max_size=6).map(sorted),
 )
-def test_each_robots_frames_come_once_each_in_order(stamps_of_robots, ticks):
+def test_frames_of_each_robot_come_once_and_in_order(stamps_of_robots, ticks):
     timeline = Timeline([FakeLog(str(i), stamps) for i, stamps in enumerate(stamps_of_robots)])
     assert timeline.first_stamp_ns == min((stamps[0] for stamps in stamps_of_robots if stamps), default=None)
     given_so_far: list[list[int]] = [[] for _ in stamps_of_robots]
@@ -49,13 +51,13 @@ def test_no_log_is_read_more_than_one_frame_ahead():
     assert [log.num_taken for log in logs] == [4, 1]
 
 
-def test_a_loop_that_stops_early_loses_nothing():
+def test_a_loop_that_stops_early_loses_no_frame():
     timeline = Timeline([FakeLog("a", [1, 2, 3])])
     next(iter(timeline.frames_before(0, 10)))
     assert [frame.stamp_ns for frame in timeline.frames_before(0, 10)] == [2, 3]
 
 
-def test_the_next_stamp_is_the_earliest_that_waits():
+def test_the_next_stamp_is_the_earliest_pending_one():
     timeline = Timeline([FakeLog("a", [5, 9]), FakeLog("b", [7]), FakeLog("c", [])])
     assert timeline.next_stamp_ns == 5
     list(timeline.frames_before(0, 8))

@@ -12,14 +12,16 @@ from pathlib import Path
 
 import pytest
 
-import octoreplay
+from octoreplay import __version__
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.study import cluster
 from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
-from support.sweeps import QUICK, TEAM, command, is_running, sweep, table, wait_for
+from support.command_line import octoreplay_process, started, wait_for
+from support.fixture_paths import PAIR_TEAM
+from support.sweeps import QUICK, is_running, table
 
-pytest.importorskip("distributed")
+pytestmark = pytest.mark.long
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 ENDLESS = ("--settle", "100000", "--settle-max", "100000", *QUICK)
@@ -40,6 +42,7 @@ class Cluster:
 @pytest.fixture
 def dask(tmp_path: Path) -> Iterator[Cluster]:
     """Scheduler with two workers."""
+    pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
     started: list[subprocess.Popen[bytes]] = []
 
@@ -63,21 +66,21 @@ def dask(tmp_path: Path) -> Iterator[Cluster]:
 
 
 def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
-    done = sweep(TEAM, *GRID, "-o", tmp_path / "d", "--scheduler", dask.address)
+    done = octoreplay_process("sweep", PAIR_TEAM, *GRID, "-o", tmp_path / "d", "--scheduler", dask.address)
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"wrote {tmp_path / 'd' / 'table.csv'} (4 runs), figures in {tmp_path / 'd' / 'figures'}\n"
-    assert sweep(TEAM, *GRID, "-o", tmp_path / "s").returncode == 0
+    assert octoreplay_process("sweep", PAIR_TEAM, *GRID, "-o", tmp_path / "s").returncode == 0
     assert table(tmp_path / "d") == table(tmp_path / "s")
-    done = sweep(TEAM, *GRID, "-o", tmp_path / "s", "--scheduler", dask.address)
+    done = octoreplay_process("sweep", PAIR_TEAM, *GRID, "-o", tmp_path / "s", "--scheduler", dask.address)
     assert "(4 runs, 4 of them before)" in done.stdout
 
 
 def test_a_lost_worker_and_a_failed_run_do_not_stop_the_sweep(dask: Cluster, tmp_path: Path) -> None:
-    arguments = command(TEAM, "--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address)
-    process = subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_for(lambda: bool(dask.children()))
-    dask.workers[0].kill()
-    out, err = process.communicate(timeout=120)
+    arguments = ("--vary", "start=99,0,1", *QUICK, "-o", tmp_path / "d", "--scheduler", dask.address)
+    with started("sweep", PAIR_TEAM, *arguments) as process:
+        wait_for(lambda: bool(dask.children()))
+        dask.workers[0].kill()
+        out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "(3 runs)" in out
     assert "failed: team=team, start=99, seed=0: no robot has a frame" in err
@@ -90,15 +93,15 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
     dask: Cluster, tmp_path: Path, number: signal.Signals
 ) -> None:
     arguments = ("-o", tmp_path / "d", "--scheduler", dask.address)
-    process = subprocess.Popen(command(TEAM, *ENDLESS, *arguments), text=True, stderr=subprocess.PIPE)
-    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
-    running = dask.children()
-    assert len(running) == 1
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    with started("sweep", PAIR_TEAM, *ENDLESS, *arguments) as process:
+        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        running = dask.children()
+        assert len(running) == 1
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
         # A killed sweep cannot stop its workers. The next sweep removes the folder of unfinished results.
-        done = sweep(TEAM, *QUICK, *arguments)
+        done = octoreplay_process("sweep", PAIR_TEAM, *QUICK, *arguments)
         assert done.returncode == 0, done.stderr
     else:
         assert process.returncode == 130
@@ -108,11 +111,10 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
 
 
 def test_a_lost_scheduler_is_reported_in_one_sentence(dask: Cluster, tmp_path: Path) -> None:
-    arguments = command(TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address)
-    process = subprocess.Popen(arguments, text=True, stderr=subprocess.PIPE)
-    wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
-    dask.scheduler.kill()
-    _, err = process.communicate(timeout=120)
+    with started("sweep", PAIR_TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address) as process:
+        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        dask.scheduler.kill()
+        _, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert err.splitlines()[-1] == (
         f"error: {dask.address}: the connection to the scheduler was lost; finished runs are kept, and the same command"
@@ -135,14 +137,14 @@ def test_an_unusable_scheduler_is_reported_in_one_sentence(tmp_path: Path, monke
 
 
 def test_jobs_and_scheduler_exclude_each_other(tmp_path: Path) -> None:
-    done = sweep(TEAM, "-o", tmp_path / "d", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9")
+    done = octoreplay_process("sweep", PAIR_TEAM, "-o", tmp_path / "d", "--jobs", 2, "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 2
     assert "--jobs applies to this machine and --scheduler to a cluster; leave one out" in done.stderr
 
 
 def some_task(folder: Path) -> Task:
     unfinished = str(folder / "none" / "u.mcap")
-    return Task("x", "k", {}, "", unfinished, str(folder / "r"), False, None, octoreplay.__version__, 1)
+    return Task("x", "k", {}, "", unfinished, str(folder / "r"), False, None, __version__, 1)
 
 
 def test_a_worker_that_cannot_execute_a_task_returns_the_reason(tmp_path: Path) -> None:
@@ -153,6 +155,4 @@ def test_a_worker_that_cannot_execute_a_task_returns_the_reason(tmp_path: Path) 
     # Another version may have other fields in its tasks.
     row = cluster.execute_on_worker({"version": "0.0.1", "wheels": 4})
     assert row["status"] == "failed"
-    assert row["error"] == (
-        f"the worker has octoreplay {octoreplay.__version__}, the sweep 0.0.1; install the same version"
-    )
+    assert row["error"] == f"the worker has octoreplay {__version__}, the sweep 0.0.1; install the same version"

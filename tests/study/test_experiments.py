@@ -14,8 +14,10 @@ from octoreplay.study import experiments
 from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_experiment
 from octoreplay.study.grid import check_variations, combinations, parse_variation
 from octoreplay.study.questions import QUESTIONS
+from support.fixture_paths import PAIR_TEAM
 
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
+pytestmark = pytest.mark.long
+
 
 NUM_RUNS = {
     "rules": {"rules": 16 * 4 * 2},
@@ -29,7 +31,7 @@ NUM_RUNS = {
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_every_experiment_consists_of_valid_distinct_runs(name: str) -> None:
     experiment = QUESTIONS[name](30.0, 2)
-    base = load_team_file(PAIR)
+    base = load_team_file(PAIR_TEAM)
     counts = {}
     for plan in experiment.plans:
         assert set(plan.teams) <= set(experiment.teams)

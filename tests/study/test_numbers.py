@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,9 +21,8 @@ from octoreplay.study.numbers import (
     run_numbers,
     truth_numbers,
 )
+from support.fixture_paths import PAIR_TEAM
 from support.result_factory import tick_metrics
-
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair" / "team.yaml"
 
 
 def ticks(*disagreements: float, num_log_ticks: int) -> list[TickMetrics]:
@@ -49,7 +47,7 @@ def test_contraction_is_the_mean_factor_over_the_later_half() -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunSummary, tuple[TickMetrics, ...]]:
     path = tmp_path_factory.mktemp("run") / "result.mcap"
     changes = {"loss": 0.5, "network_seed": 3, "rule": "bayes", "resolution": 0.6}
-    summary = replay_team(load_team_file(PAIR).with_parameters(changes), path)
+    summary = replay_team(load_team_file(PAIR_TEAM).with_parameters(changes), path)
     with open_result(path) as result:
         return summary, tuple(result.metrics)
 

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,29 +15,19 @@ from octoreplay.report import map_view
 from octoreplay.result import Result, open_result
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study import paper
+from support.command_line import octoreplay, started, wait_for
 
-pytest.importorskip("open3d", exc_type=ImportError)
+pytestmark = pytest.mark.long
 
 FIGURES = ("agreement.png", "maps.png", "packet_size.png", "total_distance.png")
-
-
-def command(folder: Path, *arguments: object) -> list[str]:
-    return [sys.executable, "-m", "octoreplay", "experiment", "paper", str(folder), *map(str, arguments)]
-
-
-def experiment(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the command with a terminal width of 100 columns."""
-    return subprocess.run(
-        command(folder, *arguments), text=True, capture_output=True, check=False, timeout=300,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"},
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the experiment with two robots over six seconds."""
+    pytest.importorskip("open3d", exc_type=ImportError)
     folder = tmp_path_factory.mktemp("experiment") / "paper"
-    process = experiment(folder, "--duration", 6, "--robots", 2)
+    process = octoreplay("experiment", "paper", folder, "--duration", 6, "--robots", 2)
     assert process.returncode == 0, process.stderr
     assert f"simulated the team in {folder / 'team'}\n" in process.stderr
     assert f"wrote {folder / 'paper.mcap'}\n" in process.stderr
@@ -131,7 +117,7 @@ def test_pictures_show_the_mapped_cells(done: Path, result: Result) -> None:
 
 def test_a_complete_team_and_result_are_used_again(done: Path) -> None:
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in done.rglob("*.*") if path.is_file()}
-    process = experiment(done, "--duration", 6, "--robots", 2)
+    process = octoreplay("experiment", "paper", done, "--duration", 6, "--robots", 2)
     assert process.returncode == 0, process.stderr
     assert f"used the team in {done / 'team'} again\n" in process.stderr
     assert f"used {done / 'paper.mcap'} again\n" in process.stderr
@@ -141,7 +127,7 @@ def test_a_complete_team_and_result_are_used_again(done: Path) -> None:
 
 
 def test_other_settings_are_refused_in_a_used_folder(done: Path) -> None:
-    process = experiment(done, "--duration", 6, "--robots", 2, "--seed", 1)
+    process = octoreplay("experiment", "paper", done, "--duration", 6, "--robots", 2, "--seed", 1)
     assert process.returncode == 1
     assert "team: holds a team with seed 0, not 1; give another folder, or remove this one" in process.stderr
 
@@ -149,7 +135,7 @@ def test_other_settings_are_refused_in_a_used_folder(done: Path) -> None:
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "team").mkdir()
     (tmp_path / "team" / "names.txt").write_text("Ann")
-    process = experiment(tmp_path, "--duration", 6)
+    process = octoreplay("experiment", "paper", tmp_path, "--duration", 6)
     assert process.returncode == 1
     assert "holds no simulated team" in process.stderr
     assert "Traceback" not in process.stderr
@@ -157,20 +143,18 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_leaves_nothing_half_written(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        command(tmp_path / "paper", "--duration", 60), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    work = tmp_path / "paper" / ".team.partial"
-    while process.poll() is None and not work.exists():
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    pytest.importorskip("open3d", exc_type=ImportError)
+    arguments = ("experiment", "paper", tmp_path / "paper", "--duration", 60)
+    with started(*arguments) as process:
+        wait_for((tmp_path / "paper" / ".team.partial").exists)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     assert list((tmp_path / "paper").iterdir()) == []
 
 
 def test_too_short_a_duration_is_refused(tmp_path: Path) -> None:
-    process = experiment(tmp_path / "paper", "--duration", 5)
+    process = octoreplay("experiment", "paper", tmp_path / "paper", "--duration", 5)
     assert process.returncode == 2
     assert "duration: 5 s is too short for the experiment; use at least 6 s" in process.stderr
     assert not (tmp_path / "paper").exists()

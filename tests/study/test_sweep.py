@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-import octoreplay
+from octoreplay import __version__
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError, OutputError
 from octoreplay.replay.run import replay_team
@@ -25,7 +25,11 @@ from octoreplay.study.numbers import run_numbers
 from octoreplay.study.process import TaskProcess
 from octoreplay.study.sweep import SweepProgress, run_sweep
 from octoreplay.study.task import Task
-from support.sweeps import PAIR, QUICK, TEAM, children, command, is_running, sweep, table, wait_for
+from support.command_line import octoreplay, started, wait_for
+from support.fixture_paths import PAIR, PAIR_TEAM
+from support.sweeps import QUICK, children, is_running, table
+
+pytestmark = pytest.mark.long
 
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 SETTINGS = {"resolution": 0.6, "duration": 2.0}
@@ -35,7 +39,7 @@ SETTINGS = {"resolution": 0.6, "duration": 2.0}
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of an undisturbed sweep."""
     folder = tmp_path_factory.mktemp("sweep") / "whole"
-    done = sweep(TEAM, *GRID, "-o", folder)
+    done = octoreplay("sweep", PAIR_TEAM, *GRID, "-o", folder)
     assert (done.returncode, done.stdout, done.stderr) == (
         0, f"wrote {folder / 'table.csv'} (4 runs), figures in {folder / 'figures'}\n", "",
     )  # fmt: skip
@@ -52,7 +56,7 @@ def test_a_row_equals_the_numbers_of_a_single_run(whole: Path, tmp_path: Path) -
     assert [(row["rule"], row["loss"]) for row in rows] == [
         (rule, loss) for rule in ("gradient", "bayes") for loss in ("0", "0.3")
     ]
-    config = load_team_file(TEAM).with_parameters({**SETTINGS, "rule": "bayes", "loss": 0.3})
+    config = load_team_file(PAIR_TEAM).with_parameters({**SETTINGS, "rule": "bayes", "loss": 0.3})
     summary = replay_team(config, tmp_path / "result.mcap")
     with open_result(tmp_path / "result.mcap") as result:
         expected = run_numbers(summary, result.metrics)
@@ -63,23 +67,21 @@ def test_a_row_equals_the_numbers_of_a_single_run(whole: Path, tmp_path: Path) -
 def test_the_folder_of_a_finished_sweep(whole: Path) -> None:
     assert {path.name for path in whole.iterdir()} == {".lock", "figures", "rows", "sweep.json", "table.csv"}
     description = json.loads((whole / "sweep.json").read_text())
-    assert description["teams"] == {"team": str(TEAM)}
+    assert description["teams"] == {"team": str(PAIR_TEAM)}
     assert description["vary"] == {"rule": ["gradient", "bayes"], "loss": ["0", "0.3"]}
     assert len(description["runs"]) == 4
     assert (whole / "figures" / "agreement.png").stat().st_size > 1000
 
 
 def test_a_killed_sweep_continues_to_the_same_table(whole: Path, tmp_path: Path) -> None:
-    arguments = (TEAM, *GRID, "-o", tmp_path / "s", "--jobs", 1)
-    process = subprocess.Popen(command(*arguments), text=True)
-    wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(children(process)) == 1)
-    running = children(process)
-    process.kill()
-    process.wait()
+    arguments = (PAIR_TEAM, *GRID, "-o", tmp_path / "s", "--jobs", 1)
+    with started("sweep", *arguments) as process:
+        wait_for(lambda: len(rows_in(tmp_path / "s")) >= 1 and len(children(process)) == 1)
+        running = children(process)
     wait_for(lambda: not any(map(is_running, running)), 10)
     finished = rows_in(tmp_path / "s")
     assert 1 <= len(finished) < 4
-    done = sweep(*arguments)
+    done = octoreplay("sweep", *arguments)
     assert done.returncode == 0, done.stderr
     assert f"(4 runs, {len(finished)} of them before)" in done.stdout
     assert table(tmp_path / "s") == table(whole)
@@ -91,12 +93,12 @@ def test_a_killed_sweep_continues_to_the_same_table(whole: Path, tmp_path: Path)
 def test_an_interrupted_sweep_ends_its_processes_and_reports_it(tmp_path: Path, number: signal.Signals) -> None:
     # Runs that do not stop settling.
     endless = ("--vary", "loss=0,0.25,0.5", "--settle", "100000", "--settle-max", "100000", *QUICK)
-    process = subprocess.Popen(command(TEAM, *endless, "-o", tmp_path / "s"), text=True, stderr=subprocess.PIPE)
-    wait_for(lambda: any((tmp_path / "s" / "unfinished").glob("*/*.mcap")))
-    running = children(process)
-    assert running
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    with started("sweep", PAIR_TEAM, *endless, "-o", tmp_path / "s") as process:
+        wait_for(lambda: any((tmp_path / "s" / "unfinished").glob("*/*.mcap")))
+        running = children(process)
+        assert running
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
     if number == signal.SIGKILL:
         wait_for(lambda: not any(map(is_running, running)), 10)
         return
@@ -113,16 +115,16 @@ def test_damaged_row_files_are_replaced(whole: Path, tmp_path: Path) -> None:
     first.write_bytes(first.read_bytes()[:-40])
     second.write_text("[]")
     third.rename(third.with_suffix(".json.partial"))
-    done = sweep(TEAM, *GRID, "-o", folder)
+    done = octoreplay("sweep", PAIR_TEAM, *GRID, "-o", folder)
     assert "(4 runs, 1 of them before)" in done.stdout
     assert table(folder) == table(whole)
     assert not list((folder / "rows").glob("*.partial"))
 
 
 def test_a_failed_run_does_not_stop_the_others_and_is_repeated(tmp_path: Path) -> None:
-    arguments = (TEAM, "--vary", "start=99,0", "--resolution", "0.6", "-o", tmp_path)
+    arguments = (PAIR_TEAM, "--vary", "start=99,0", "--resolution", "0.6", "-o", tmp_path)
     for others in ("2 runs", "2 runs, 1 of them before"):
-        done = sweep(*arguments)
+        done = octoreplay("sweep", *arguments)
         assert done.returncode == 1
         assert f"({others})" in done.stdout
         assert re.fullmatch(
@@ -135,7 +137,7 @@ def test_a_failed_run_does_not_stop_the_others_and_is_repeated(tmp_path: Path) -
 
 
 def test_a_killed_process_is_a_failed_run(tmp_path: Path) -> None:
-    task = Task("x", "k", {}, "", str(tmp_path / "u"), str(tmp_path / "r"), False, None, octoreplay.__version__, 1)
+    task = Task("x", "k", {}, "", str(tmp_path / "u"), str(tmp_path / "r"), False, None, __version__, 1)
     process = TaskProcess(task)
     process.kill()
     row = process.wait(30)
@@ -149,7 +151,7 @@ def test_lost_data_gives_exit_code_3_and_no_repetition(tmp_path: Path) -> None:
     log = team.with_name("husky_2.mcap")
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     for _ in range(2):
-        done = sweep(team, "--resolution", "0.6", "-o", tmp_path / "s")
+        done = octoreplay("sweep", team, "--resolution", "0.6", "-o", tmp_path / "s")
         assert (done.returncode, done.stderr) == (3, "")
     assert "(1 runs, 1 of them before)" in done.stdout
     (row,) = table(tmp_path / "s")
@@ -174,7 +176,7 @@ def test_a_run_is_repeated_if_its_inputs_change(tmp_path: Path) -> None:
 
 def test_other_combinations_use_finished_runs_again(whole: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "s")
-    done = run_sweep(TEAM, ["rule=bayes,local", "loss=0.3"], folder, settings=SETTINGS)
+    done = run_sweep(PAIR_TEAM, ["rule=bayes,local", "loss=0.3"], folder, settings=SETTINGS)
     assert [(row["rule"], row["status"]) for row in done.rows] == [("bayes", "ok"), ("local", "ok")]
     assert done.num_earlier == 1
     assert table(folder)[0] == table(whole)[3]
@@ -182,7 +184,7 @@ def test_other_combinations_use_finished_runs_again(whole: Path, tmp_path: Path)
 
 def test_a_run_is_repeated_if_its_kept_result_is_missing(tmp_path: Path) -> None:
     for _ in range(2):
-        done = run_sweep([TEAM], ["rule=bayes"], tmp_path / "s", settings=SETTINGS, keep=True)
+        done = run_sweep([PAIR_TEAM], ["rule=bayes"], tmp_path / "s", settings=SETTINGS, keep=True)
         result = tmp_path / "s" / "runs" / "team=team,rule=bayes,seed=0.mcap"
         with open_result(result) as opened:
             assert opened.config.consensus.rule == "bayes"
@@ -203,12 +205,12 @@ def test_labels_of_teams_are_distinct(tmp_path: Path) -> None:
     assert [step.num_finished for step in steps] == [0, 1, 2, 3, 4]
     assert steps[-1] == SweepProgress(4, 0, 4, 0.0)
     with pytest.raises(ConfigError, match="a team file is given twice"):
-        run_sweep([TEAM, TEAM], [], tmp_path / "s")
+        run_sweep([PAIR_TEAM, PAIR_TEAM], [], tmp_path / "s")
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     with SweepFolder.locked(tmp_path / "s"):
-        done = sweep(TEAM, "-o", tmp_path / "s", *QUICK)
+        done = octoreplay("sweep", PAIR_TEAM, "-o", tmp_path / "s", *QUICK)
     assert done.returncode == 1
     assert done.stderr == (
         f"error: {tmp_path / 's'}: is in use by another sweep (process {os.getpid()}); wait for it, or use another"
@@ -219,9 +221,9 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").touch()
     with pytest.raises(OutputError, match="is not empty and holds no sweep; use another folder"):
-        run_sweep(TEAM, [], tmp_path)
+        run_sweep(PAIR_TEAM, [], tmp_path)
     with pytest.raises(OutputError, match=r"thesis\.txt: cannot be written: "):
-        run_sweep(TEAM, [], tmp_path / "thesis.txt")
+        run_sweep(PAIR_TEAM, [], tmp_path / "thesis.txt")
 
 
 def test_invalid_options_are_reported_before_any_run(tmp_path: Path) -> None:
@@ -231,15 +233,15 @@ def test_invalid_options_are_reported_before_any_run(tmp_path: Path) -> None:
         (["--jobs", "0"], 2, "error: jobs: 0 is below the least value 1"),
         (["--threads", "0"], 2, "error: threads: 0 is below the least value 1"),
         (["--seeds", "0"], 2, "error: seeds: 0 is below the least value 1"),
-        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither beside {TEAM} nor in"),
+        (["--truth", "none.npz"], 1, f"error: none.npz: not found, neither beside {PAIR_TEAM} nor in"),
     ):
-        done = sweep(TEAM, *arguments, "-o", tmp_path / "s")
+        done = octoreplay("sweep", PAIR_TEAM, *arguments, "-o", tmp_path / "s")
         assert done.returncode == code, done.stderr
         assert done.stderr.startswith(sentence)
         assert done.stderr.count("\n") == 1
     assert not (tmp_path / "s").exists()
     with pytest.raises(InputError, match="not found"):
-        run_sweep(TEAM, [], tmp_path / "s", truth="none.npz")
+        run_sweep(PAIR_TEAM, [], tmp_path / "s", truth="none.npz")
 
 
 def test_each_worker_has_a_processor_of_its_own() -> None:
@@ -261,7 +263,7 @@ def test_each_worker_has_a_processor_of_its_own() -> None:
 
 
 def test_a_sweep_with_truth_has_scores(tmp_path: Path) -> None:
-    done = run_sweep(TEAM, ["rule=bayes"], tmp_path, settings={"resolution": 0.3}, truth="world.npz")
+    done = run_sweep(PAIR_TEAM, ["rule=bayes"], tmp_path, settings={"resolution": 0.3}, truth="world.npz")
     (row,) = done.rows
     assert row["status"] == "ok", row["error"]
     assert 0.1 < row["mean_iou"] <= 1.0

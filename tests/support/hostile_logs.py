@@ -33,11 +33,11 @@ from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import ClassTable, SemanticClass
 from octoreplay.replay.run import replay_team
 from support import room
+from support.fixture_paths import FIXTURES
 from support.log_damage import MUTATIONS, damage_log, reseal_chunk
 from support.log_factory import Row, write_rows
 from support.scan_maps import MAP, SENSOR, octree_of
 
-FIXTURES = Path(__file__).parents[1] / "fixtures"
 LOGS = tuple(
     sorted(
         path.relative_to(FIXTURES).as_posix()

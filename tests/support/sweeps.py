@@ -1,33 +1,15 @@
-"""Helpers for tests that run small sweeps as processes."""
+"""Helpers for tests of small sweeps and their processes."""
 
 from __future__ import annotations
 
 import csv
-import os
 import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from octoreplay.study.numbers import TIMING_COLUMNS
 
-PAIR = Path(__file__).parents[1] / "fixtures" / "pair"
-TEAM = PAIR / "team.yaml"
 QUICK = ("--resolution", "0.6", "--duration", "2")
 """Options with which a run takes less than a second or two."""
-
-
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "octoreplay", "sweep", *map(str, arguments)]
-
-
-def sweep(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a sweep as a process and wait for it."""
-    return subprocess.run(
-        command(*arguments), cwd=folder, text=True, capture_output=True, check=False, timeout=300,
-        env={**os.environ, "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"},
-    )  # fmt: skip
 
 
 def table(folder: Path) -> list[dict[str, str]]:
@@ -36,14 +18,6 @@ def table(folder: Path) -> list[dict[str, str]]:
         rows = list(csv.DictReader(stream))
     assert all(set(TIMING_COLUMNS) <= set(row) for row in rows)
     return [{name: value for name, value in row.items() if name not in TIMING_COLUMNS} for row in rows]
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait until a condition holds."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.01)
 
 
 def children(process: subprocess.Popen[str]) -> list[Path]:

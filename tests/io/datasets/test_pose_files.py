@@ -10,13 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.pose_files import read_poses
-
-
-def pose(index: int) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("zyx", [0.3 * index, 0.1, -0.2]).as_matrix()
-    T[:3, 3] = index, -2.0, 0.5
-    return T
+from support.poses import pose
 
 
 def kitti_row(T: np.ndarray) -> str:

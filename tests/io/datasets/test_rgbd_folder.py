@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError
 from octoreplay.io.datasets.rgbd_folder import import_rgbd
 from octoreplay.records import ClassTable, SemanticClass
+from support.poses import pose
 from support.recordings import RECORDINGS, needs_recordings
 from support.stored_messages import matrix, pixels, read_messages
 
@@ -22,13 +23,6 @@ def depth_values(index: int) -> np.ndarray:
     values = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100 + index
     values[0, :2] = 0, 65535
     return values
-
-
-def pose(index: int) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("zyx", [0.3 * index, 0.1, -0.2]).as_matrix()
-    T[:3, 3] = index, -2.0, 0.5
-    return T
 
 
 def save_png(path: Path, values: np.ndarray) -> None:

@@ -179,7 +179,7 @@ def test_messages_of_another_type_are_damage_and_no_camera():
     for depth, label in ((cloud(), LABEL_IMAGE), (DEPTH_IMAGE, cloud())):
         with pytest.raises(DamagedMessageError, match=r"is of type sensor_msgs/msg/PointCloud2, not an image"):
             make(depth_maker(INFO_MESSAGE), depth, label, None)
-    with pytest.raises(InputError, match=r"is of type sensor_msgs/msg/Image, no CameraInfo"):
+    with pytest.raises(InputError, match=r"is of type sensor_msgs/msg/Image, not CameraInfo"):
         DepthFrameMaker(robot_of(depth_topic=DEPTH), None, DEPTH_IMAGE)
 
 

@@ -8,7 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from octoreplay.config.robot import RobotConfig
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.robots.robot_log import RobotLog
@@ -39,9 +39,9 @@ NUM_FRAMES = 160
 """Frames of the logs here, two a second."""
 
 
-def robot_of(path: Path, **fields) -> RobotConfig:
+def robot_of(path: Path, **fields) -> ResolvedRobot:
     known = {"depth_topic": DEPTH, "label_topic": LABELS, "camera_info_topic": INFO, "pose_topic": "/odom"}
-    return RobotConfig("r", (path,), **{**known, **fields})
+    return ResolvedRobot("r", (path,), **{**known, **fields})
 
 
 def entries_of(**options) -> list[Entry]:
@@ -55,7 +55,7 @@ def delayed(entries: list[Entry], most_ns: int, seed: int = 0) -> list[Entry]:
     return sorted(late, key=lambda e: e.log_time_ns)
 
 
-def read(robot: RobotConfig, time: TimeConfig, *, is_whole: bool = False, team_start_ns: int | None = None):
+def read(robot: ResolvedRobot, time: TimeConfig, *, is_whole: bool = False, team_start_ns: int | None = None):
     """(frames, counts, number of messages read), with or without seeking."""
     num_read = 0
     original = RobotLog._until_sensor_ends
@@ -73,7 +73,7 @@ def read(robot: RobotConfig, time: TimeConfig, *, is_whole: bool = False, team_s
         return list(log.frames(team_start_ns)), log.counts, num_read
 
 
-def assert_same_frames(robot: RobotConfig, time: TimeConfig, *, seeks: bool = True, **options) -> int:
+def assert_same_frames(robot: ResolvedRobot, time: TimeConfig, *, seeks: bool = True, **options) -> int:
     """Compare reading a part with reading all; the number of frames."""
     found, counts, num_read = read(robot, time, **options)
     expected, all_counts, num_all = read(robot, time, is_whole=True, **options)
@@ -160,7 +160,7 @@ def test_files_one_after_the_other_are_one_log(tmp_path):
     halves = [write_mcap(tmp_path / "a.mcap", entries[:400]), write_mcap(tmp_path / "b.mcap", entries[400:])]
     for logs in (paths, halves):
         robot = robot_of(tmp_path)
-        robot = RobotConfig("r", tuple(logs), robot.depth_topic, label_topic=LABELS, camera_info_topic=INFO,
+        robot = ResolvedRobot("r", tuple(logs), robot.depth_topic, label_topic=LABELS, camera_info_topic=INFO,
                             pose_topic="/odom")  # fmt: skip
         assert assert_same_frames(robot, TimeConfig(start=45, duration=20)) == 40
 

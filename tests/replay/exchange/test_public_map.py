@@ -1,4 +1,4 @@
-"""What a robot shows of its map: as exact as packets are, what changes most first, and nothing anew that did not."""
+"""Public maps: rounding as in packets, largest changes first, new revisions for changed bricks only."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _changed_since(held, base):
 # --- exact ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_exact_map_is_a_copy_with_the_revisions_that_it_was_given():
+def test_an_exact_public_map_is_a_copy_with_its_revisions():
     public, _ = _public_map()
     assert public.is_exact
     octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [-0.3, 0.7]})
@@ -69,7 +69,7 @@ def test_an_exact_map_is_a_copy_with_the_revisions_that_it_was_given():
      {"packets": "delta", "budget": 4096}],
     ids=str,
 )  # fmt: skip
-def test_what_is_not_exact_says_so(parameters):
+def test_an_inexact_public_map_is_marked(parameters):
     assert not _public_map(**parameters)[0].is_exact
 
 
@@ -114,7 +114,7 @@ def test_only_bricks_that_changed_after_rounding_get_a_revision(parameters, roun
     assert num_kept > 20
 
 
-def test_pruning_merges_what_is_close_and_keeps_what_is_not():
+def test_pruning_merges_close_values_only():
     public, _ = _public_map(prune_tolerance=0.1)
     close = {(x, y, z): [1.0 + 0.01 * (x + y + z), -1.0] for x in range(2) for y in range(2) for z in range(2)}
     far = {(4 + x, y, z): [1.0 + 0.2 * x, -1.0] for x in range(2) for y in range(2) for z in range(2)}
@@ -124,7 +124,7 @@ def test_pruning_merges_what_is_close_and_keeps_what_is_not():
     assert {key: shown[key] for key in far} == {key: cells_of(octree)[key] for key in far}
 
 
-def test_versions_that_others_have_stay_as_they_were():
+def test_published_versions_do_not_change():
     random = np.random.default_rng(0)
     public, _ = _public_map(content="int8")
     versions = []
@@ -168,7 +168,7 @@ def _by_brick(octree):
      {"budget": 1300, "prune_tolerance": 1e-9}],
     ids=str,
 )  # fmt: skip
-def test_within_a_budget_what_changes_most_goes_first(parameters, seed):
+def test_within_a_budget_the_largest_changes_go_first(parameters, seed):
     random = np.random.default_rng(seed)
     public, encoder = _public_map(packets="delta", **parameters)
     cells = _random_cells(random, 36)
@@ -223,7 +223,7 @@ def test_the_budget_is_shared_with_the_maps_of_others():
     assert sizes[0] > sizes[1] > sizes[2] > 500
 
 
-def test_cells_without_evidence_are_shown_too():
+def test_cells_without_evidence_are_published():
     public, _ = _public_map(packets="delta", budget=1024)
     octree = octree_of({(0, 0, 0): [0.0, 0.0], (4, 1, 0): [2.0, 0.0]})
     held = public.advance(octree, np.zeros(2, np.int64), 1)
@@ -234,7 +234,7 @@ def test_cells_without_evidence_are_shown_too():
     assert _changed_since(held, 1) == [1]
 
 
-def test_a_map_without_bricks_is_shown_as_it_is():
+def test_an_empty_map_is_published():
     public, encoder = _public_map(packets="delta", budget=1024)
     nothing = SemanticOctree(0.25, 2)
     held = public.advance(nothing, nothing.revisions, 1)

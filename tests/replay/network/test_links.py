@@ -1,4 +1,4 @@
-"""The radio links: delay, loss, rate, queue, and that each link has its own luck."""
+"""Radio links: delay, loss, rate and queue; losses are drawn independently per direction."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_without_delay_a_packet_arrives_at_once():
     assert links.deliver(10 * SECOND, EVERYBODY) == []
 
 
-def test_packets_come_in_the_order_of_arrival_then_sender():
+def test_packets_are_ordered_by_arrival_and_sender():
     links = _links((("b", "a", (("latency", 0.5),)),), latency=1.0)
     links.send(2, 0, Content(1), 0)
     links.send(1, 0, Content(2), 0)
@@ -84,7 +84,7 @@ def test_jitter_spreads_delays_evenly_around_the_latency():
         ({"loss": 0.1, "burst_start": 0.2, "burst_end": 0.2, "burst_loss": 0.5}, 0.3),
     ],
 )
-def test_losses_are_as_frequent_as_they_should_be(parameters, expected):
+def test_losses_have_the_given_frequency(parameters, expected):
     links = _links(**parameters)
     for number in range(20_000):
         links.send(0, 1, Content(number), 0)
@@ -97,7 +97,7 @@ def test_losses_are_as_frequent_as_they_should_be(parameters, expected):
     assert 1 - num_arrived / 20_000 == pytest.approx(expected, abs=0.02)
 
 
-def test_bursts_are_as_long_as_they_should_be():
+def test_bursts_have_the_given_mean_length():
     links = _links(burst_start=0.02, burst_end=0.25)
     for number in range(40_000):
         links.send(0, 1, Content(number), 0)
@@ -107,7 +107,7 @@ def test_bursts_are_as_long_as_they_should_be():
     assert (~arrived).sum() / starts == pytest.approx(4.0, rel=0.1)
 
 
-def test_every_link_has_its_own_luck_and_the_seed_decides():
+def test_losses_are_drawn_independently_per_direction_from_the_seed():
     def fates(seed, *, with_other):
         links = _links(loss=0.5, latency=0.1, jitter=0.1, seed=seed)
         for number in range(64):
@@ -119,14 +119,14 @@ def test_every_link_has_its_own_luck_and_the_seed_decides():
     assert fates(0, with_other=False) == fates(0, with_other=True) != fates(1, with_other=False)
 
 
-def test_a_rate_takes_time_for_every_byte():
+def test_a_rate_delays_packets_by_their_size():
     links = _links(rate=1000.0, queue="drop-tail", latency=0.5)
     for number in range(3):
         links.send(0, 1, Content(number, num_bytes=250), 0)
     assert [d.arrival_ns for d in links.deliver(2 * SECOND, EVERYBODY)] == [SECOND * 3 // 4, SECOND, SECOND * 5 // 4]
 
 
-def test_the_newest_packet_takes_the_place_of_the_one_that_waits():
+def test_the_newest_packet_replaces_the_waiting_one():
     links = _links(rate=100.0)
     for number in range(4):
         links.send(0, 1, Content(number), number * SECOND // 10)
@@ -136,7 +136,7 @@ def test_the_newest_packet_takes_the_place_of_the_one_that_waits():
     assert (counts.num_sent, counts.num_dropped, counts.num_delivered, counts.num_late) == (4, 2, 2, 2)
 
 
-def test_a_full_queue_drops_what_comes_last():
+def test_a_full_queue_drops_new_packets():
     links = _links(rate=100.0, queue="drop-tail", queue_bytes=250)
     for number in range(5):
         links.send(0, 1, Content(number), 0)
@@ -144,7 +144,7 @@ def test_a_full_queue_drops_what_comes_last():
     assert links.take_counts()[0, 1].num_dropped == 2
 
 
-def test_an_answer_does_not_wait_for_the_queue_and_counts_in_bytes_only():
+def test_acknowledgements_bypass_the_queue_and_count_in_bytes_only():
     links = _links(rate=1.0)
     links.send(0, 1, Content(1), 0)
     links.send(0, 1, Content(2, num_bytes=12, waits=False), 0)
@@ -152,7 +152,7 @@ def test_an_answer_does_not_wait_for_the_queue_and_counts_in_bytes_only():
     assert links.take_counts()[0, 1] == LinkCounts(num_sent=1, sent_bytes=112, delivered_bytes=12)
 
 
-def test_the_queue_of_a_link_that_is_gone_is_empty():
+def test_the_queue_of_a_removed_link_is_empty():
     links = _links(rate=100.0)
     links.send(0, 1, Content(1), 0)
     links.send(0, 1, Content(2), 0)
@@ -163,7 +163,7 @@ def test_the_queue_of_a_link_that_is_gone_is_empty():
     assert links.take_counts()[0, 1].num_dropped == 1
 
 
-def test_what_arrives_at_a_robot_that_does_not_listen_is_lost():
+def test_packets_to_a_robot_that_is_off_are_lost():
     links = _links()
     links.send(0, 1, Content(1), 0)
     links.send(0, 2, Content(2), 0)
@@ -171,14 +171,14 @@ def test_what_arrives_at_a_robot_that_does_not_listen_is_lost():
     assert links.take_counts()[0, 1] == LinkCounts(num_sent=1, sent_bytes=100, num_lost=1)
 
 
-def test_damage_is_as_frequent_as_it_should_be():
+def test_damage_has_the_given_frequency():
     links = _links(corruption=0.25)
     for number in range(4000):
         links.send(0, 1, Content(number), 0)
     assert np.mean([d.content.is_damaged for d in links.deliver(0, EVERYBODY)]) == pytest.approx(0.25, abs=0.03)
 
 
-def test_counts_start_anew():
+def test_counts_are_reset():
     links = _links()
     links.send(0, 1, Content(1), 0)
     assert links.take_counts()[0, 1].num_sent == 1

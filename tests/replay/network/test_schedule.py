@@ -1,3 +1,5 @@
+"""Schedules: states of robots and links over time."""
+
 from __future__ import annotations
 
 import itertools
@@ -37,21 +39,21 @@ def test_an_entry_holds_from_its_start_up_to_its_end():
         assert available.is_undisturbed == (not holds)
 
 
-def test_an_entry_without_end_lasts():
+def test_an_entry_without_an_end_holds_forever():
     schedule = _schedule(ScheduleEntry(5.0, links_down=(("spot", "husky"),)))
     assert schedule.change_times == (5.0,)
     assert _links(schedule.at(1e9).links_down) == [(0, 2)]
     assert _links(schedule.at(1e9).links_up) == []
 
 
-def test_groups_cut_every_link_between_them_and_leave_others_alone():
+def test_groups_cut_the_links_between_them_only():
     schedule = _schedule(ScheduleEntry(0.0, 1.0, groups=(("warthog", "husky"), ("jackal",))))
     assert _links(schedule.at(0.0).links_down) == [(0, 1), (1, 3)]  # spot is in no group
     three = _schedule(ScheduleEntry(0.0, groups=(("husky",), ("spot",), (), ("jackal", "warthog"))))
     assert _links(three.at(0.0).links_down) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
 
 
-def test_one_entry_follows_on_another():
+def test_successive_entries():
     schedule = _schedule(
         ScheduleEntry(20.0, 30.0, links_up=(("husky", "spot"),)),
         ScheduleEntry(10.0, 20.0, links_down=(("spot", "husky"), ("spot", "jackal"))),
@@ -62,7 +64,7 @@ def test_one_entry_follows_on_another():
     assert (_links(after.links_down), _links(after.links_up)) == ([], [(0, 2)])
 
 
-def test_robots_and_their_links_are_different_subjects():
+def test_entries_of_robots_and_of_their_links_do_not_conflict():
     schedule = _schedule(
         ScheduleEntry(0.0, 10.0, robots_off=("husky",)), ScheduleEntry(5.0, 15.0, links_up=(("husky", "spot"),))
     )
@@ -71,7 +73,7 @@ def test_robots_and_their_links_are_different_subjects():
     assert _links(available.links_up) == [(0, 2)]
 
 
-def test_a_time_between_two_changes_gives_the_same_object_whose_arrays_cannot_be_written():
+def test_the_state_is_reused_between_changes_and_read_only():
     schedule = _schedule(ScheduleEntry(1.0, 2.0, robots_off=("spot",)))
     assert schedule.at(1.0) is schedule.at(1.9)
     assert schedule.at(0.0) is not schedule.at(2.0)
@@ -79,7 +81,7 @@ def test_a_time_between_two_changes_gives_the_same_object_whose_arrays_cannot_be
         schedule.at(1.0).robots_off[0] = True
 
 
-def test_an_empty_schedule_says_nothing():
+def test_an_empty_schedule_changes_nothing():
     schedule = _schedule()
     assert schedule.change_times == ()
     assert schedule.at(3.0).is_undisturbed
@@ -100,7 +102,7 @@ def test_robots_forget_when_they_go_off():
     assert schedule.forgets(10.0, 10.2).tolist() == [False, False, True, False]
 
 
-def test_a_robot_has_what_it_scanned_while_it_was_on_and_has_not_forgotten():
+def test_robots_hold_the_scans_since_their_last_restart():
     schedule = _schedule(
         ScheduleEntry(10.0, 20.0, robots_off=("husky", "spot")),
         ScheduleEntry(30.0, 40.0, robots_off=("spot",), forget=True),
@@ -148,7 +150,7 @@ def test_a_robot_has_what_it_scanned_while_it_was_on_and_has_not_forgotten():
         ([ScheduleEntry(0.0, robots_off=("spot",), robots_silent=("spot",))], r"robot 'spot' is in it twice"),
     ],
 )  # fmt: skip
-def test_a_schedule_that_makes_no_sense_is_refused(entries, message):
+def test_invalid_schedules_are_refused(entries, message):
     with pytest.raises(ConfigError, match=rf"^schedule: .*{message}") as caught:
         _schedule(*entries)
     assert "\n" not in str(caught.value)
@@ -191,7 +193,7 @@ def _holds(entry, elapsed_s):
 
 
 @given(st.lists(_entries(), max_size=4))
-def test_a_schedule_says_at_every_time_what_its_entries_say(entries):
+def test_the_state_at_every_time_follows_from_the_entries(entries):
     times = [k / 2 for k in range(20)]
     assume(all(_subjects(entry) for entry in entries))
     holding = {t: [entry for entry in entries if _holds(entry, t)] for t in times}

@@ -1,3 +1,5 @@
+"""Topologies by name and by position."""
+
 from __future__ import annotations
 
 import math
@@ -40,7 +42,7 @@ def test_fixed_topologies():
     )
 
 
-def test_grids_are_as_square_as_can_be_and_their_last_row_may_be_short():
+def test_grids_are_nearly_square_with_a_short_last_row():
     assert _links(2, "grid") == ((0, 1),)
     assert _links(3, "grid") == ((0, 1), (0, 2))
     assert _links(4, "grid") == ((0, 1), (0, 2), (1, 3), (2, 3))
@@ -62,14 +64,14 @@ def test_one_robot_has_no_link_and_two_have_one(topology):
     assert _links(2, topology, prob_link=1.0, positions=[(0, 0, 0), (1, 0, 0)]) == ((0, 1),)
 
 
-def test_fixed_topologies_are_induced_on_the_robots_that_are_present():
+def test_fixed_topologies_are_induced_on_the_present_robots():
     assert _links(5, "ring", [True, True, False, True, True]) == ((0, 1), (0, 4), (3, 4))
     assert _links(4, "line", [True, False, True, True]) == ((2, 3),)
     assert _links(4, "star", [False, True, True, True]) == ()
     assert _links(4, "grid", [True, True, True, False]) == ((0, 1), (0, 2))
 
 
-def test_random_links_follow_the_seed_and_stand_over_the_run():
+def test_random_links_follow_the_seed_and_are_constant():
     made = Topology(NetworkConfig(topology="random", prob_link=0.4, network_seed=3), NAMES[:12])
     everybody, nowhere = np.ones(12, bool), np.full((12, 3), np.nan)
     first = made.links(everybody, nowhere)
@@ -82,7 +84,7 @@ def test_random_links_follow_the_seed_and_stand_over_the_run():
     assert len(_links(5, "random", prob_link=1.0)) == 10
 
 
-def test_nearest_links_stand_where_either_end_wants_them():
+def test_nearest_links_need_one_end_only():
     on_a_line = [(x, 0, 0) for x in (0, 1, 3, 7)]
     assert _links(4, "nearest", num_nearest=1, positions=on_a_line) == ((0, 1), (1, 2), (2, 3))
     assert _links(4, "nearest", num_nearest=2, positions=on_a_line) == ((0, 1), (0, 2), (1, 2), (1, 3), (2, 3))
@@ -102,14 +104,14 @@ def test_ties_of_the_nearest_go_to_the_lower_index():
     assert _links(64, "nearest", num_nearest=5, positions=crowd) == expected
 
 
-def test_robots_without_a_pose_or_not_present_are_nobodys_nearest():
+def test_robots_without_a_pose_or_not_present_are_not_among_the_nearest():
     positions = [(0, 0, 0), (1, 0, 0), NOWHERE, (9, 0, 0)]
     assert _links(4, "nearest", num_nearest=2, positions=positions) == ((0, 1), (0, 3), (1, 3))
     assert _links(4, "nearest", [True, False, True, True], positions, num_nearest=1) == ((0, 3),)
     assert _links(4, "nearest", num_nearest=2) == ()
 
 
-def test_range_links_come_up_below_the_range_and_break_beyond_the_hysteresis():
+def test_range_links_start_below_the_range_and_end_beyond_the_hysteresis():
     made = Topology(NetworkConfig(topology="range", radio_range=10.0, range_hysteresis=2.0), NAMES[:2])
 
     def linked(distance, present=(True, True)):
@@ -125,7 +127,7 @@ def test_range_links_come_up_below_the_range_and_break_beyond_the_hysteresis():
     assert not linked(11.0)
 
 
-def test_without_hysteresis_a_link_stands_up_to_the_range():
+def test_without_hysteresis_a_link_lasts_up_to_the_range():
     made = Topology(NetworkConfig(topology="range", radio_range=10.0, range_hysteresis=0.0), NAMES[:2])
     everybody = np.ones(2, bool)
     seen = [_pairs(made.links(everybody, np.array([(0.0, 0, 0), (x, 0, 0)]))) for x in (10.0, 9.0, 10.0, 10.1)]
@@ -138,7 +140,7 @@ _POINT = st.none() | st.tuples(*[st.integers(0, 6).map(float)] * 3)
 
 
 @given(st.data())
-def test_every_tick_of_every_topology_is_that_of_the_reference(data):
+def test_every_topology_equals_the_reference_in_every_tick(data):
     num_robots = data.draw(st.integers(1, 7))
     topology = data.draw(
         st.sampled_from(["complete", "ring", "line", "star", "grid", "random", "nearest", "nearest", "range", "range"])

@@ -1,0 +1,73 @@
+"""Rule ratio on small teams whose links and robots fail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from octoreplay.config.network import ScheduleEntry
+from support.faulty_team import (
+    ONE_WAY_RING,
+    RATIO_TOLERANCE,
+    assert_all_have_the_oracle,
+    configured,
+    dense,
+    finished_run,
+    known_cells,
+    oracle_errors,
+    session_of,
+)
+
+
+def test_ratio_equals_bayes_without_faults():
+    sessions = [session_of(configured(rule=rule, settle=0)) for rule in ("ratio", "bayes")]
+    num_joined = []
+    for ratio, bayes in zip(*(session.ticks() for session in sessions), strict=True):
+        for one, other in zip(ratio.maps, bayes.maps, strict=True):
+            np.testing.assert_allclose(dense(one), dense(other), rtol=0, atol=RATIO_TOLERANCE)
+            np.testing.assert_array_equal(known_cells(one), known_cells(other))
+        num_joined.append(len(ratio.graph.active))
+    assert num_joined[1] == 3
+    assert num_joined[-1] == 4
+    assert np.abs(dense(ratio.maps[0])).max() > 2.0
+
+
+GROUPS = (("robot_0", "robot_1"), ("robot_2", "robot_3"))
+RATIO_FAULTS = {
+    "loss and latency": {"topology": "ring", "loss": 0.3, "latency": 0.6, "network_seed": 1},
+    "bursts and jitter": {"topology": "line", "burst_start": 0.2, "latency": 0.5, "jitter": 0.5, "network_seed": 2},
+    "rate": {"topology": "ring", "rate": 8000.0},
+    "broadcast": {"topology": "ring", "cast": "broadcast", "loss": 0.3, "network_seed": 1},
+    "one-way ring": {"topology": "ring", "one_way": ONE_WAY_RING},
+    "partition": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, groups=GROUPS),)},
+    "partition, loss and latency": {
+        "topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, groups=GROUPS),), "loss": 0.2, "latency": 0.6,
+        "network_seed": 1,
+    },
+    "links that come and go": {
+        "topology": "ring", "loss": 0.2, "schedule": (
+            ScheduleEntry(3.0, 6.0, links_down=(("robot_0", "robot_1"),)),
+            ScheduleEntry(5.0, 9.0, links_up=(("robot_0", "robot_2"),)),
+            ScheduleEntry(7.0, 10.0, links_down=(("robot_0", "robot_1"), ("robot_2", "robot_3"))),),
+    },
+    "silence": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, robots_silent=("robot_1",)),)},
+    "a robot was off": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, robots_off=("robot_1",)),)},
+    "newcomer": {"topology": "ring", "schedule": (ScheduleEntry(0.0, 9.0, robots_off=("robot_3",)),)},
+    "different periods": {"topology": "ring", "robots": {"robot_1": {"publish_period": 3.0, "publish_phase": 1.0}}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RATIO_FAULTS)
+def test_ratio_ends_with_the_oracle_despite_faults(name):
+    _, tick = finished_run(rule="ratio", **RATIO_FAULTS[name])
+    assert tick.graph.active == (0, 1, 2, 3)
+    assert_all_have_the_oracle(tick, RATIO_TOLERANCE)
+
+
+def test_on_one_way_links_bayes_drifts_and_ratio_does_not():
+    deviations = {
+        rule: oracle_errors(finished_run(rule=rule, topology="ring", one_way=ONE_WAY_RING)[1])
+        for rule in ("ratio", "bayes")
+    }
+    assert (deviations["bayes"] > 10 * deviations["ratio"].max()).all()
+    assert (deviations["bayes"] > 0.5).all()

@@ -1,0 +1,202 @@
+"""Faults of the session and of the twin that the comparison has to find."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from octoreplay.mapping import sensor
+from octoreplay.mapping.kernels import consensus as consensus_kernels
+from octoreplay.mapping.kernels import storage
+from octoreplay.replay import session as session_module
+from octoreplay.replay.measure import TickMeasurer
+from octoreplay.replay.robots import consensus as consensus_module
+from octoreplay.replay.robots import robot as robot_module
+from octoreplay.replay.session import Session
+from reference import rules
+from support.octree_factory import class_rows
+from support.twin_comparison import SMALL, compare
+
+
+def _change_steps(monkeypatch, change):
+    """Apply ``change`` to every consensus step."""
+    right = consensus_module.team_step
+
+    def wrong(steps, **kwargs):
+        return right([change(step) for step in steps], **kwargs)
+
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
+
+
+def _wrong_sign(monkeypatch):
+    _change_steps(
+        monkeypatch,
+        lambda step: dataclasses.replace(step, step_weights=[-0.1 * weight for weight in step.step_weights]),
+    )
+
+
+def _wrong_gradient_sign(monkeypatch):
+    _change_steps(monkeypatch, lambda step: dataclasses.replace(step, gamma=-0.1 * step.gamma))
+
+
+def _change_arrivals(monkeypatch, change):
+    """Replace every map that arrived by ``change`` before the robots iterate."""
+    right = Session._iterate
+
+    def wrong(self, graph, factor, number):
+        for robot in self.team.robots:
+            robot._arrived = [a._replace(held=change(self, robot, a)) for a in robot._arrived]
+        return right(self, graph, factor, number)
+
+    monkeypatch.setattr(Session, "_iterate", wrong)
+
+
+def _current_maps_in_place_of_published_ones(monkeypatch):
+    _change_arrivals(
+        monkeypatch,
+        lambda session, robot, arrival: dataclasses.replace(
+            arrival.held, octree=session.team.robots[arrival.source.origin].map
+        ),
+    )
+
+
+def _maps_of_the_tick_before(monkeypatch):
+    last = {}
+
+    def before(session, robot, arrival):
+        key = (robot.index, arrival.source)
+        old = last.get(key, arrival.held)
+        last[key] = arrival.held
+        return old
+
+    _change_arrivals(monkeypatch, before)
+
+
+def _free_is_not_reset(monkeypatch):
+    """Keep the step of free space, g_0 = -sum of the others, out of the log-odds of the classes."""
+    right = consensus_module.team_step
+
+    def wrong(steps, **kwargs):
+        mixed = [dataclasses.replace(step, own=step.own.copy(), gamma=0.0) for step in steps]
+        right(mixed, **kwargs)
+        changes = right(steps, **kwargs)
+        for own, without in ((step.own, other.own) for step, other in zip(steps, mixed, strict=True)):
+            codes = own.codes[own.bricks.masks[: own.num_bricks].any(axis=1)]
+            rows, others = class_rows(own, own.find(codes)), class_rows(without, without.find(codes))
+            is_there = rows >= 0
+            after, before = np.zeros((2, *rows.shape, storage.OCTETS), np.float32)
+            after[is_there], before[is_there] = own.bricks.rows[rows[is_there]], without.bricks.rows[others[is_there]]
+            after += (after - before).sum(axis=1, keepdims=True)
+            own.bricks.rows[rows[is_there]] = after[is_there]
+        return changes
+
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
+
+
+def _free_is_not_reset_in_the_twin(monkeypatch):
+    monkeypatch.setattr(rules, "free_is_zero", lambda log_odds: log_odds)
+
+
+def _evidence_of_the_last_iteration_is_forgotten(monkeypatch):
+    def forget(step):
+        return dataclasses.replace(step, last_log_likelihood=type(step.own)(step.own.resolution, step.own.num_classes))
+
+    _change_steps(monkeypatch, forget)
+
+
+def _scans_of_the_tick_come_late(monkeypatch):
+    right = Session._integrate
+    monkeypatch.setattr(Session, "_integrate", lambda self, number, stamp_ns: right(self, number, stamp_ns - 10**9))
+
+
+def _hits_add_too_little(monkeypatch):
+    right = robot_module.clamped_increments
+    monkeypatch.setattr(
+        robot_module, "clamped_increments", lambda config: dataclasses.replace(right(config), hit=config.hit - 0.01)
+    )
+
+
+def _clamping_is_forgotten(monkeypatch):
+    monkeypatch.setattr(robot_module, "clamped_increments", sensor.unclamped_increments)
+
+
+def _half_a_step(monkeypatch):
+    right = session_module.step_size
+    monkeypatch.setattr(session_module, "step_size", lambda *args: 0.5 * right(*args))
+
+
+def _neighbours_cells_are_not_taken(monkeypatch):
+    right = consensus_kernels.join_columns
+
+    def wrong(table, columns, needs_update, known, has_block, layout):
+        right(table, columns, needs_update, known, has_block, layout)
+        known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
+
+    monkeypatch.setattr(consensus_kernels, "join_columns", wrong)
+
+
+LOG_ODDS_DIFFER = "log-odds differ"
+MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious|iterations differ"
+
+
+@pytest.mark.parametrize(
+    ("rule", "mode", "fault", "message"),
+    [
+        ("gradient", "sync", _wrong_sign, LOG_ODDS_DIFFER), ("gradient", "on-arrival", _wrong_sign, LOG_ODDS_DIFFER),
+        ("natural", "sync", _wrong_sign, LOG_ODDS_DIFFER), ("bayes", "sync", _wrong_sign, LOG_ODDS_DIFFER),
+        ("bayes", "on-arrival", _wrong_sign, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _wrong_gradient_sign, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("gradient", "on-arrival", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("natural", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("bayes", "sync", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("bayes", "on-arrival", _current_maps_in_place_of_published_ones, MAPS_DIFFER),
+        ("gradient", "sync", _maps_of_the_tick_before, MAPS_DIFFER),
+        ("bayes", "on-arrival", _maps_of_the_tick_before, MAPS_DIFFER),
+        ("gradient", "sync", _free_is_not_reset, LOG_ODDS_DIFFER),
+        ("gradient", "on-arrival", _free_is_not_reset, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _free_is_not_reset_in_the_twin, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _evidence_of_the_last_iteration_is_forgotten, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _scans_of_the_tick_come_late, "scans differ|active robots differ"),
+        ("local", "sync", _hits_add_too_little, LOG_ODDS_DIFFER),
+        ("gradient", "sync", _hits_add_too_little, LOG_ODDS_DIFFER),
+        ("local", "sync", _clamping_is_forgotten, LOG_ODDS_DIFFER), ("gradient", "sync", _half_a_step, LOG_ODDS_DIFFER),
+        ("natural", "sync", _neighbours_cells_are_not_taken, "cells are missing"),
+    ],
+)  # fmt: skip
+def test_the_comparison_fails_with_a_fault(monkeypatch, rule, mode, fault, message):
+    parameters = {"topology": "line", "rule": rule, "mode": mode, "settle": 0, "every": 5}
+    compare(SMALL, **parameters)
+    fault(monkeypatch)
+    with pytest.raises(AssertionError, match=message):
+        compare(SMALL, **parameters)
+
+
+def _each_robot(robots, name, change):
+    return tuple(dataclasses.replace(robot, **{name: getattr(robot, name) + change}) for robot in robots)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("total_distance", lambda value: value * 1.01), ("total_distance_all", lambda value: value * 0.99),
+        ("num_known_cells", lambda value: value + 1), ("max_change", lambda value: value + 0.1),
+        ("label_disagreement", lambda value: value + 0.1),
+        ("robots", lambda robots: _each_robot(robots, "agreement", 0.05)),
+        ("robots", lambda robots: _each_robot(robots, "agreement_occupied", -0.05)),
+        ("robots", lambda robots: _each_robot(robots, "entropy_bits", 0.001)),
+        ("robots", lambda robots: _each_robot(robots, "num_cells", 1)),
+    ],
+)  # fmt: skip
+def test_the_comparison_fails_with_a_wrong_metric(monkeypatch, name, wrong):
+    right = TickMeasurer.measure
+
+    def measure(self, *args, **kwargs):
+        metrics = right(self, *args, **kwargs)
+        return dataclasses.replace(metrics, **{name: wrong(getattr(metrics, name))})
+
+    monkeypatch.setattr(TickMeasurer, "measure", measure)
+    with pytest.raises(AssertionError):
+        compare(SMALL, topology="line", rule="gradient", settle=0, every=50, with_metrics=True)
