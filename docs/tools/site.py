@@ -44,7 +44,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, files: Files, **_: MkDocsConfig) -> str:
+def on_page_markdown(markdown: str, page: Page, files: Files, **_: object) -> str:
     """Return the page with its links as the site needs them, and with the options where they belong."""
     names = {name: ROOT / source for source, name in OUTSIDE.items()}
     folder = names.get(page.file.src_uri, DOCS / page.file.src_uri).parent
