@@ -1,10 +1,13 @@
 """Import contracts: they hold, and a breach of each is reported."""
 
+import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -101,3 +104,47 @@ def test_reference_twin_shares_no_code_with_the_package(breach: str, tmp_path: P
     done = check_contracts(config, tmp_path, ROOT / "src")
     assert done.returncode == bool(breach), done.stdout + done.stderr
     assert ("reference is not allowed to import octoreplay.mapping" in done.stdout) == bool(breach)
+
+
+def tool(name: str) -> ModuleType:
+    """A script of docs/tools."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "tools" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_shows_the_imports_of_the_source() -> None:
+    rooms = tool("rooms")
+    shown = rooms.PAGE.read_text(encoding="utf-8").partition(rooms.START)[2].partition(rooms.END)[0]
+    assert shown == rooms.text(rooms.rooms()), "run python docs/tools/rooms.py"
+    for name, drawing in rooms.drawings().items():
+        assert (rooms.DRAWINGS / name).read_text(encoding="utf-8") == drawing, "run python docs/tools/rooms.py"
+
+
+def test_a_new_import_changes_the_drawing() -> None:
+    rooms = tool("rooms")
+    imports = {"top": {"middle", "bottom"}, "middle": {"bottom"}, "bottom": set()}
+    assert rooms.text(imports).splitlines()[1:4] == ["top         -> middle, bottom", "middle      -> bottom",
+                                                    "bottom      -> (none)"]  # fmt: skip
+    without_shortcut = {**imports, "top": {"middle"}}
+    assert rooms._essential(imports) == rooms._essential(without_shortcut) == [("middle", "bottom"), ("top", "middle")]
+    assert rooms._essential({**imports, "middle": set()}) == [("top", "bottom"), ("top", "middle")]
+
+
+def test_the_page_names_files_that_exist() -> None:
+    rooms = tool("rooms")
+    steps = [step.partition("\n")[2] for step in rooms.TICK]
+    paths = re.findall(r"`([a-z_]+/[a-z_/.]*)`", rooms.PAGE.read_text(encoding="utf-8"))
+    assert len(paths) > 30
+    for path in (*steps, *paths):
+        assert (rooms.PACKAGE / path).exists() or (ROOT / path).exists(), path
+
+
+def test_every_room_has_its_row() -> None:
+    rooms = tool("rooms")
+    page = rooms.PAGE.read_text(encoding="utf-8")
+    for room in rooms.rooms():
+        assert f"`{room}/`" in page or f"`{room}.py`" in page, room

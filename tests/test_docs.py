@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
+import octoreplay
 from octoreplay import cli
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.rules import RULES, Exchanged
@@ -67,11 +68,31 @@ def test_every_command_and_option_is_explained() -> None:
 
 
 def test_links_between_pages_lead_somewhere() -> None:
-    pages = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
+    root = DOCS.parent
+    pages = [root / "README.md", root / "CONTRIBUTING.md", root / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
     assert len(pages) > 5
     for page in pages:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name} -> {target}"
+
+
+def test_every_page_has_a_place_in_the_navigation() -> None:
+    navigation = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2].partition("\n\n")[0]
+    assert {page.name for page in DOCS.glob("*.md")} <= set(re.findall(r"[a-z-]+\.md", navigation))
+
+
+def test_every_public_name_is_in_the_python_reference() -> None:
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"^::: octoreplay\.(\w+)$", page, re.MULTILINE))
+    assert names | {"__version__"} == set(octoreplay.__all__)
+
+
+def test_the_page_on_extension_names_files_that_exist() -> None:
+    page = (DOCS / "how-to-extend.md").read_text(encoding="utf-8")
+    paths = set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+(?:\.[a-z]+)?)`", page)) - {"io/containers/xyz_log.py"}
+    assert len(paths) > 15
+    for path in paths:
+        assert (DOCS.parent / path).exists() or (DOCS.parent / "src" / "octoreplay" / path).exists(), path
 
 
 @pytest.mark.parametrize("name", ["rules", "steps", "scale", "noise", "choose"])

@@ -131,6 +131,8 @@ def check_result(
 ) -> tuple[CheckRow, ...]:
     """Check a result against limits and return one row per check, failed ones first, in the order of ``LIMITS``.
 
+    A value that cannot be measured is NaN and fails. The result of an interrupted run fails with a row of its own.
+
     Parameters
     ----------
     path : path
@@ -141,8 +143,6 @@ def check_result(
         True to check that the maps were at rest at the end.
     truth : path, optional
         True world (docs/simulation.md), which some limits need.
-
-    A value that cannot be measured is NaN and fails. The result of an interrupted run fails with a row of its own.
 
     Raises
     ------

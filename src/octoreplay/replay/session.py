@@ -114,7 +114,7 @@ class Session:
         self.stop_reason = settling.stop_reason
 
     def _exchange(self, number: int, stamp_ns: int, gamma_factor: float = 1.0, *, settling: bool = False) -> Tick:
-        """One tick behind its scans: publish, deliver, iterate, measure."""
+        """The rest of a tick after its scans: publish, deliver, iterate, measure."""
         graph, robots = self._graph, self.team.robots
         self.is_symmetric &= graph.is_symmetric
         published = self._publish(graph, number, stamp_ns)

@@ -114,13 +114,13 @@ class RobotLog:
     ) -> Iterator[Frame]:
         """Yield the robot's frames in stamp order, decoded on demand; ``counts`` has the frames that are not given.
 
-        ``start`` and ``duration`` count from ``team_start_ns``, the robot's own first stamp unless given. With a
-        ``start``, reading begins some seconds before it, and late, duplicate, undecodable and damaged messages before
-        that are not counted. The logs are read from their beginning where the delay between stamps and log times
-        changes by more than 10 s, or where Foxglove's transforms, which hold from their first message on, are needed.
-        Reading ends when ``is_wanted``, which is called for every message, returns False. Every call starts with fresh
-        counts. Raises InputError with file, topic and time for an encoding that holds no depth or no labels, for images
-        whose sizes differ, and for frames that TF never joins.
+        ``start`` and ``duration`` count from ``team_start_ns`` (default: the robot's first stamp). With a ``start``,
+        reading begins some seconds before it; late, duplicate, undecodable and damaged messages before that are not
+        counted. The logs are read from their beginning where the delay between stamps and log times changes by more
+        than 10 s, and with Foxglove's transforms, which hold from their first message on. Reading ends when
+        ``is_wanted``, which is called for every message, returns false. Every call starts with new counts. Raises
+        InputError for an encoding without depth or labels, for images of different sizes, and for frames that TF does
+        not join.
         """
         self.counts = FrameCounts(truncated_files=self._damage())
         if self._labels is not None:
@@ -211,12 +211,12 @@ class RobotLog:
         """Log time from which to read for stamps from ``needed_from_ns`` on; None for the log's beginning."""
         if needed_from_ns is None:
             return None
-        # Delays are taken to differ from that of the first message by at most _LOG_DELAY_NS.
+        # Delays are assumed to differ from that of the first message by at most _LOG_DELAY_NS.
         delay_ns = self.first_log_time_ns - (self.first_stamp_ns - self._offset_ns)
         log_start_ns = needed_from_ns + delay_ns - _LOG_DELAY_NS
         if log_start_ns <= self.first_log_time_ns or self._has_holding_transforms(poses):
             return None
-        # A clock that was set, or that runs at another speed than the log's, shows in the delay at this place.
+        # The delay here reveals a clock that was set or that runs at another rate than the log times.
         try:
             delays = [
                 message.log_time_ns - self._stamp_of(message, StampCheck(self._offset_ns))
@@ -228,7 +228,7 @@ class RobotLog:
         return log_start_ns if is_steady else None
 
     def _has_holding_transforms(self, poses: PoseSource) -> bool:
-        """True where one of the pose topics carries transforms that hold from their first message on (Foxglove's)."""
+        """True where a pose topic has Foxglove's transforms, which hold from their first message on."""
         types = {topic.type_name for log in self._logs for topic in log.topics if topic.name in poses.topics}
         return any(kind_of(name) is Kind.TF and name.startswith("foxglove") for name in types)
 

@@ -26,7 +26,7 @@ class Thinning:
 
     @property
     def needed_from_ns(self) -> int | None:
-        """Stamp before which no message or pose affects a frame that is taken; None where the first frames are."""
+        """Stamp before which no message or pose affects a frame that is used; None without a start."""
         return self._start_ns - self._hold_ns if self._has_start else None
 
     def keeps(self, stamp_ns: int) -> bool:
