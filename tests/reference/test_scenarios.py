@@ -52,6 +52,7 @@ def test_configurations_take_flat_parameters_and_edges():
     assert config.map.resolution == TeamShape().resolution
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_robots", [4, 6])
 def test_default_teams_are_large_enough(num_robots):
     """At least 100 ticks and 20,000 cells, overlapping views, saturated cells, evidence throughout, late and early."""

@@ -119,7 +119,7 @@ def test_flood_returns_the_map_of_an_earlier_restart_epoch(name, radio):
     schedule = (ScheduleEntry(5.0, 8.0, robots_off=("robot_1",), forget=True),)
     session, tick = finished_run(rule="flood", topology="ring", schedule=schedule, **PACKETS[name], **radio)
     assert session.team.robots[1].source == Source(1, 1)
-    (past,) = session._past_lives
+    (past,) = session.team._past_evidence
     published = {robot.exchange.held[Source(1, 0)].version for robot in session.team.robots}
     assert len(published) == 1
     # The evidence of its last tick was not published.
@@ -133,6 +133,6 @@ def test_flood_ends_with_the_oracle_if_a_robot_published_everything_before_its_r
     """With eight ticks a second, every scan is published before the next one."""
     pause = ScheduleEntry(6.0, 8.0, robots_off=("robot_1",), forget=True)
     session, tick = finished_run(rule="flood", schedule=(pause,), publish_period=0.125, **PACKETS[name])
-    (past,) = session._past_lives
+    (past,) = session.team._past_evidence
     assert np.abs(dense(past.octree)).max() > 1.0
     assert_all_have_the_oracle(tick, FLOOD_TOLERANCE)

@@ -38,9 +38,12 @@ def test_frames_of_each_robot_come_once_and_in_order(stamps_of_robots, ticks):
             assert {frame.robot_id for frame in frames} <= {str(index)}
             given_so_far[index] += [frame.stamp_ns for frame in frames]
             assert given_so_far[index] == [stamp for stamp in stamps if stamp < tick]
-            assert timeline.has_ended(index) == (len(given_so_far[index]) == len(stamps))
-            assert timeline.last_stamp_ns(index) == (given_so_far[index][-1] if given_so_far[index] else None)
         assert timeline.exhausted == (given_so_far == stamps_of_robots)
+        assert timeline.active(None) == [bool(given) for given in given_so_far]
+        for leave_ns in (tick - 5, tick):
+            pairs = zip(given_so_far, stamps_of_robots, strict=True)
+            expected = [bool(given) and (given != stamps or given[-1] >= leave_ns) for given, stamps in pairs]
+            assert timeline.active(leave_ns) == expected
 
 
 def test_no_log_is_read_more_than_one_frame_ahead():

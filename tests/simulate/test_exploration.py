@@ -15,7 +15,10 @@ from octoreplay.simulate.village import make_village
 PERIOD = 0.1
 
 
-@pytest.fixture(scope="module", params=[(70.0, 6, 0), (70.0, 6, 5), (26.0, 4, 1)], ids=str)
+LARGE = [pytest.param((70.0, 6, seed), marks=pytest.mark.long) for seed in (0, 5)]
+
+
+@pytest.fixture(scope="module", params=[*LARGE, (26.0, 4, 1)], ids=str)
 def drive(request):
     size, num_robots, seed = request.param
     world = make_village(size, seed)

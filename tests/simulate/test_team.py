@@ -306,6 +306,7 @@ def test_midway_is_slerp_at_one_half():
         np.testing.assert_allclose(middle[:3, 3], (a[:3, 3] + b[:3, 3]) / 2)
 
 
+@pytest.mark.long
 def test_no_robot_of_the_default_team_sees_more_than_its_share(tmp_path):
     # Small images, with the default village, team, camera and duration.
     config = SimulationConfig(image=(40, 30), rate=1.0)

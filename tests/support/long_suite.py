@@ -12,9 +12,6 @@ long = pytest.mark.long
 
 
 def one_in(step: int, *factors: Iterable[Any]) -> list[Any]:
-    """Every combination of some factors as parameters of a test; one in ``step`` is not left to the long suite.
-
-    A step that has no divisor in common with the numbers of values takes every value of every factor.
-    """
+    """Return every combination of some factors as parameters; the default suite runs one in ``step`` of them."""
     combinations = itertools.product(*factors)
     return [pytest.param(*values, marks=long if index % step else ()) for index, values in enumerate(combinations)]

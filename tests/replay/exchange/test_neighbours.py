@@ -189,7 +189,7 @@ def test_a_delta_holds_the_changes_since_the_acknowledged_version():
 def test_a_map_is_not_sent_back_to_its_sender():
     exchanges = [Exchange(PacketConfig(), PacketCodec(PacketConfig())) for _ in range(2)]
     source = Source(7, 0)
-    exchanges[0].held[source] = HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3)
+    exchanges[0].hold(source, HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3))
     ((_, message),) = exchanges[0].outbox([1], [source], keep_alive=False)
     exchanges[1].receive(0, message)
     assert exchanges[1].outbox([0], [source], keep_alive=False) == []

@@ -15,6 +15,7 @@ from octoreplay.mapping.quantise import quantised, top_classes
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
+from support.long_suite import one_in
 from support.octree_factory import cells_of, octree_of
 
 SOURCE = Source(0, 0)
@@ -161,13 +162,13 @@ def _by_brick(octree):
     return content
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize(
-    "parameters",
-    [{"budget": 1300}, {"budget": 1250, "packet_compression": "none"}, {"budget": 450, "content": "int8"},
-     {"budget": 1300, "prune_tolerance": 1e-9}],
-    ids=str,
+BUDGETS = (
+    {"budget": 1300}, {"budget": 1250, "packet_compression": "none"}, {"budget": 450, "content": "int8"},
+    {"budget": 1300, "prune_tolerance": 1e-9},
 )  # fmt: skip
+
+
+@pytest.mark.parametrize(("parameters", "seed"), one_in(2, BUDGETS, range(2)), ids=str)
 def test_within_a_budget_the_largest_changes_go_first(parameters, seed):
     random = np.random.default_rng(seed)
     public, encoder = _public_map(packets="delta", **parameters)

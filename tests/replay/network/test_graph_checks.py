@@ -62,7 +62,7 @@ def test_graphs_by_position_are_checked_during_the_run():
     with pytest.raises(ConfigError, match=r"^epsilon: 0\.6 is not below 0\.5, the bound .*'range', 3 of 3 robots"):
         team.at(1.0, [True] * 3, apart * [[1], [1], [50]])
     twice = ScheduleEntry(0.0, robots_off=NAMES[:1], robots_silent=NAMES[:1])
-    with pytest.raises(ConfigError, match="is in it twice"):
+    with pytest.raises(ConfigError, match="is in two entries"):
         check_team_graph(NetworkConfig(topology="range", schedule=(twice,)), consensus, NAMES[:3])
 
 

@@ -146,8 +146,8 @@ def test_robots_hold_the_scans_since_their_last_restart():
             [ScheduleEntry(0.0, 30.0, groups=(("husky",), ("spot",)), links_up=(("spot", "husky"),))],
             r"link 'husky' - 'spot' is in two entries at 0 s",
         ),
-        ([ScheduleEntry(0.0, links_down=(("spot", "husky"), ("husky", "spot")))], r"link 'husky' - 'spot' is in it"),
-        ([ScheduleEntry(0.0, robots_off=("spot",), robots_silent=("spot",))], r"robot 'spot' is in it twice"),
+        ([ScheduleEntry(0.0, links_down=(("spot", "husky"), ("husky", "spot")))], "'husky' - 'spot' is in two entries"),
+        ([ScheduleEntry(0.0, robots_off=("spot",), robots_silent=("spot",))], r"robot 'spot' is in two entries"),
     ],
 )  # fmt: skip
 def test_invalid_schedules_are_refused(entries, message):
@@ -201,7 +201,7 @@ def test_the_state_at_every_time_follows_from_the_entries(entries):
         len(subjects := [s for entry in holding[t] for s in _subjects(entry)]) > len(set(subjects)) for t in times
     )
     if twice:
-        with pytest.raises(ConfigError, match="is in it twice"):
+        with pytest.raises(ConfigError, match="is in two entries"):
             _schedule(*entries)
         return
     schedule = _schedule(*entries)
