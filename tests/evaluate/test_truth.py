@@ -211,7 +211,7 @@ def test_labels_of_faces_take_precedence_over_those_of_vertices(tmp_path: Path) 
         ([(1e9, 0, 0)], [7], None, "reaches beyond 131 km"),
         ([(0, 0, 0), (1e9, 0, 0), (0, 1, 0)], None, [((0, 1, 2), 7)], "reaches beyond 131 km"),
         ([(0, 0, 0), (90_000, 0, 0), (0, 90_000, 0)], None, [((0, 1, 2), 7)], r"would take 5\.8e\+11 points"),
-        ([(0, 0, 0), (1, 0, 0), (0, 1, 0)], None, [((0, 1, 5), 7)], "a face names a vertex that is not there"),
+        ([(0, 0, 0), (1, 0, 0), (0, 1, 0)], None, [((0, 1, 5), 7)], "a face has a vertex index out of range"),
         ([(0, 0, 0), (1, 0, 0)], None, [((0, 1), 7)], "holds no surface"),
         ([], [], None, "holds no surface"),
     ],
