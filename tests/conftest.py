@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from support import long_suite
 from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
 
 IS_COMPILED = os.environ.get("NUMBA_DISABLE_JIT") != "1"
@@ -28,9 +29,18 @@ SharedFile = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    long_suite.is_long_suite = config.getoption("markexpr") == "long"
     if not IS_COMPILED:
         # Kernels let integers overflow and divide by 0, of which numpy warns in Python.
         config.addinivalue_line("filterwarnings", "ignore::RuntimeWarning")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Select the random tests in both suites: with few examples in the default one, with all in the long one."""
+    for item in items:
+        if long_suite.is_long_suite and item.get_closest_marker("examples"):
+            item.add_marker(long_suite.long)
 
 
 @pytest.fixture(scope="session")

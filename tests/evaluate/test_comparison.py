@@ -9,7 +9,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.config.class_file import class_table
@@ -22,6 +22,7 @@ from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
 from support import octree_factory
+from support.long_suite import examples
 from support.result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25
@@ -115,7 +116,7 @@ def twin(a: dict, b: dict, tolerance: float) -> dict:
     }  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(a=maps(), b=maps(), tolerance=st.sampled_from([0.0, 0.25, 0.5, 1.0]), shared=st.booleans())
 def test_every_number_equals_that_of_the_twin(tmp_path_factory, a, b, tolerance, shared) -> None:
     b = {**a, **b} if shared else b
@@ -133,7 +134,7 @@ def test_every_number_equals_that_of_the_twin(tmp_path_factory, a, b, tolerance,
         assert found["largest_at"] is None
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(a=maps(), b=maps(), tolerance=st.sampled_from([0.0, 0.25, 1.0]))
 def test_exchanged_results_have_the_same_difference(tmp_path_factory, a, b, tolerance) -> None:
     folder = tmp_path_factory.mktemp("pair")
@@ -148,7 +149,7 @@ def test_exchanged_results_have_the_same_difference(tmp_path_factory, a, b, tole
     assert [getattr(one, name) for name in same] == [getattr(other, name) for name in same]
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(a=maps(), b=maps())
 def test_a_larger_tolerance_does_not_find_more_differences(tmp_path_factory, a, b) -> None:
     folder = tmp_path_factory.mktemp("pair")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.evaluate.repairs import Repairs, repairs
@@ -11,6 +11,7 @@ from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import keys_to_codes
 from octoreplay.result import StoredMap
 from support import octree_factory
+from support.long_suite import examples
 
 FREE, GROUND, TREE = [-2.0, -2.0], [2.0, -1.0], [-1.0, 2.0]
 VALUES = {0: FREE, 1: GROUND, 2: TREE}
@@ -65,7 +66,7 @@ def test_a_cell_that_is_unknown_after_the_exchange_has_the_label_of_the_prior() 
 KEYS = st.tuples(*[st.integers(-3, 4)] * 3)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     own=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
     after=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.evaluate.morton_intervals import Region
@@ -16,6 +16,7 @@ from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import SemanticOctree, keys_to_codes
 from support import dense_scores
+from support.long_suite import examples
 from support.octree_factory import cells_of, cube, octree_of
 
 FREE, GROUND, TREE, UNSURE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3), (-0.3, -0.4)
@@ -62,7 +63,7 @@ def mean_of_true_classes(iou, region, classes):
     return np.mean([iou[class_id - 1] for class_id in true]) if true else np.nan
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(scenes(), st.sampled_from((0.0, -0.8, 0.15)), st.sampled_from((1, 3)))
 def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior, num_robots):
     cells, team, observed, classes = scene
@@ -87,7 +88,7 @@ def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior, num_robots)
     np.testing.assert_allclose((*found_iou, *found_numbers), expected, atol=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(scenes(), st.sampled_from((0.0, -0.8)))
 def test_agreement_equals_that_over_cells(scene, prior):
     cells, reference, _, _ = scene
@@ -220,7 +221,7 @@ def test_scores_of_an_empty_map():
     assert Region([]).num_inside(octree_of({(0, 0, 0): GROUND}).spans()).tolist() == [0]
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(scenes())
 def test_a_region_is_the_union_of_the_known_cells(scene):
     maps = [octree_of(content) for content in scene[:3]]

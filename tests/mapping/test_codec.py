@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.errors import PacketError
@@ -18,6 +18,7 @@ from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, quantised
 from octoreplay.mapping.streams import leaf_list, leaf_values
+from support.long_suite import examples
 from support.octree_factory import cells_of, cube, octree_of
 from support.packet_format import (
     CHAIN,
@@ -37,7 +38,7 @@ from support.packet_format import (
 PLAIN = PacketFormat(zstd_level=None)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(octree=octrees(), level=st.sampled_from([None, 1, 3, 22]), prune=st.booleans())
 def test_decoding_restores_the_map_bit_for_bit(octree, level, prune):
     packet = codec.encode_packet(octree, packet_format=PacketFormat(zstd_level=level), prune=prune)
@@ -48,14 +49,14 @@ def test_decoding_restores_the_map_bit_for_bit(octree, level, prune):
     assert codec.encode_packet(decoded) == codec.encode_packet(octree)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(octree=octrees(), prune=st.booleans())
 def test_streams_follow_the_documented_format(octree, prune):
     streams = octree.streams(prune=prune)
     assert naive_cells(streams.words.tolist(), streams, octree.num_classes) == cells_of(octree)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(octree=octrees())
 def test_leaf_stores_the_value_of_most_classes_and_the_others(octree):
     streams = octree.streams(prune=False)
@@ -68,7 +69,7 @@ def test_leaf_stores_the_value_of_most_classes_and_the_others(octree):
         assert streams.own_values[start:end].tolist() == [value for value in leaf if value != shared]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(before=octrees(num_classes=2), after=octrees(num_classes=2), data=st.data())
 def test_delta_replaces_its_bricks(before, after, data):
     after.resolution = before.resolution
@@ -183,7 +184,7 @@ def test_grid_bytes():
 # --- contents ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     octree=octrees(), content=st.sampled_from(CONTENTS), step=st.sampled_from([0.05, 0.3, 1e-3]), level=st.booleans(),
     every=st.integers(1, 3),
@@ -238,7 +239,7 @@ def test_siblings_made_equal_by_quantisation_are_one_leaf():
     assert codec.encode_packet(exact, packet_format=packet_format) == packet
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(octree=octrees(), content=st.sampled_from(CONTENTS), prune=st.booleans())
 def test_compressed_payload_follows_the_documented_format(octree, content, prune):
     octree = quantised(octree, content, 0.05)
@@ -253,7 +254,7 @@ def test_compressed_payload_follows_the_documented_format(octree, content, prune
     assert zstandard.ZstdDecompressor().decompress(packet[codec.HEADER_BYTES :]) == expected
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(
     numbers=st.lists(st.sampled_from([0, 1, 2, 255, 256, 2**16 - 1, 2**31, 2**32 - 1, 0xC0A00000, 377, 754, 1131])),
     width=st.sampled_from([2, 4]),

@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.errors import PacketError
@@ -16,6 +16,7 @@ from octoreplay.mapping import codec
 from octoreplay.mapping import octree as octree_module
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.quantise import CONTENTS, quantised
+from support.long_suite import examples
 from support.octree_factory import cells_of, cube, octree_of
 from support.packet_format import CHAIN, coded_payload, counts_of, forged, naive_cells, octrees, words_of
 
@@ -230,7 +231,7 @@ def test_bytes_after_the_compressed_payload_are_refused():
             codec.decode_packet(forged(payload + tail, counts=counts, compression=1))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     words=st.lists(st.integers(0, 2**16 - 1), max_size=40),
     leaves=st.integers(0, 40),
@@ -247,7 +248,7 @@ def test_any_words_give_an_octree_or_a_packet_error(words, leaves, masks, data):
     assert octree.streams().num_leaves <= leaves
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(octree=octrees(num_classes=2), prune=st.booleans(), data=st.data())
 def test_damaged_words_follow_the_format_or_give_a_packet_error(octree, prune, data):
     """Some wrong, additional or missing words deep in a real octree, with a valid checksum."""

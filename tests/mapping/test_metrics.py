@@ -6,11 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.mapping.metrics import MapComparer
 from reference.metrics import team_metrics
+from support.long_suite import examples
 from support.octree_factory import cube, octree_of
 
 EMPTY = {}
@@ -133,7 +134,7 @@ def _dense(maps, oracle, prior):
     return dense[:-1], known, dense[-1]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=st.integers(0, 10_000), prior=st.sampled_from([0.0, -1.2]))
 def test_random_maps_against_the_reference(seed, prior):
     rng = np.random.default_rng(seed)
@@ -152,7 +153,7 @@ def test_random_maps_against_the_reference(seed, prior):
     assert found.agreement_occupied.tolist() == pytest.approx(expected.agreement_occupied)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=st.integers(0, 10_000))
 def test_incremental_comparison_equals_a_new_one(seed):
     rng = np.random.default_rng(seed)

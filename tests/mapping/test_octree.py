@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
@@ -12,6 +12,7 @@ from octoreplay.mapping.octree import SemanticOctree, codes_to_keys, keys_to_cod
 from octoreplay.mapping.streams import leaf_list
 from octoreplay.records import LeafTable
 from reference.comparison import expand_leaves, num_lossless_leaves
+from support.long_suite import examples
 from support.octree_factory import cells_of, cube, octree_of
 
 LIMIT = storage.KEY_OFFSET
@@ -32,7 +33,7 @@ def cell_maps(draw, num_classes):
     return cells
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(cells=cell_maps(num_classes=2))
 def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
     octree = octree_of(cells)
@@ -47,7 +48,7 @@ def test_leaves_are_canonical_do_not_overlap_and_keep_the_volume(cells):
     assert _in_morton_order(leaves)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(cells=cell_maps(num_classes=2))
 def test_spans_equal_the_leaves(cells):
     octree = octree_of(cells)
@@ -66,7 +67,7 @@ def _in_morton_order(leaves):
     return bool((np.diff(codes) > 0).all())
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(cells=cell_maps(num_classes=3), seed=st.integers(0, 99))
 def test_lookup_equals_the_leaves(cells, seed):
     octree = octree_of(cells, num_classes=3)
@@ -105,7 +106,7 @@ def test_lookup_without_coordinates_and_in_an_empty_map():
     assert log_odds.shape == (4, 2)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(cells=cell_maps(num_classes=2), prior=st.sampled_from([0.0, 0.4, -0.7]))
 def test_occupied_leaves_have_a_class_above_free(cells, prior):
     octree = octree_of(cells)
@@ -125,7 +126,7 @@ def test_the_prior_is_added_to_leaves():
     assert table.sizes.tolist() == [0.25]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=st.integers(0, 10_000), tolerance=st.sampled_from([0.0, 0.05, 0.2, 1.0, 10.0]))
 def test_lossy_merging_stays_within_its_bound(seed, tolerance):
     """Cells differ from their merged leaf by at most half the tolerance, and no more leaves can be merged."""
@@ -157,7 +158,7 @@ def test_leaves_that_merge_to_equal_classes_are_not_vector_leaves():
     assert (merged.values.tolist(), merged.masks.size) == ([0.5], 0)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(cells=cell_maps(num_classes=2), prune=st.booleans())
 def test_leaves_of_a_stream_do_not_overlap_and_cover_the_known_space(cells, prune):
     octree = octree_of(cells)
@@ -188,7 +189,7 @@ def test_equal_siblings_are_not_merged_unless_all_are_known():
     assert len(whole.leaves()) == 1
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(first=cell_maps(num_classes=2), second=cell_maps(num_classes=2))
 def test_overwrite_replaces_whole_bricks(first, second):
     target, source = octree_of(first), octree_of(second)

@@ -5,13 +5,14 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.mapping import codec
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.quantise import CONTENTS, content_numbers, content_values, is_step, quantised, top_classes
+from support.long_suite import examples
 from support.octree_factory import cells_of, cube, octree_of
 
 FLOATS = st.floats(width=32)
@@ -118,7 +119,7 @@ def cell_maps(draw, num_classes):
     return cells
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(cells=cell_maps(num_classes=4), content=st.sampled_from(CONTENTS), step=STEPS)
 def test_every_cell_is_quantised(cells, content, step):
     octree = octree_of(cells, num_classes=4)
@@ -187,7 +188,7 @@ def naive_top_classes(values, num_kept):
     return [values[c] if c in kept else shared for c in range(len(values))]
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(cells=cell_maps(num_classes=5), num_kept=st.integers(1, 7))
 def test_top_classes_equal_the_naive_ones_cell_by_cell(cells, num_kept):
     octree = octree_of(cells, num_classes=5)
@@ -227,7 +228,7 @@ def test_top_classes_by_hand():
     assert values(5) == values(9) == [1.0, 3.0, 1.0, 3.0, 3.0]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(cells=cell_maps(num_classes=5), num_kept=st.integers(1, 6))
 def test_top_classes_are_idempotent(cells, num_kept):
     once = top_classes(octree_of(cells, num_classes=5), num_kept)

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.mapping.codec import decode_packet, encode_packet
@@ -28,6 +28,7 @@ from octoreplay.mapping.running_sums import (
 )
 from reference import ratio
 from reference.ratio import quantised
+from support.long_suite import examples
 from support.masses import (
     NUM_CLASSES,
     assert_equal,
@@ -47,7 +48,7 @@ from support.octree_factory import cells_of, cube, octree_of
 seeds = st.integers(0, 1_000_000)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds, num_receivers=st.integers(0, 7), is_first=st.booleans())
 def test_share_out_equals_the_reference(seed, num_receivers, is_first):
     rng = np.random.default_rng(seed)
@@ -78,7 +79,7 @@ def test_shares_are_rounded_to_nearest(num_receivers):
         assert share[0] == round(Fraction(int(masses[key][0]), parts))
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds, num_senders=st.integers(0, 4))
 def test_receive_equals_the_reference(seed, num_senders):
     rng = np.random.default_rng(seed)
@@ -98,7 +99,7 @@ def test_receive_equals_the_reference(seed, num_senders):
     assert revised_bricks(mass, 7) <= {code for new, _ in arrivals for code in new.codes.tolist()}
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=seeds, with_threads=st.booleans())
 def test_receive_team_equals_receive_robot_by_robot(seed, with_threads):
     rng = np.random.default_rng(seed)
@@ -149,7 +150,7 @@ def test_receive_team_without_robots():
     receive_team([], 1)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds)
 def test_add_evidence_equals_the_reference(seed):
     rng = np.random.default_rng(seed)
@@ -170,7 +171,7 @@ def test_add_evidence_equals_the_reference(seed):
     assert changed_bricks(masses, units_of(mass)) == revised_bricks(mass, 7)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds)
 def test_difference_added_to_the_old_sum_gives_the_new_sum(seed):
     rng = np.random.default_rng(seed)
@@ -195,7 +196,7 @@ def test_shares_of_a_weight_add_up_to_it():
 # --- the map ----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds, weight=st.integers(LEAST_WEIGHT, 6 * WHOLE_WEIGHT), tolerance=st.sampled_from([0.0, 1e-3]))
 def test_recovered_map_is_mass_over_weight(seed, weight, tolerance):
     rng = np.random.default_rng(seed)

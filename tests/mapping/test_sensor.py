@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.config.sensor import MapConfig, SensorConfig
@@ -15,6 +15,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import storage
 from octoreplay.records import CloudFrame, DepthFrame
 from reference.hand_made import cloud, depth_frame, facing_x
+from support.long_suite import examples
 from support.scans import SENSOR, cells_of_scan, check_scan, random_cloud, random_depth
 
 # --- against the reference -------------------------------------------------------------------------------------------
@@ -54,7 +55,7 @@ def test_bounds_through_cell_centres(resolution, low, high):
     assert freed
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     origin=st.tuples(*[st.integers(-24, 24)] * 3),
     ends=st.lists(st.tuples(*[st.integers(-30, 30)] * 3), min_size=1, max_size=6),
@@ -96,7 +97,7 @@ def test_long_rays(seed, rays):
     assert len(freed) > 5000
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(
     origin=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
     point=st.tuples(*[st.floats(-30.0, 30.0).map(lambda value: round(value, 6))] * 3),

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.config.sensor import MapConfig
@@ -18,6 +18,7 @@ from octoreplay.mapping.sensor import (
 from octoreplay.records import BodyBox, CameraModel, CloudFrame
 from reference.hand_made import cloud, depth_frame, facing_x
 from reference.scenarios import TeamShape, make_scenario
+from support.long_suite import examples
 from support.octree_factory import cells_of
 from support.scans import (
     MAP,
@@ -111,7 +112,7 @@ def _random_frame(seed, num_classes, kind, *, confident, num_boxes, bent):
     return dataclasses.replace(frame, boxes=random_boxes(rng, frame, num_boxes))
 
 
-@settings(max_examples=120, deadline=None)
+@examples(120)
 @given(
     seed=st.integers(0, 2**32 - 1),
     num_classes=st.sampled_from([1, 3, 12]),

@@ -23,6 +23,7 @@ from support.faulty_team import (
     session_of,
     team_sums,
 )
+from support.long_suite import one_in
 
 BAD_RADIO = {"loss": 0.5, "latency": 1.2, "jitter": 1.0}
 
@@ -61,8 +62,7 @@ def test_flood_ends_with_the_oracle_on_connected_graphs(parameters):
     assert_all_have_the_oracle(tick, 1e-5)
 
 
-@pytest.mark.parametrize("topology", ["line", "complete"])
-@pytest.mark.parametrize("name", PACKETS)
+@pytest.mark.parametrize(("name", "topology"), one_in(3, PACKETS, ["line", "complete"]))
 def test_flood_ends_with_the_oracle_over_a_bad_radio(name, topology):
     session = session_of(configured(rule="flood", topology=topology, **BAD_RADIO, **PACKETS[name]))
     num_gaps = 0
@@ -113,8 +113,9 @@ def test_flood_keeps_the_delivered_map_of_a_robot_that_is_off(name):
     assert oracle == pytest.approx(np.abs(last.oracle).sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("radio", [{}, {"loss": 0.3, "latency": 0.6, "jitter": 0.5}], ids=["good", "bad"])
-@pytest.mark.parametrize("name", PACKETS)
+@pytest.mark.parametrize(
+    ("name", "radio"), one_in(3, PACKETS, [{}, {"loss": 0.3, "latency": 0.6, "jitter": 0.5}]), ids=str
+)
 def test_flood_returns_the_map_of_an_earlier_restart_epoch(name, radio):
     schedule = (ScheduleEntry(5.0, 8.0, robots_off=("robot_1",), forget=True),)
     session, tick = finished_run(rule="flood", topology="ring", schedule=schedule, **PACKETS[name], **radio)

@@ -31,8 +31,7 @@ LOSSY = {
 }
 
 
-@pytest.mark.parametrize("packets", ["full", "delta"])
-@pytest.mark.parametrize("name", LOSSY)
+@pytest.mark.parametrize(("name", "packets"), one_in(3, LOSSY, ["full", "delta"]))
 def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     session = session_of(configured(rule="bayes", settle_max=8, **LOSSY[name], **PACKETS[packets]))
     rounded = 0.0
@@ -45,8 +44,7 @@ def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     assert all(robot.agreement > 0.99 and robot.agreement_occupied > 0.99 for robot in tick.metrics.robots)
 
 
-@pytest.mark.parametrize("mode", ["sync", "on-arrival"])
-@pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "merge"])
+@pytest.mark.parametrize(("rule", "mode"), one_in(3, ["gradient", "bayes", "natural", "merge"], ["sync", "on-arrival"]))
 def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
     parameters = {"rule": rule, "mode": mode, "topology": "ring", "settle": 3, "settle_max": 4}
     sessions = [

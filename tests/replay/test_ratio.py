@@ -17,6 +17,7 @@ from support.faulty_team import (
     oracle_errors,
     session_of,
 )
+from support.long_suite import one_in
 
 
 def test_ratio_equals_bayes_without_faults():
@@ -57,7 +58,7 @@ RATIO_FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", RATIO_FAULTS)
+@pytest.mark.parametrize(("name",), one_in(3, RATIO_FAULTS))
 def test_ratio_ends_with_the_oracle_despite_faults(name):
     _, tick = finished_run(rule="ratio", **RATIO_FAULTS[name])
     assert tick.graph.active == (0, 1, 2, 3)

@@ -55,7 +55,7 @@ def test_six_robots(rule, mode, topology):
     assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
 
 
-@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(3, RULES, MODES, TOPOLOGIES))
+@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(4, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""
     outcome = compare(
@@ -102,7 +102,7 @@ SENSOR_VARIANTS = {
 }
 
 
-@pytest.mark.parametrize(("rule", "variant"), one_in(2, ["gradient", "bayes"], SENSOR_VARIANTS))
+@pytest.mark.parametrize(("rule", "variant"), one_in(3, ["gradient", "bayes"], SENSOR_VARIANTS))
 def test_sensor_models(variant, rule):
     outcome = compare(SMALL, rule=rule, settle=0, every=8, sensor_parameters=SENSOR_VARIANTS[variant])
     assert outcome.twin_tick.known.any()

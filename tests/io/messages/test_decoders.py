@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from octoreplay.errors import InputError
@@ -24,6 +24,7 @@ from support.log_factory import (
     ros2,
     ros_row,
 )
+from support.long_suite import examples
 
 ODOMETRY = Entry("/odom", "nav_msgs/msg/Odometry", ros2.odometry(5 * SECOND, (1, 2, 3)), 0)
 IMAGE = Entry("/image", "sensor_msgs/msg/Image", ros2.image(5, np.ones((2, 3), np.uint16), "16UC1"), 0)
@@ -120,7 +121,7 @@ def test_cut_bytes_are_damage_or_a_shorter_message(row):
 
 
 @given(st.sampled_from(ROWS), st.integers(0, 10**6), st.binary(min_size=1, max_size=12), st.booleans())
-@settings(max_examples=600, deadline=None)
+@examples(600)
 def test_changed_bytes_raise_only_input_errors(row, position, noise, is_definition):
     source = bytearray(row.schema if is_definition else row.data)
     position %= len(source)
@@ -134,7 +135,7 @@ def test_changed_bytes_raise_only_input_errors(row, position, noise, is_definiti
 
 @given(st.sampled_from(ROWS), st.binary(max_size=80))
 @example(ROWS[0], b"")
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_random_bytes_raise_only_input_errors(row, data):
     message = row._replace(data=data).message()
     for read in (message.decode, message.sensor_message, message.header_stamp_ns, message.header_frame_id):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from octoreplay.errors import InputError
@@ -12,6 +12,7 @@ from octoreplay.io.messages.sensor_messages import Calibration, convert
 from octoreplay.io.sensors.cameras import FISHEYE_MODELS, POLYNOMIAL_MODELS, camera_model
 from octoreplay.records import CameraModel
 from support.log_factory import Factory
+from support.long_suite import examples
 
 HERE = "a.mcap: topic '/camera_info' at 1.000 s"
 K = (70.0, 0, 31, 0, 71, 23, 0, 0, 1)
@@ -131,7 +132,7 @@ def check_round_trip(model_name: str, project, D, slope) -> None:
 
 
 @given(st.sampled_from(POLYNOMIAL_MODELS), polynomials, slopes)
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_projected_rays_are_recovered(model_name, D, slope):
     check_round_trip(model_name, polynomial, D, slope)
 
@@ -140,7 +141,7 @@ def test_projected_rays_are_recovered(model_name, D, slope):
     st.sampled_from(FISHEYE_MODELS), st.tuples(*[st.floats(-0.02, 0.02)] * 4),
     st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)),
 )  # fmt: skip
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_projected_rays_are_recovered_from_a_fisheye(model_name, D, slope):
     theta = np.arctan(np.hypot(*slope))
     distorted = theta * (1 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(D)))
@@ -194,7 +195,7 @@ def test_pixels_that_no_ray_of_the_lens_model_hits_are_nan():
 )  # fmt: skip
 @example((0.0, 0.0, 0.4), (1.0, 0.0, 0.4))
 @example((0.3, 0.0, 0.0), (0.0, 0.0, 0.4))
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_a_pixel_has_the_ray_from_within_the_fold_or_none(above, below):
     """Compared with a table of the radial factor times r, from 0 up to its first decrease or pole."""
     D = (above[0], above[1], 0, 0, above[2], *below)
@@ -267,7 +268,7 @@ def test_impossible_sizes_are_refused_without_computing_rays(fields, model, d):
     st.sampled_from([("plumb_bob", 5), ("rational_polynomial", 8), ("plumb_bob", 14), ("equidistant", 4)]),
     st.data(),
 )  # fmt: skip
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_any_coefficients_give_a_camera_or_an_error(kind, data):
     numbers = st.floats(width=32) | st.sampled_from([0.0, 1e300, -1e300, np.nan, np.inf])
     d = data.draw(st.tuples(*[numbers] * kind[1]))

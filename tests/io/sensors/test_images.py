@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.errors import InputError
@@ -25,6 +25,7 @@ from octoreplay.io.sensors.images import (
     encoding_and_size,
 )
 from support.log_factory import ros2
+from support.long_suite import examples
 
 HERE = "a.mcap: topic '/x' at 1.000 s"
 KINDS = {
@@ -361,7 +362,7 @@ def test_a_cut_png_is_damage(name, share):
 
 
 @given(st.sampled_from(sorted(FILES)), st.integers(0, 10**6), st.binary(min_size=1, max_size=10), st.booleans())
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_damaged_files_raise_nothing_but_input_errors(name, position, noise, is_depth):
     data = bytearray(FILES[name])
     position %= len(data)
@@ -376,7 +377,7 @@ def test_damaged_files_raise_nothing_but_input_errors(name, position, noise, is_
 
 
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"RIFF"]))
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_garbage_is_damage(garbage, magic):
     for form in ("png", "16UC1; compressedDepth png", ""):
         with pytest.raises(DamagedMessageError, match=r"^a\.mcap: topic '/x' at 1\.000 s: the .*image "):
