@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from support.long_suite import long
+
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial.md"
 LOGS = ROOT / "tests" / "fixtures" / "pair"
@@ -36,6 +38,7 @@ def printed_lines(text: str) -> set[str]:
     return {" ".join(line.split()) for line in text.splitlines() if line.strip() and "──" not in line}
 
 
+@long
 def test_the_tutorial_works_as_printed(tmp_path: Path) -> None:
     for log in LOGS.glob("*.mcap"):
         shutil.copy(log, tmp_path)

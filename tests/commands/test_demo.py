@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from support.command_line import assert_fails, octoreplay
+from support.long_suite import long
 
 
+@long
 def test_demo_writes_every_file(tmp_path: Path) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     done = octoreplay("demo", "show", "--robots", 2, "--duration", 3, folder=tmp_path)

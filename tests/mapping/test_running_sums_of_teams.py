@@ -21,6 +21,7 @@ from octoreplay.mapping.running_sums import (
 )
 from reference import ratio
 from reference.ratio import RatioRobot, quantised
+from support.long_suite import long, one_in
 from support.masses import NUM_CLASSES, log_odds_octree, mass_of, signed, units_of, value_at
 from support.octree_factory import cells_of, cube
 
@@ -109,7 +110,7 @@ def _ring(size):
     return [[(robot + 1) % size, (robot - 1) % size] for robot in range(size)]
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", one_in(2, range(2)))
 def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
     """At every tick, with changing evidence, masses and shares under way add up to the evidence exactly."""
     rng = np.random.default_rng(seed)
@@ -178,6 +179,7 @@ def test_team_follows_changing_evidence():
     assert max(abs(robot.recover() - mean).max() for robot in robots) < 1e-4
 
 
+@long
 def test_no_drift_over_a_day_of_ticks():
     """The reference runs for 86,400 ticks; octrees are compared for a while at the start, in the middle and at the end.
 
