@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -305,6 +306,8 @@ def _scenario(shape=SHAPE):
 
 
 def _session(shape=SHAPE, **parameters):
+    if numba.config.DISABLE_JIT:
+        pytest.skip("a whole run takes too long without the compiler")
     scenario = _scenario(shape)
     sources = frame_lists(scenario.robot_ids, scenario.frames)
     return Session(scenario.config(**parameters), sources, ThreadPoolExecutor(1))
