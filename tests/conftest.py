@@ -20,6 +20,7 @@ if not IS_COMPILED:
     plain_intrinsics.install()
 
 # Imported after the intrinsics, because it imports kernels.
+from octoreplay.mapping.warm_up import compile_if_needed  # noqa: E402
 from octoreplay.replay.exchange.packet_codec import PacketCodec  # noqa: E402
 
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
@@ -33,6 +34,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if not IS_COMPILED:
         # Kernels let integers overflow and divide by 0, of which numpy warns in Python.
         config.addinivalue_line("filterwarnings", "ignore::RuntimeWarning")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels once, before the workers start: each of them would compile its own."""
+    if IS_COMPILED and session.config.getoption("numprocesses", None):
+        compile_if_needed()
 
 
 @pytest.hookimpl(tryfirst=True)

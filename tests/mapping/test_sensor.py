@@ -15,14 +15,13 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import storage
 from octoreplay.records import CloudFrame, DepthFrame
 from reference.hand_made import cloud, depth_frame, facing_x
-from support.long_suite import examples
+from support.long_suite import examples, one_in
 from support.scans import SENSOR, cells_of_scan, check_scan, random_cloud, random_depth
 
 # --- against the reference -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rays", ["cells", "all"])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(("seed", "rays"), one_in(3, range(12), ["cells", "all"]))
 def test_random_scans(seed, rays):
     rng = np.random.default_rng(seed)
     sensor = dataclasses.replace(SENSOR, rays=rays, min_range=0.4)
@@ -69,7 +68,7 @@ def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
     check_scan(frame, dataclasses.replace(SENSOR, rays=rays, max_range=100.0), MapConfig(resolution=0.25))
 
 
-@pytest.mark.parametrize("resolution", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("resolution", one_in(3, [0.1, 0.2, 0.3]))
 def test_walls_at_decimal_places(resolution):
     """Origins at centres and on walls of cells with an edge that is no binary fraction; rays to cell centres."""
     places = [k * resolution / 2 for k in range(-5, 6)]
@@ -80,8 +79,7 @@ def test_walls_at_decimal_places(resolution):
         check_scan(CloudFrame("r", 0, ends, None, pose), SENSOR, MapConfig(resolution=resolution))
 
 
-@pytest.mark.parametrize("rays", ["cells", "all"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "rays"), one_in(3, range(4), ["cells", "all"]))
 def test_long_rays(seed, rays):
     """Rays of hundreds of cells are traversed in several pieces; some end next to the end of a piece."""
     rng = np.random.default_rng(seed)

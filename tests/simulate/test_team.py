@@ -17,6 +17,7 @@ from octoreplay.simulate import team
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
+from support.long_suite import one_in
 from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
@@ -251,8 +252,9 @@ def test_a_folder_that_is_not_empty_is_refused_and_kept(tmp_path):
         simulate_team(tmp_path / "notes.txt" / "team", SMALL)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
-@pytest.mark.parametrize("exists", [True, False])
+@pytest.mark.parametrize(
+    ("error", "exists"), one_in(3, [KeyboardInterrupt, OSError(28, "No space left on device")], [True, False])
+)
 def test_a_failed_simulation_removes_its_files(tmp_path, monkeypatch, error, exists):
     def fail(*args, **kwargs):
         raise error

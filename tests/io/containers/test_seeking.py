@@ -22,6 +22,7 @@ from octoreplay.io.containers.db3_log import Db3Log
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.ros_types import typestore
 from support.log_factory import ROS1, SECOND, ros2
+from support.long_suite import examples
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "containers"
 STRING = "std_msgs/msg/String"
@@ -181,7 +182,7 @@ def test_every_log_of_the_suite_holds_messages(name):
 @example(first=1.0, last=None, shift=0, topics={0, 1, 2})
 @example(first=None, last=0.0, shift=1, topics={0, 1, 2})
 @example(first=0.7, last=0.3, shift=0, topics={0, 1, 2})
-@settings(max_examples=15, deadline=None)
+@examples(15)
 def test_a_range_gives_the_messages_of_the_whole_log_in_it(name, first, last, shift, topics):
     with open_log(log_of(name)) as log:
         names = [topic.name for index, topic in enumerate(log.topics) if index in topics]
