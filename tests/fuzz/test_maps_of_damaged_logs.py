@@ -22,12 +22,13 @@ from support.hostile_logs import (
     write_hostile_log,
 )
 from support.log_factory import write_rows
+from support.long_suite import one_in
 
 CASES = [pytest.param(range(2), id="few"), pytest.param(range(2, 30), id="many", marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("cases", CASES)
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", one_in(2, LOGS))
 def test_a_damaged_log_gives_a_map_or_a_sentence(tmp_path, name, cases):
     good = map_of_log(FIXTURES / name, is_run=False)
     assert good.refusal is None

@@ -18,7 +18,7 @@ from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, quantised
 from octoreplay.mapping.streams import leaf_list, leaf_values
-from support.long_suite import examples
+from support.long_suite import examples, long
 from support.octree_factory import cells_of, cube, octree_of
 from support.packet_format import (
     CHAIN,
@@ -84,6 +84,7 @@ def test_delta_replaces_its_bricks(before, after, data):
     assert set(before.codes[before.revisions == 7].tolist()) == codes
 
 
+@long
 def test_large_uniform_cubes_are_one_leaf():
     octree = octree_of(cube((-64, -64, -64), 64, [-5.0, -5.0]))
     streams = octree.streams()

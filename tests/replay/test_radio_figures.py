@@ -12,6 +12,9 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from support.fixture_paths import TRIO_TEAM
+from support.long_suite import long
+
+pytestmark = long
 
 
 @functools.lru_cache(maxsize=16)
@@ -45,7 +48,6 @@ def test_ratio_tolerates_losses_and_delays_on_a_ring():
     assert _worst(summary) >= 0.999
 
 
-@pytest.mark.long
 def test_flood_tolerates_a_loss_of_99_percent():
     assert _worst(_replayed(rule="flood", loss=0.99)) >= 0.999
 

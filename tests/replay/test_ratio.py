@@ -58,7 +58,7 @@ RATIO_FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", one_in(3, RATIO_FAULTS))
+@pytest.mark.parametrize("name", one_in(6, RATIO_FAULTS))
 def test_ratio_ends_with_the_oracle_despite_faults(name):
     _, tick = finished_run(rule="ratio", **RATIO_FAULTS[name])
     assert tick.graph.active == (0, 1, 2, 3)
