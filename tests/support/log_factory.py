@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from octoreplay.io.containers.log_reader import Channel, RawMessage, normalise_type_name
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import typestore
+from support.foxglove_definitions import FOXGLOVE_ROS2
 
 SECOND = 1_000_000_000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -249,27 +250,6 @@ def ros1_row(entry: Entry) -> Row:
     data = bytes(ROS1.serialize_ros1(entry.value, entry.type_name))
     return Row(entry.topic, entry.type_name, "ros1msg", definition.encode(), "ros1", data, entry.log_time_ns)
 
-
-# foxglove_msgs for ROS 2, as far as it is used.
-_FOXGLOVE_MSGS = {
-    "CompressedImage": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
-    "RawImage": "builtin_interfaces/Time timestamp\nstring frame_id\nuint32 width\nuint32 height\nstring encoding\n"
-    "uint32 step\nuint8[] data\n",
-    "CameraCalibration": "builtin_interfaces/Time timestamp\nstring frame_id\nuint32 width\nuint32 height\n"
-    "string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n",
-    "PackedElementField": "string name\nuint32 offset\nuint8 type\n",
-    "PointCloud": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nuint32 point_stride\n"
-    "foxglove_msgs/PackedElementField[] fields\nuint8[] data\n",
-    "LaserScan": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nfloat64 start_angle\n"
-    "float64 end_angle\nfloat64[] ranges\nfloat64[] intensities\n",
-    "PoseInFrame": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\n",
-    "FrameTransform": "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
-    "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
-    "FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
-}
-FOXGLOVE_ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-for _name, _definition in _FOXGLOVE_MSGS.items():
-    FOXGLOVE_ROS2.register(get_types_from_msg(_definition, f"foxglove_msgs/msg/{_name}"))
 
 FOXGLOVE_ENCODINGS = ("cdr", "protobuf", "json")
 # The types of the fields that are messages, in the SDK and in foxglove_msgs.
