@@ -64,7 +64,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _seconds(command: list[str]) -> float:
-    """How long a command takes."""
+    """Seconds that a command takes."""
     started = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - started

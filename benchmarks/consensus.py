@@ -200,7 +200,7 @@ def _add_rings(report: Report, rounds: int, resolution: float) -> None:
 
 
 def robot_evidence(robot: int, resolution: float) -> SemanticOctree:
-    """What one of the six robots has seen: LiDAR scans along its part of the street."""
+    """Evidence of one of the six robots: LiDAR scans along its part of the street."""
     octree = SemanticOctree(resolution, NUM_CLASSES)
     caster = ScanCaster(SENSOR, MapConfig(resolution=resolution), NUM_CLASSES)
     for frame in scenes.lidar_scene(FRAMES_PER_ROBOT, track=robot, tracks=NUM_ROBOTS).frames:

@@ -63,7 +63,7 @@ class Messages:
         return path, damage_log(path, rng)
 
     def read(self, path: Path, _: int) -> tuple[str, int]:
-        """What reading came to, and how many messages it gave."""
+        """Outcome of reading, and number of messages."""
         outcome = read_all(path)
         result = "refused" if outcome.refusal else "damaged" if outcome.damage else "read whole"
         return result, len(outcome.messages)
@@ -91,7 +91,7 @@ class Maps:
         return self._logs.write_hostile_log(name, folder, rng)
 
     def read(self, path: Path, case: int) -> tuple[str, int]:
-        """What came of it, and how many frames went into the maps."""
+        """Outcome, and number of frames in the maps."""
         outcome = self._logs.map_of_log(path, is_run=case % 5 == 0)
         result = "refused" if outcome.refusal else "map" if outcome.num_frames else "empty map"
         return result, outcome.num_frames
@@ -110,7 +110,7 @@ def run_batch(to: str, name: str, first: int, number: int, seed: int) -> None:
 
 
 def run_case(goal: Messages | Maps, name: str, case: int, folder: Path, seed: int) -> dict[str, object]:
-    """What came of one damaged copy of a log."""
+    """Outcome of one damaged copy of a log."""
     path, what = goal.damage(name, folder, random.Random(f"{seed} {name} {case}"))
     start = time.perf_counter()
     signal.alarm(SECONDS_PER_CASE)

@@ -27,7 +27,7 @@ FASTER_THAN_OCTOMAP = {
     ("lidar", 0.2): (10.0, 19.0),
     ("lidar", 0.1): (19.0, 36.0),
 }
-"""How many times as fast as native OctoMap with discretize=true: what is asked for, and the goal."""
+"""Speed relative to native OctoMap with discretize=true: target and goal."""
 FASTER_THAN_PYOCTOMAP = (10.0, 20.0)
 FASTER_THAN_SEMANTIC_TREE = (25.0, 50.0)
 SEMANTIC_TREE_IN_OCTOMAPS = {
@@ -86,7 +86,7 @@ def _peers(report: Report) -> tuple[NativeOctomap | None, PyOctomap | None]:
 
 
 def _add_workload(report: Report, title: str, scene: Scene, resolution: float) -> None:
-    """What the scene asks for; the camera's figures have bounds at 0.1 m, so that it is no toy."""
+    """Add the workload of the scene; the camera's figures at 0.1 m have lower bounds, so that it is realistic."""
     load = scenes.workload(scene, resolution)
     bounded = scene.name == "camera" and resolution == 0.1
     valid = 100 * load.valid_share
@@ -256,7 +256,7 @@ def _longest_chord(key: Int64Array, origin: Float32Array, ends: Float64Array, re
 
 
 def _chords(who: str, chords: Sequence[float]) -> str:
-    """How many cells, and how many of them a ray really passes through: by more than a micrometre."""
+    """Number of cells, and number of those that a ray passes by more than a micrometre."""
     crossed = [chord for chord in chords if chord > MICROMETRE]
     longest = f", by up to {1e3 * max(crossed):.2g} mm" if crossed else ""
     return f"{who}: {len(chords):,}, of them really crossed {len(crossed):,}{longest}"

@@ -79,7 +79,7 @@ def _compare(report: Report, title: str, scene: Scene, clouds: list[PointCloud],
 
 
 def _pyoctomap_bytes(pyoctomap: PyOctomap, clouds: list[PointCloud], resolution: float, max_range: float) -> int:
-    """What a ColorOcTree of pyoctomap with all clouds allocates, by the C library's own count."""
+    """Bytes that a ColorOcTree of pyoctomap with all clouds allocates, as counted by the C library."""
     before = _allocated_bytes()
     tree = pyoctomap.module.ColorOcTree(resolution)
     for cloud in clouds:

@@ -99,7 +99,7 @@ def _map_bytes(ticks: Iterable[TickMetrics]) -> tuple[float, float, float]:
 
 
 def _delta(report: Report, options: argparse.Namespace) -> None:
-    """What changed since the receiver's version, in steps of 0.05 log-odds."""
+    """Deltas since the receiver's version, in steps of 0.05 log-odds."""
     for rule in ("bayes", "gradient", "flood"):
         exact = clean_run(rule, PACKET_RESOLUTION, options.duration, "full", "float32")
         run = clean_run(rule, PACKET_RESOLUTION, options.duration, "delta", "int8")
@@ -185,7 +185,7 @@ def _lidar_map() -> tuple[str, SemanticOctree, Int64Array]:
 
 
 def _village_map(duration: float) -> tuple[str, SemanticOctree, Int64Array]:
-    """What six noisy robots agree on, and the bricks that one robot's last second changed."""
+    """Agreed map of six noisy robots, and the bricks that one robot's last second changed."""
     config = simulated_team(duration)
     assert config.classes is not None
     num_classes, resolution = config.classes.num_classes, 0.2

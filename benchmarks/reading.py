@@ -266,7 +266,7 @@ def bare_loop(
 
 
 class Decoders:
-    """What octoreplay makes of a message: depth, class ids, a pose."""
+    """Decode a message as octoreplay does: depth, class ids or a pose."""
 
     def __init__(self) -> None:
         self._labels = LabelLookup(CLASSES)

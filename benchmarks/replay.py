@@ -42,7 +42,7 @@ STAGES: tuple[tuple[str, type, tuple[str, ...]], ...] = (
     ("writing the result", Recorder, ("record", "finish")),
     ("writing the result", ResultWriter, ("complete",)),
 )
-"""What is timed: the methods of these classes that are there, on the thread that calls them."""
+"""Timed methods of each stage, on the thread that calls them; a missing method is skipped."""
 
 
 class Stopwatch:

@@ -1,4 +1,4 @@
-"""How all benchmarks measure and report: interleaved rounds, medians with their spread, targets, JSON."""
+"""Measurement and reports of all benchmarks: interleaved rounds, medians with their spread, targets, JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Whether the target is reached; empty without one."""
+        """Verdict on the target; empty without one."""
         if self.must is None:
             return ""
         if self.goal is not None and self._reaches(self.goal):
@@ -108,7 +108,7 @@ def arguments(description: str, *, rounds: int, add: Callable[[argparse.Argument
 
 
 def interleave(contenders: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
-    """What each contender returned in each round; a round runs all of them one after another."""
+    """Results of each contender in each round; a round runs all contenders one after another."""
     values: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, run in contenders.items():
@@ -122,7 +122,7 @@ def measured(what: str, values: Sequence[float], unit: str, **targets: Any) -> R
 
 
 def speedup(what: str, ours: Sequence[float], theirs: Sequence[float], **targets: Any) -> Row:
-    """How many times as long the peer takes, round by round."""
+    """Ratio of the peer's time to ours, round by round."""
     ratios = [b / a for a, b in zip(ours, theirs, strict=True)]
     return Row(
         what, statistics.median(ratios), "times as fast", min(ratios), max(ratios), more_is_better=True, **targets
@@ -144,7 +144,7 @@ def pinned() -> Iterator[None]:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
+    """Machine and package versions of the measurement."""
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():

@@ -60,7 +60,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """What a peer is given for a frame, in the world's frame.
+    """Input of a peer for one frame, in the world's frame.
 
     ``origin`` (3,) float32 of the sensor, ``points`` (P, 3) float32, ``class_ids`` (P,) uint8.
     """
@@ -72,7 +72,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Workload:
-    """How much one frame of a scene asks for at a resolution, as means over the frames."""
+    """Workload of one frame of a scene at a resolution, as means over the frames."""
 
     valid_share: float
     points: float
@@ -82,7 +82,7 @@ class Workload:
 
 
 def cache_folder() -> Path:
-    """Where generated inputs are kept between runs."""
+    """Folder of the generated inputs, which are kept for the next benchmark."""
     folder = Path(os.environ.get("OCTOREPLAY_BENCH_CACHE") or Path(tempfile.gettempdir()) / "octoreplay-benchmarks")
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -210,7 +210,7 @@ def point_cloud(frame: Frame) -> PointCloud:
 
 
 def workload(scene: Scene, resolution: float) -> Workload:
-    """What the scene's frames ask for. A ray step is one cell walked by the one ray of a distinct end cell."""
+    """Workload of the scene's frames. A ray step is one cell walked by the one ray of a distinct end cell."""
     caster = ScanCaster(scene.sensor(), MapConfig(resolution=resolution), NUM_CLASSES)
     rows = []
     for frame in scene.frames:

@@ -46,7 +46,7 @@ class Watched:
 
     @property
     def num_settling(self) -> int:
-        """How many ticks it settled for."""
+        """Number of settling ticks."""
         return len(self.ticks) - len(self.log_ticks)
 
     @property

@@ -57,7 +57,7 @@ CLASSES = ClassTable(
         for index, (raw, name) in enumerate(room.NAMES.items())
     )
 )
-"""What the labels mean in logs that do not say it."""
+"""Class table for logs without one."""
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ def _types_of(definition: bytes, name: str) -> Any:
 
 
 def _ros_codec(row: Row) -> tuple[Callable[..., Any], Callable[..., Any], str]:
-    """What reads and writes messages of a ROS type, and the type's long name."""
+    """Type store of a ROS type, and the type's long name."""
     name = normalise_type_name(row.schema_name)
     if row.encoding == "ros1":
         store = _types_of(row.schema, name)
@@ -136,7 +136,7 @@ def _parts(value: Any) -> Iterator[tuple[str | int, Any]]:
 
 
 def _places(value: Any, place: Place = ()) -> Iterator[Place]:
-    """Where the leaves of a message are; of long lists the first few."""
+    """Paths of the leaves of a message; of long lists only the first few."""
     for key, part in _parts(value):
         if isinstance(key, int) and key > 20:
             return
@@ -356,7 +356,7 @@ def write_hostile_log(name: str, folder: Path, rng: random.Random) -> tuple[Path
 
 
 class MapOutcome(NamedTuple):
-    """What came of a log: its frames, or why there is no map, and every sentence that a user would read."""
+    """Outcome of a log: its frames or the reason for no map, and every sentence that a user would read."""
 
     num_frames: int
     refusal: str | None
@@ -397,7 +397,7 @@ def _resolved(path: Path) -> RunConfig:
 
 
 def _num_frames(config: RunConfig, *, is_run: bool) -> int:
-    """How many frames went into the maps."""
+    """Number of frames in the maps."""
     assert config.classes is not None
     if is_run:
         summary = replay_team(config, None, num_threads=1)
@@ -411,7 +411,7 @@ def _num_frames(config: RunConfig, *, is_run: bool) -> int:
 
 
 def _check_sentence(text: str) -> None:
-    """What a user reads is one line of printable characters; only candidates follow on lines of their own."""
+    """Check that a message is one line of printable characters; only candidates follow on lines of their own."""
     lines = text.split("\n    ") if "put one of these lines" in text else [text]
     assert all(line.isprintable() for line in lines), text
     assert len(lines[0]) > 15, text

@@ -235,7 +235,7 @@ def damage_log(path: Path, rng: random.Random) -> str:
 
 
 class Outcome(NamedTuple):
-    """What reading a whole log came to: what it holds, and its damage or the refusal."""
+    """Outcome of reading a whole log: its content, and its damage or the refusal."""
 
     messages: list[tuple[str, int, bytes]]
     damage: str | None

@@ -95,7 +95,7 @@ def cells_of(octree):
 
 
 def class_rows(octree, indices):
-    """Which rows (n, C, 8) hold the values of every class in every octet of the bricks ``indices`` (n,) with blocks.
+    """Rows (n, C, 8) that hold the values of every class in every octet of the bricks ``indices`` (n,) with blocks.
 
     -1 where the octet has no known cell.
     """

@@ -1,4 +1,4 @@
-"""Where recordings made by others are: beside the project, never in it; tests skip where they are absent."""
+"""Paths of recordings made by others, which lie beside the project; tests skip where they are absent."""
 
 from pathlib import Path
 

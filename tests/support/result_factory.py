@@ -68,7 +68,7 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
 
 
 def summary(metrics: Sequence[TickMetrics]) -> RunSummary:
-    """What a run over some ticks came to."""
+    """Summary of a run over some ticks."""
     links = LinkTotals()
     for tick in metrics:
         links.add(tick.links)

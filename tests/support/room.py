@@ -23,7 +23,7 @@ BOX_LABELS = np.array([CRATE, SHELF, CRATE, SHELF])
 
 
 def cast(origin: npt.NDArray[np.float64], directions: npt.NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:
-    """How often a ray's direction goes into the way to what it meets, (...) float64, and its raw label (...) uint8.
+    """Distance along each ray in units of its direction, (...) float64, and raw label of the hit surface, (...) uint8.
 
     ``origin`` (3,) lies in the room, outside the boxes; ``directions`` are (..., 3).
     """

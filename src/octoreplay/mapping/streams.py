@@ -56,7 +56,7 @@ class BrickMasks(NamedTuple):
 
     @property
     def is_leaf(self) -> BoolArray:
-        """Whether each entry (n,) is one leaf, of one brick or more."""
+        """True for each entry (n,) that is one leaf, of one brick or more."""
         is_leaf: BoolArray = (self.known == storage.ALL_CELLS) & (self.starts == 1)
         return is_leaf
 

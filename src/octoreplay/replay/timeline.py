@@ -50,7 +50,7 @@ class Timeline:
         return min((frame.stamp_ns for frame in self._next if frame is not None), default=None)
 
     def active(self, leave_ns: int | None) -> list[bool]:
-        """Whether each robot takes part (N,): from its first frame on.
+        """True for each robot (N,) that takes part, from its first frame on.
 
         With ``leave_ns`` robots whose last frame is before that stamp have left.
         """

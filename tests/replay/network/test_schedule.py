@@ -178,7 +178,7 @@ def _entries(draw):
 
 
 def _subjects(entry):
-    """What an entry speaks of, once for each time that it does."""
+    """Robots and links of an entry, repeated as often as the entry names them."""
     found = [*entry.robots_off, *entry.robots_silent]
     found += [frozenset(pair) for pair in (*entry.links_down, *entry.links_up)]
     for pair in itertools.combinations(NAMES, 2):
