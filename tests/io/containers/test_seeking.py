@@ -136,7 +136,7 @@ LOGS: dict[str, Callable[[Path], Path]] = {
     "db3 cut": lambda folder: cut(write_db3(folder / "bag", 40), 0.6),
     "db3 damaged page": lambda folder: overwrite(write_db3(folder / "bag", 10), 0.5, 4096),
     "split folder": lambda folder: write_split(folder / "part"),
-    } | {f"fixture {p.name}": lambda _, p=p: p for p in sorted(FIXTURES.iterdir())}
+} | {f"fixture {p.name}": lambda _, p=p: p for p in sorted(FIXTURES.iterdir())}
 
 
 @cache
