@@ -27,8 +27,8 @@ _FLATNESS = 0.25
 # Squared Mahalanobis distance at which Geman and McClure's weight is 1/4.
 _ROBUST_SCALE = 4.0
 _NUM_ITERATIONS = 12
-_CORRESPONDENCES_PER_SAMPLE = 20.0
-"""Number of neighbouring correspondences that carry the information of one independent measurement."""
+# Number of neighbouring correspondences that carry the information of one independent measurement.
+_CORRESPONDENCES_PER_SAMPLE = 50.0
 
 
 @dataclass(frozen=True, eq=False)

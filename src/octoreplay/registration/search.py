@@ -1,119 +1,188 @@
-"""Search for planar poses."""
+"""Search for the pose between two maps whose vertical axes agree: columns, correlation over all yaws, hill climbing."""
+
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import fft
 
-E = 0.2
+from octoreplay.records import Float64Array, Int64Array
+from octoreplay.registration.own_map import Columns, OwnMap
 
-def weights(a, b):
-    """(K,K) table over codes 0..K-1 (0 unknown -> 0)."""
-    K = 1 + 2 * a.num_classes
-    na = np.bincount(a.columns.ravel(), minlength=K)[1:].astype(float)
-    nb = np.bincount(b.columns.ravel(), minlength=K)[1:].astype(float)
-    P = (na / na.sum() + nb / nb.sum()) / 2
-    return P
+# Share of columns whose code differs although the pose is right.
+_ERROR_SHARE = 0.2
+_MIN_FREQUENCY = 1e-4
+_NUM_YAWS = 72
+_PEAKS_PER_YAW = 3
+_NUM_CLIMBED = 16
+_NUM_KEPT = 8
+# Edge of a cell of the correlation [columns].
+_COARSE = 2
+# Steps of the hill climbing: yaw [degree], shift [column].
+_STEPS = ((5.0, 2.0), (2.5, 1.0), (1.0, 0.5))
+_MAX_CLIMB = 8
+# Two poses are one where they are closer than this: yaw [degree], shift [column].
+_SAME_YAW, _SAME_SHIFT = 8.0, 4.0
 
-def table(P):
-    K = P.size + 1
-    W = np.full((K, K), np.log(E), np.float32)
-    W[0, :] = 0; W[:, 0] = 0
-    with np.errstate(divide="ignore"):
-        d = np.log((1 - E) / np.maximum(P, 1e-4) + E)
-    W[np.arange(1, K), np.arange(1, K)] = d
-    return W
 
-def column_points(m):
-    """centres (n,2) [m] and codes."""
-    ij = np.argwhere(m.columns > 0)
-    pts = (ij + m.column_low + 0.5) * 2 * m.resolution
-    return pts, m.columns[ij[:, 0], ij[:, 1]].astype(np.int64)
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Pose found by the search: ``T_first_second`` (4, 4), a rotation about the vertical axis, and its score."""
 
-class Coarse:
-    """coarse layers of a map for FFT: factor 2 columns -> nearest scatter counts."""
+    T_first_second: Float64Array
+    score: float
 
-def correlate(a, b, W, num_yaws=72, peaks=3, keep=40):
-    G = 4 * a.resolution
-    pa, ca = column_points(a)
-    pb, cb = column_points(b)
-    K = W.shape[0]
-    used = np.intersect1d(np.unique(ca), np.unique(cb))
-    ia = np.floor(pa / G).astype(int); oa = ia.min(0); ia -= oa
-    rb = np.abs(pb - pb.mean(0)).max() * 1.5
-    mb = pb.mean(0)
-    r = np.sqrt(((pb - mb) ** 2).sum(1)).max()
-    nb = int(np.ceil(2 * r / G)) + 2
-    shape = [fft.next_fast_len(int(ia[:, k].max()) + 1 + nb, real=True) for k in (0, 1)]
-    def layers(ij, codes):
-        n = shape[0] * shape[1]
-        flat = ij[:, 0] * shape[1] + ij[:, 1]
-        count = np.bincount(flat, minlength=n).astype(np.float32)
-        out = np.empty((len(used) + 1, n), np.float32)
-        inv = 1 / np.maximum(count, 1)
-        for k, u in enumerate(used):
-            out[k] = np.bincount(flat[codes == u], minlength=n) * inv
-        out[-1] = count > 0
-        return out.reshape(-1, *shape)
-    FA = fft.rfft2(layers(ia, ca))
-    lw = np.log(E)
-    w = np.append(W[used, used] - lw, lw).astype(np.float32)
-    FA = np.conj(FA) * w[:, None, None]
+
+def planar_candidates(first: OwnMap, second: OwnMap) -> list[Candidate]:
+    """Return the most likely poses of the second map in the first one's frame, best first.
+
+    The score is the log-likelihood ratio of the columns' codes: ln((1 - e) / P_c + e) where two known columns have the
+    same code c, ln e where they differ. P_c is the mean frequency of the code in both maps, e = 0.2.
+    """
+    a, b = first.columns, second.columns
+    if a.known[1].size == 0 or b.known[1].size == 0:
+        return []
+    table = _score_table(a, b, 2 * first.num_classes)
+    found = _correlation_peaks(a, b, table)[:_NUM_CLIMBED]
+    climbed = sorted((_climbed(a, b, table, planar) for planar in found), key=lambda p: -p.score)
+    kept: list[_Planar] = []
+    for planar in climbed:
+        if len(kept) < _NUM_KEPT and not any(planar.is_close_to(other, a.edge) for other in kept):
+            kept.append(planar)
+    return [Candidate(planar.pose(_height_difference(a, b, planar)), planar.score) for planar in kept]
+
+
+@dataclass(frozen=True, eq=False)
+class _Planar:
+    """Pose in the plane: a point c of the second frame goes to R(yaw) (c - centre) + target."""
+
+    yaw: float
+    centre: Float64Array
+    target: Float64Array
+    score: float = -math.inf
+
+    def apply(self, points: Float64Array) -> Float64Array:
+        """Points (n, 2) in the first frame."""
+        return (points - self.centre) @ _rotation(self.yaw).T + self.target
+
+    def is_close_to(self, other: _Planar, edge: float) -> bool:
+        """True where both poses are one."""
+        turn = (self.yaw - other.yaw + math.pi) % (2 * math.pi) - math.pi
+        shift = float(np.hypot(*(self.target - other.target)))
+        return abs(turn) < math.radians(_SAME_YAW) and shift < _SAME_SHIFT * edge
+
+    def pose(self, height: float) -> Float64Array:
+        """The pose (4, 4) at a height [m]."""
+        result = np.eye(4)
+        result[:2, :2] = _rotation(self.yaw)
+        result[:2, 3] = self.target - _rotation(self.yaw) @ self.centre
+        result[2, 3] = height
+        return result
+
+
+def _rotation(yaw: float) -> Float64Array:
+    """Rotation matrix (2, 2)."""
+    return np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+
+
+def _score_table(a: Columns, b: Columns, num_codes: int) -> Float64Array:
+    """Score of each pair of codes (num_codes + 1, num_codes + 1); 0 where one is unknown."""
+    counts = [np.bincount(columns.known[1], minlength=num_codes + 1)[1:] for columns in (a, b)]
+    frequency = sum(count / count.sum() for count in counts) / 2
+    table = np.full((num_codes + 1, num_codes + 1), math.log(_ERROR_SHARE))
+    table[0], table[:, 0] = 0.0, 0.0
+    codes = np.arange(1, num_codes + 1)
+    table[codes, codes] = np.log((1 - _ERROR_SHARE) / np.maximum(frequency, _MIN_FREQUENCY) + _ERROR_SHARE)
+    return table
+
+
+def _correlation_peaks(a: Columns, b: Columns, table: Float64Array) -> list[_Planar]:
+    """Peaks of the score over all yaws and shifts, best first, by FFT over the codes that both maps hold."""
+    edge = _COARSE * a.edge
+    points_a, codes_a, _ = a.known
+    points_b, codes_b, _ = b.known
+    shared = np.intersect1d(codes_a, codes_b)
+    cells_a = np.floor(points_a / edge).astype(np.int64)
+    low_a = cells_a.min(axis=0)
+    cells_a -= low_a
+    centre = points_b.mean(axis=0)
+    reach = float(np.hypot(*(points_b - centre).T).max())
+    num_b = math.ceil(2 * reach / edge) + 2
+    shape = tuple(int(fft.next_fast_len(int(n) + 1 + num_b, real=True)) for n in cells_a.max(axis=0))
+    miss = math.log(_ERROR_SHARE)
+    weights = np.append(table[shared, shared] - miss, miss)
+    spectrum_a = np.conj(fft.rfft2(_layers(cells_a, codes_a, shared, shape))) * weights[:, None, None]
+    spectrum_a = spectrum_a.astype(np.complex64)
     found = []
-    for y in range(num_yaws):
-        th = 2 * np.pi * y / num_yaws
-        c, s = np.cos(th), np.sin(th)
-        R = np.array([[c, -s], [s, c]])
-        q = (pb - mb) @ R.T
-        ib = np.floor((q + r) / G).astype(int)
-        FB = fft.rfft2(layers(ib, cb))
-        # corr[d] = sum_x A[x] B[x + d]
-        S = fft.irfft2((FA * FB).sum(0), s=shape)
-        S = S.copy()
-        for _ in range(peaks):
-            k = int(S.argmax()); d = np.array(divmod(k, shape[1]))
-            val = S[d[0], d[1]]
-            dd = (d + nb) % np.array(shape) - nb  # d in [-nax, nb)
-            dd = np.where(d < nb, d, d - np.array(shape))
-            # x_b = x_a + d: a coord = (ia+oa)*G ; b rotated coord = ib*G - r ; t = a - R(b - mb)
-            t = (-dd + oa) * G + r
-            t = t - R @ mb
-            found.append((val, th, *t))
-            S[np.ix_((d[0] + np.arange(-2, 3)) % shape[0], (d[1] + np.arange(-2, 3)) % shape[1])] = -np.inf
-    found.sort(key=lambda f: -f[0])
-    return found[:keep]
+    for yaw in np.arange(_NUM_YAWS) * (2 * math.pi / _NUM_YAWS):
+        turned = (points_b - centre) @ _rotation(yaw).T + reach
+        layers = _layers(np.floor(turned / edge).astype(np.int64), codes_b, shared, shape)
+        scores = fft.irfft2((spectrum_a * fft.rfft2(layers)).sum(axis=0), s=shape)
+        for _ in range(_PEAKS_PER_YAW):
+            peak = np.array(np.unravel_index(int(scores.argmax()), shape))
+            shift = np.where(peak < num_b, peak, peak - shape)
+            score = float(scores[tuple(peak)])
+            found.append(_Planar(float(yaw), centre, (low_a - shift) * edge + reach, score))
+            rows, columns = ((peak[k] + np.arange(-2, 3)) % shape[k] for k in (0, 1))
+            scores[np.ix_(rows, columns)] = -np.inf
+    return sorted(found, key=lambda planar: -planar.score)
 
-def score(a, pb, cb, W, th, t):
-    """th (h,), t (h,2) -> (h,)"""
-    c, s = np.cos(th)[:, None], np.sin(th)[:, None]
-    x = c * pb[:, 0] - s * pb[:, 1] + t[:, 0, None]
-    y = s * pb[:, 0] + c * pb[:, 1] + t[:, 1, None]
-    G = 2 * a.resolution
-    i = np.floor(x / G).astype(np.int32) - a.column_low[0]
-    j = np.floor(y / G).astype(np.int32) - a.column_low[1]
-    cols = a.columns
-    ok = (i >= 0) & (i < cols.shape[0]) & (j >= 0) & (j < cols.shape[1])
-    code = np.where(ok, cols.ravel()[np.where(ok, i * cols.shape[1] + j, 0)], 0)
-    return W[code, cb].sum(1)
 
-def climb(a, b, W, found, steps=((5, 1.2), (2.5, 0.6), (1, 0.3))):
-    pb, cb = column_points(b)
-    cen = pb.mean(0)
-    out = []
-    for f in found:
-        th, t = f[1], np.array(f[2:4])
-        best = score(a, pb, cb, W, np.array([th]), t[None])[0]
-        for dth, dt in steps:
-            dth = np.deg2rad(dth); dt = dt / 0.3 * a.resolution
-            for _ in range(8):
-                g = np.array([(u, v, w) for u in (-1, 0, 1) for v in (-1, 0, 1) for w in (-1, 0, 1) if (u, v, w) != (0, 0, 0)], float)
-                ths = th + g[:, 0] * dth
-                # rotate about b's centre
-                c0 = np.array([[np.cos(th), -np.sin(th)], [np.sin(th), np.cos(th)]]) @ cen + t
-                ts = c0 - np.stack([np.cos(ths) * cen[0] - np.sin(ths) * cen[1], np.sin(ths) * cen[0] + np.cos(ths) * cen[1]], 1) + g[:, 1:] * dt
-                s = score(a, pb, cb, W, ths, ts)
-                k = int(s.argmax())
-                if s[k] <= best:
-                    break
-                best, th, t = s[k], ths[k], ts[k]
-        out.append((best, th, *t))
-    out.sort(key=lambda f: -f[0])
-    return out
+def _layers(cells: Int64Array, codes: Int64Array, shared: Int64Array, shape: tuple[int, ...]) -> np.typing.NDArray[np.float32]:
+    """Share of the known columns of each cell that have each shared code, and where any is known: (k + 1, nx, ny)."""
+    size = math.prod(shape)
+    flat = cells[:, 0] * shape[1] + cells[:, 1]
+    count = np.bincount(flat, minlength=size)
+    layers = np.empty((shared.size + 1, size), np.float32)
+    for layer, code in zip(layers, shared, strict=False):
+        layer[:] = np.bincount(flat[codes == code], minlength=size)
+    layers[:-1] /= np.maximum(count, 1)
+    layers[-1] = count > 0
+    return layers.reshape(-1, *shape)
+
+
+def _climbed(a: Columns, b: Columns, table: Float64Array, planar: _Planar) -> _Planar:
+    """The pose after hill climbing on the columns."""
+    points, codes = b.known[0], b.known[1].astype(np.int32)
+    moves = np.array([(u, v, w) for u in (-1, 0, 1) for v in (-1, 0, 1) for w in (-1, 0, 1) if (u, v, w) != (0, 0, 0)])
+    # Every position outside of the map is clipped to an unknown border.
+    padded = np.pad(a.codes, 1).astype(np.int32)
+    flat_table, num_codes = table.astype(np.float32).ravel(), len(table)
+    x, y = ((points - planar.centre) / a.edge).T.astype(np.float32)
+    offset = 1.0 - a.low
+
+    def score(yaws: Float64Array, targets: Float64Array) -> Float64Array:
+        """Scores (h,) of yaws (h,) and targets (h, 2)."""
+        cosine, sine = np.cos(yaws)[:, None].astype(np.float32), np.sin(yaws)[:, None].astype(np.float32)
+        shift = (targets / a.edge + offset).astype(np.float32)
+        i = np.clip(cosine * x - sine * y + shift[:, :1], 0, padded.shape[0] - 1).astype(np.int32)
+        j = np.clip(sine * x + cosine * y + shift[:, 1:], 0, padded.shape[1] - 1).astype(np.int32)
+        found = padded.ravel()[i * padded.shape[1] + j]
+        return flat_table[found * num_codes + codes].sum(axis=1)
+
+    yaw, target = planar.yaw, planar.target
+    best = float(score(np.array([yaw]), target[None])[0])
+    for turn, shift in _STEPS:
+        for _ in range(_MAX_CLIMB):
+            yaws = yaw + moves[:, 0] * math.radians(turn)
+            targets = target + moves[:, 1:] * (shift * a.edge)
+            scores = score(yaws, targets)
+            top = int(scores.argmax())
+            if scores[top] <= best:
+                break
+            best, yaw, target = float(scores[top]), float(yaws[top]), targets[top]
+    return _Planar(yaw, planar.centre, target, best)
+
+
+def _height_difference(a: Columns, b: Columns, planar: _Planar) -> float:
+    """Median difference of the ground's height where both maps know it [m]; 0 where they share no ground."""
+    points, _, ground = b.known
+    cells = np.floor(planar.apply(points) / a.edge).astype(np.int64) - a.low
+    inside = ((cells >= 0) & (cells < a.codes.shape)).all(axis=1)
+    cells = cells[inside]
+    heights = np.where(a.codes[tuple(cells.T)] > 0, a.ground[tuple(cells.T)], np.nan)
+    differences = heights - ground[inside]
+    differences = differences[np.isfinite(differences)]
+    return float(np.median(differences)) if differences.size else 0.0

@@ -1,47 +1,102 @@
+"""Verification of a pose between two maps: cells of one map that the other one confirms or contradicts."""
+
 from __future__ import annotations
+
+import math
 from dataclasses import dataclass
+
 import numpy as np
-from octoreplay.registration.own_map import FREE, MAX_BITS
+
+from octoreplay.records import Float64Array
+from octoreplay.registration.own_map import FREE, OccupiedCells, OwnMap, class_bits
+from octoreplay.transforms import inverse
+
+# Shares of cells (same, other, contra) under right poses, and under the wrong poses that fit best.
+_RIGHT_OBSTACLES, _WRONG_OBSTACLES = (0.965, 0.027, 0.008), (0.80, 0.10, 0.10)
+_RIGHT_GROUND, _WRONG_GROUND = (0.985, 0.012, 0.003), (0.85, 0.10, 0.05)
+
 
 @dataclass(frozen=True)
-class Verification:
-    num: int
+class CellCounts:
+    """Occupied cells of both maps by what the other map holds there.
+
+    - ``same``: an occupied cell of the same class within one cell.
+    - ``other``: occupied cells of other classes only within one cell.
+    - ``contra``: known free, and no occupied cell within one cell.
+
+    Cells in unknown space of the other map do not count.
+    """
+
     same: int
     other: int
     contra: int
-    ground_num: int
-    g_same: int
-    g_other: int
-    g_contra: int
-    per_class: tuple = ()
-    @property
-    def q(self): return self.same / max(self.num, 1)
-    @property
-    def q_c(self): return self.contra / max(self.num, 1)
-    @property
-    def q_g(self): return self.g_same / max(self.ground_num, 1)
-    @property
-    def L(self):
-        l = np.log
-        return (self.same * l(.8/.3) + self.other * l(.08/.2) + self.contra * l(.12/.5)
-                + .25 * (self.g_same * l(.9/.6) + self.g_other * l(.08/.3) + self.g_contra * l(.02/.1)))
 
-def _count(cells, T, m):
-    p = cells.points @ T[:3, :3].T + T[:3, 3]
-    lab, near = m.lookup(p)
-    bit = np.uint64(1) << (cells.class_ids.astype(np.uint64) - np.uint64(1)) % np.uint64(MAX_BITS)
-    same = (near & bit) != 0
-    other = (near != 0) & ~same
-    contra = (near == 0) & (lab == FREE)
-    return same, other, contra
+    @property
+    def total(self) -> int:
+        """Number of cells that count."""
+        return self.same + self.other + self.contra
 
-def verify(a, b, T):
-    """T maps b to a."""
-    Ti = np.linalg.inv(T)
-    tot = np.zeros(6, int)
-    for cells, X, m in ((b, T, a), (a, Ti, b)):
-        for k, part in enumerate((cells.obstacles, cells.ground)):
-            s, o, c = _count(part, X, m)
-            tot[3*k:3*k+3] += (int(s.sum()), int(o.sum()), int(c.sum()))
-    s, o, c, gs, go, gc = map(int, tot)
-    return Verification(s + o + c, s, o, c, gs + go + gc, gs, go, gc)
+    @property
+    def share_same(self) -> float:
+        """Share of the cells that are the same; 0 without cells."""
+        return self.same / max(self.total, 1)
+
+    @property
+    def share_contra(self) -> float:
+        """Share of the cells that contradict; 0 without cells."""
+        return self.contra / max(self.total, 1)
+
+    def log_likelihood_ratio(self, right: tuple[float, ...], wrong: tuple[float, ...]) -> float:
+        """Return ln P(counts | right) / P(counts | wrong) for the shares (same, other, contra) of both."""
+        counts = (self.same, self.other, self.contra)
+        return sum(n * math.log(a / b) for n, a, b in zip(counts, right, wrong, strict=True))
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Agreement of two maps under a pose.
+
+    Attributes
+    ----------
+    obstacles, ground : CellCounts
+        Counts of the obstacles' and of the ground's cells, both maps together.
+    overlap : float
+        Obstacle cells that count, as a share of the map where it is less.
+    """
+
+    obstacles: CellCounts
+    ground: CellCounts
+    overlap: float
+
+    @property
+    def score(self) -> float:
+        """L: log-likelihood ratio of a right pose against the best wrong one.
+
+        The shares of the cells were measured on simulated villages. Ground counts a quarter, because neighbouring
+        ground cells tell the same.
+        """
+        obstacles = self.obstacles.log_likelihood_ratio(_RIGHT_OBSTACLES, _WRONG_OBSTACLES)
+        return obstacles + self.ground.log_likelihood_ratio(_RIGHT_GROUND, _WRONG_GROUND) / 4
+
+
+def verify(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> Verification:
+    """Return the agreement of two maps, where ``T_first_second`` (4, 4) maps the second frame to the first."""
+    back = inverse(T_first_second)
+    obstacles = np.zeros(3, np.int64)
+    ground = np.zeros(3, np.int64)
+    shares = []
+    for cells, T, other in ((second, T_first_second, first), (first, back, second)):
+        counts = _counts(cells.obstacles, T, other)
+        obstacles += counts
+        ground += _counts(cells.ground, T, other)
+        shares.append((int(counts.sum()), len(cells.obstacles)))
+    obstacle_counts, ground_counts = CellCounts(*obstacles.tolist()), CellCounts(*ground.tolist())
+    return Verification(obstacle_counts, ground_counts, min(n / max(size, 1) for n, size in shares))
+
+
+def _counts(cells: OccupiedCells, T: Float64Array, other: OwnMap) -> np.typing.NDArray[np.int64]:
+    """Numbers (same, other, contra) of cells against another map, where T maps to the other map's frame."""
+    states, nearby = other.at(cells.points @ T[:3, :3].T + T[:3, 3])
+    is_same = (nearby & class_bits(cells.class_ids)) != 0
+    is_near = nearby != 0
+    return np.array([is_same.sum(), (is_near & ~is_same).sum(), (~is_near & (states == FREE)).sum()])
