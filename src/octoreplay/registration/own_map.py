@@ -153,9 +153,7 @@ class OwnMap:
         weights = np.array([1.0, _GROUND_WEIGHT, _EDGE_WEIGHT]) * max(num[0], 1) / np.maximum(num, 1)
         return Surface.of_points(
             np.concatenate([obstacles.points, ground.points, ground.points[is_edge]]),
-            np.concatenate(
-                [obstacles.class_ids.astype(np.int64), ground.class_ids + np.int64(UNDECIDED), edge_codes]
-            ),
+            np.concatenate([obstacles.class_ids.astype(np.int64), ground.class_ids + np.int64(UNDECIDED), edge_codes]),
             np.repeat(weights, num),
             spacing=self.resolution,
             radius=_SURFACE_RADIUS * self.resolution,

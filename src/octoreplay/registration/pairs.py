@@ -189,9 +189,7 @@ def _pair(
 
 def _refused(pair: PairAlignment, reason: str) -> PairAlignment:
     """The pair, refused for a reason."""
-    return PairAlignment(
-        pair.first, pair.second, pair.T_first_second, pair.information, pair.verification, reason
-    )
+    return PairAlignment(pair.first, pair.second, pair.T_first_second, pair.information, pair.verification, reason)
 
 
 def _is_distinct(one: PairAlignment, other: PairAlignment, edge: float) -> bool:

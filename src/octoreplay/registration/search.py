@@ -130,7 +130,9 @@ def _correlation_peaks(a: Columns, b: Columns, table: Float64Array) -> list[_Pla
     return sorted(found, key=lambda planar: -planar.score)
 
 
-def _layers(cells: Int64Array, codes: Int64Array, shared: Int64Array, shape: tuple[int, ...]) -> np.typing.NDArray[np.float32]:
+def _layers(
+    cells: Int64Array, codes: Int64Array, shared: Int64Array, shape: tuple[int, ...]
+) -> np.typing.NDArray[np.float32]:
     """Share of the known columns of each cell that have each shared code, and where any is known: (k + 1, nx, ny)."""
     size = math.prod(shape)
     flat = cells[:, 0] * shape[1] + cells[:, 1]
