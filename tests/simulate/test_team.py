@@ -23,12 +23,13 @@ from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_er
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
 from octoreplay.transforms import transform_of
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
 FILES = ("frames.yaml", "husky_1.mcap", "husky_2.mcap", "team.yaml", "truth", "world.npz", "world.ply")
 SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)
+CLEAN = dataclasses.replace(SMALL, label_noise=0.0)
 EXACT = SimulationConfig(
     num_robots=2, duration=6.0, rate=2.0, image=(80, 60), seed=6, world_size=24.0, label_noise=0.0, depth_noise=0.0
 )
@@ -38,6 +39,13 @@ EXACT = SimulationConfig(
 def small(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("small") / "team"
     simulate_team(folder, SMALL)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("clean") / "team"
+    simulate_team(folder, CLEAN)
     return folder
 
 
@@ -221,7 +229,7 @@ def test_own_frames_start_at_the_robots_first_poses_and_differ_in_yaw(own):
     assert all(robot.T_team_map == RobotConfig("a", (Path("a"),)).T_team_map for robot in config.robots)
 
 
-@pytest.mark.parametrize("own_frames", [False, True])
+@pytest.mark.parametrize("own_frames", [False, pytest.param(True, marks=long)])
 def test_removing_frame_and_drift_gives_the_true_poses(small, tmp_path, own_frames):
     config = dataclasses.replace(SMALL, odometry_drift=(3.0, 4.0), own_frames=own_frames)
     folder = tmp_path / "team"
@@ -246,13 +254,11 @@ def test_removing_frame_and_drift_gives_the_true_poses(small, tmp_path, own_fram
         assert all(np.array_equal(one.data, other.data) for (_, one), (_, other) in pairs)
 
 
-def test_patchy_noise_has_the_given_share_and_is_the_same_in_every_image(small, tmp_path):
-    quiet = dataclasses.replace(SMALL, label_noise=0.0)
-    simulate_team(tmp_path / "clean", quiet)
-    simulate_team(tmp_path / "patchy", dataclasses.replace(quiet, patchy_noise=0.3))
+def test_patchy_noise_has_the_given_share_and_is_the_same_in_every_image(clean, tmp_path):
+    simulate_team(tmp_path / "patchy", dataclasses.replace(CLEAN, patchy_noise=0.3))
     wrong: dict[tuple[int, ...], list[bool]] = defaultdict(list)
-    clean, patchy = (read_messages(tmp_path / name / "husky_1.mcap") for name in ("clean", "patchy"))
-    pairs = zip(measured_points(clean, "husky_1"), measured_points(patchy, "husky_1"), strict=True)
+    images, patchy = (read_messages(folder / "husky_1.mcap") for folder in (clean, tmp_path / "patchy"))
+    pairs = zip(measured_points(images, "husky_1"), measured_points(patchy, "husky_1"), strict=True)
     for (points, labels), (same_points, noisy) in pairs:
         np.testing.assert_array_equal(points, same_points)
         for cube, is_wrong in zip(np.floor(points / 2.0).astype(int).tolist(), labels != noisy, strict=True):
@@ -291,17 +297,14 @@ def test_points_of_exact_images_in_the_frames_of_frames_yaml_are_in_the_ground_t
     assert agreed / known > 0.95
 
 
-def test_label_noise_has_the_given_share(small, tmp_path):
-    clean_folder = tmp_path / "clean"
-    simulate_team(clean_folder, SimulationConfig(**{**vars(SMALL), "label_noise": 0.0}))
+def test_label_noise_has_the_given_share(small, clean):
     topic = "/husky_1/camera/labels/image_raw"
-    noisy, clean = (
-        np.stack([pixels(m) for _, m in read_messages(folder / "husky_1.mcap")[topic]])
-        for folder in (small, clean_folder)
+    noisy, true = (
+        np.stack([pixels(m) for _, m in read_messages(folder / "husky_1.mcap")[topic]]) for folder in (small, clean)
     )
-    np.testing.assert_array_equal(noisy == 255, clean == 255)
-    measured = clean != 255
-    assert (noisy != clean)[measured].mean() == pytest.approx(0.1, abs=0.015)
+    np.testing.assert_array_equal(noisy == 255, true == 255)
+    measured = true != 255
+    assert (noisy != true)[measured].mean() == pytest.approx(0.1, abs=0.015)
     depth = np.stack([pixels(m) for _, m in read_messages(small / "husky_1.mcap")["/husky_1/camera/depth/image_raw"]])
     np.testing.assert_array_equal(depth == 0, noisy == 255)
 
