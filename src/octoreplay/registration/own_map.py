@@ -98,7 +98,7 @@ class OwnMap:
     @cached_property
     def is_occupied(self) -> BoolArray:
         """True for each occupied cell (nx, ny, nz)."""
-        return (self.states != UNKNOWN) & (self.states < UNDECIDED)
+        return _is_occupied(self.states)
 
     @cached_property
     def _occupied_by_height(self) -> tuple[OccupiedCells, OccupiedCells]:
@@ -107,7 +107,7 @@ class OwnMap:
         lowest = _lowest(self.is_occupied)
         ground = ndimage.minimum_filter(lowest, size=_GROUND_WINDOW * COLUMN_CELLS, mode="nearest")
         is_obstacle = indices[:, 2] - ground[indices[:, 0], indices[:, 1]] >= COLUMN_CELLS
-        points = (indices + self.low + 0.5) * self.resolution
+        points: Float64Array = (indices + self.low + 0.5) * self.resolution
         class_ids = self.states[tuple(indices.T)]
         return (
             OccupiedCells(points[is_obstacle], class_ids[is_obstacle]),
@@ -196,7 +196,7 @@ class Columns:
         before = own.low[:2] % COLUMN_CELLS
         after = -(before + own.states.shape[:2]) % COLUMN_CELLS
         states = np.pad(own.states, ((before[0], after[0]), (before[1], after[1]), (0, 0)))
-        is_occupied = (states != UNKNOWN) & (states < UNDECIDED)
+        is_occupied = _is_occupied(states)
         num_x, num_y, num_z = states.shape
         shape = num_x // COLUMN_CELLS, num_y // COLUMN_CELLS
         lowest = _lowest(is_occupied).reshape(shape[0], COLUMN_CELLS, shape[1], COLUMN_CELLS).min(axis=(1, 3))
@@ -232,7 +232,8 @@ class Columns:
         """Centres (n, 2) [m], codes (n,) and ground heights (n,) [m] of the known columns."""
         indices = np.argwhere(self.codes > 0)
         cells = tuple(indices.T)
-        return (indices + self.low + 0.5) * self.edge, self.codes[cells], self.ground[cells]
+        centres: Float64Array = (indices + self.low + 0.5) * self.edge
+        return centres, self.codes[cells], self.ground[cells]
 
 
 def class_bits(class_ids: UInt8Array) -> UInt64Array:
@@ -248,9 +249,16 @@ def _two_bits(sets: UInt64Array) -> tuple[Int64Array, Int64Array]:
     )
 
 
+def _is_occupied(states: UInt8Array) -> BoolArray:
+    """True for each occupied cell."""
+    is_occupied: BoolArray = (states != UNKNOWN) & (states < UNDECIDED)
+    return is_occupied
+
+
 def _lowest(is_occupied: BoolArray) -> Int64Array:
     """Index (nx, ny) of the lowest occupied cell of each vertical line of cells; nz where there is none."""
-    return np.where(is_occupied.any(axis=2), is_occupied.argmax(axis=2), is_occupied.shape[2])
+    lowest: Int64Array = np.where(is_occupied.any(axis=2), is_occupied.argmax(axis=2), is_occupied.shape[2])
+    return lowest
 
 
 def _dilated(bits: UInt64Array) -> UInt64Array:
@@ -270,7 +278,8 @@ def _winner(
     """The most frequent class index of each column (num_columns,), ties to the lower one, and where there is one."""
     votes = np.bincount(columns * num_classes + class_indices, minlength=num_columns * num_classes)
     votes = votes.reshape(num_columns, num_classes)
-    return votes.argmax(axis=1), votes.any(axis=1)
+    has_winner: BoolArray = votes.any(axis=1)
+    return votes.argmax(axis=1), has_winner
 
 
 def _halved(keys: Int64Array, states: UInt8Array) -> tuple[Int64Array, UInt8Array]:

@@ -162,7 +162,8 @@ def _climbed(a: Columns, b: Columns, table: Float64Array, planar: _Planar) -> _P
         i = np.clip(cosine * x - sine * y + shift[:, :1], 0, padded.shape[0] - 1).astype(np.int32)
         j = np.clip(sine * x + cosine * y + shift[:, 1:], 0, padded.shape[1] - 1).astype(np.int32)
         found = padded.ravel()[i * padded.shape[1] + j]
-        return flat_table[found * num_codes + codes].sum(axis=1)
+        scores: Float64Array = flat_table[found * num_codes + codes].sum(axis=1, dtype=np.float64)
+        return scores
 
     yaw, target = planar.yaw, planar.target
     best = float(score(np.array([yaw]), target[None])[0])

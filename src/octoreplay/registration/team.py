@@ -121,14 +121,15 @@ def _contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
 ) -> str:  # fmt: skip
-    """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty where no maps contradict."""
+    """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty without contradiction."""
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
             obstacles = verify(maps[i], maps[j], pose).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
                 first, second = sorted((i, j))
-                return f"robots {first + 1} and {second + 1} would contradict each other (q_c {obstacles.share_contra:.3f})"
+                share = obstacles.share_contra
+                return f"robots {first + 1} and {second + 1} would contradict each other (q_c {share:.3f})"
     return ""
 
 
