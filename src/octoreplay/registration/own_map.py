@@ -107,7 +107,7 @@ class OwnMap:
         lowest = _lowest(self.is_occupied)
         ground = ndimage.minimum_filter(lowest, size=_GROUND_WINDOW * COLUMN_CELLS, mode="nearest")
         is_obstacle = indices[:, 2] - ground[indices[:, 0], indices[:, 1]] >= COLUMN_CELLS
-        points: Float64Array = (indices + self.low + 0.5) * self.resolution
+        points = np.asarray((indices + self.low + 0.5) * self.resolution, np.float64)
         class_ids = self.states[tuple(indices.T)]
         return (
             OccupiedCells(points[is_obstacle], class_ids[is_obstacle]),
@@ -144,7 +144,7 @@ class OwnMap:
         bits = np.zeros(self.states.shape, np.uint64)
         cells = tuple(self.indices_of(ground.points).T)
         bits[cells] = class_bits(ground.class_ids)
-        nearby = _dilated(bits)[cells]
+        nearby: UInt64Array = _dilated(bits)[cells]
         is_edge = np.bitwise_count(nearby) == 2
         _, edge_codes = np.unique(nearby[is_edge], return_inverse=True)
         first, second = _two_bits(nearby[is_edge])
@@ -159,6 +159,15 @@ class OwnMap:
             radius=_SURFACE_RADIUS * self.resolution,
         )
 
+    @cached_property
+    def all_surface(self) -> Surface:
+        """Surface of all occupied cells, with the class as code: for maps without a vertical axis."""
+        cells = np.argwhere(self.is_occupied)
+        points = np.asarray((cells + self.low + 0.5) * self.resolution, np.float64)
+        codes = self.states[tuple(cells.T)].astype(np.int64)
+        radius = _SURFACE_RADIUS * self.resolution
+        return Surface.of_points(points, codes, np.ones(len(points)), spacing=self.resolution, radius=radius)
+
     def indices_of(self, points: Float64Array) -> Int64Array:
         """Return the indices (n, 3) of the cells that hold points (n, 3) [m]; they may lie outside of ``states``."""
         indices: Int64Array = np.floor(points / self.resolution).astype(np.int64) - self.low
@@ -167,7 +176,7 @@ class OwnMap:
     def at(self, points: Float64Array) -> tuple[UInt8Array, UInt64Array]:
         """Return the state (n,) and the classes nearby (n,) of the cells that hold points (n, 3) [m]."""
         indices = self.indices_of(points)
-        inside = ((indices >= 0) & (indices < self.states.shape)).all(axis=1)
+        inside: BoolArray = np.all((indices >= 0) & (indices < self.states.shape), axis=1)
         flat = np.ravel_multi_index(tuple(np.where(inside[:, None], indices, 0).T), self.states.shape)
         # The first cell belongs to the empty border.
         return self.states.ravel()[flat], self.classes_nearby.ravel()[flat]
@@ -232,7 +241,7 @@ class Columns:
         """Centres (n, 2) [m], codes (n,) and ground heights (n,) [m] of the known columns."""
         indices = np.argwhere(self.codes > 0)
         cells = tuple(indices.T)
-        centres: Float64Array = (indices + self.low + 0.5) * self.edge
+        centres = np.asarray((indices + self.low + 0.5) * self.edge, np.float64)
         return centres, self.codes[cells], self.ground[cells]
 
 
@@ -278,8 +287,7 @@ def _winner(
     """The most frequent class index of each column (num_columns,), ties to the lower one, and where there is one."""
     votes = np.bincount(columns * num_classes + class_indices, minlength=num_columns * num_classes)
     votes = votes.reshape(num_columns, num_classes)
-    has_winner: BoolArray = votes.any(axis=1)
-    return votes.argmax(axis=1), has_winner
+    return votes.argmax(axis=1), votes.max(axis=1) > 0
 
 
 def _halved(keys: Int64Array, states: UInt8Array) -> tuple[Int64Array, UInt8Array]:

@@ -23,6 +23,8 @@ _COARSE_GATES, _FINE_GATES = (5.0, 3.0, 2.0), (2.0, 1.2)
 _NUM_REFINED = 4
 # Candidates are refined with one point in this many.
 _THINNING = 3
+# Edge of the cells for which the least score holds [m].
+_SCORE_RESOLUTION = 0.3
 # A refined candidate with more contradicting obstacles than this is wrong.
 _EXCLUDING_CONTRA = 0.2
 
@@ -34,7 +36,7 @@ class AcceptLimits:
     Attributes
     ----------
     min_score : float
-        Least log-likelihood ratio L.
+        Least log-likelihood ratio L at cells of 0.3 m. It grows with the number of cells on the same surface.
     min_cells : int
         Least number of obstacle cells that count.
     max_contra : float
@@ -45,7 +47,7 @@ class AcceptLimits:
         Largest score of another pose that is accepted by itself, relative to the best one.
     """
 
-    min_score: float = 110.0
+    min_score: float = 280.0
     min_cells: int = 150
     max_contra: float = 0.05
     max_tilt: float = math.radians(2.5)
@@ -123,7 +125,7 @@ def align_pair(
     return best
 
 
-def refusal_of(verification: Verification, tilt_angle: float, limits: AcceptLimits) -> str:
+def refusal_of(verification: Verification, tilt_angle: float, resolution: float, limits: AcceptLimits) -> str:
     """Return the number for which a pose is refused, as text; empty where it is accepted."""
     obstacles = verification.obstacles
     if obstacles.total < limits.min_cells:
@@ -132,8 +134,9 @@ def refusal_of(verification: Verification, tilt_angle: float, limits: AcceptLimi
         return f"q_c {obstacles.share_contra:.3f} above {limits.max_contra:g}"
     if tilt_angle > limits.max_tilt:
         return f"tilt {math.degrees(tilt_angle):.1f} degrees, above {math.degrees(limits.max_tilt):.1f}"
-    if verification.score < limits.min_score:
-        return f"L {verification.score:.0f} below {limits.min_score:.0f}"
+    min_score = limits.min_score * (_SCORE_RESOLUTION / resolution) ** 2
+    if verification.score < min_score:
+        return f"L {verification.score:.0f} below {min_score:.0f}"
     return ""
 
 
@@ -184,7 +187,7 @@ def _pair(
     limits: AcceptLimits,
 ) -> PairAlignment:  # fmt: skip
     """The pose of a pair with its verdict."""
-    return PairAlignment(first, second, T, information, agreement, refusal_of(agreement, tilt(T), limits))
+    return PairAlignment(first, second, T, information, agreement, refusal_of(agreement, tilt(T), a.resolution, limits))
 
 
 def _refused(pair: PairAlignment, reason: str) -> PairAlignment:

@@ -54,6 +54,20 @@ def planar_candidates(first: OwnMap, second: OwnMap) -> list[Candidate]:
     return [Candidate(planar.pose(_height_difference(a, b, planar)), planar.score) for planar in kept]
 
 
+def column_score(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> float:
+    """Return the score of a pose (4, 4): the sum over the second map's known columns, as for candidates."""
+    a, b = first.columns, second.columns
+    points, codes, ground = b.known
+    if a.known[1].size == 0 or codes.size == 0:
+        return 0.0
+    table = _score_table(a, b, 2 * first.num_classes)
+    spatial = np.column_stack([points, np.nan_to_num(ground)])
+    moved = spatial @ T_first_second[:2, :3].T + T_first_second[:2, 3]
+    cells = np.floor(moved / a.edge).astype(np.int64) - a.low
+    inside = np.all((cells >= 0) & (cells < a.codes.shape), axis=1)
+    return float(table[a.codes[tuple(cells[inside].T)], codes[inside]].sum())
+
+
 @dataclass(frozen=True, eq=False)
 class _Planar:
     """Pose in the plane: a point c of the second frame goes to R(yaw) (c - centre) + target."""

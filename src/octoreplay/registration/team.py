@@ -53,8 +53,8 @@ def align_team(
 ) -> TeamAlignment:
     """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
 
-    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run`` aligns
-    the pairs, one call for each; the result does not depend on it.
+    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run``
+    aligns the pairs, one call for each; the result does not depend on it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
