@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any, Self
 
 from octoreplay.config.robot import RobotConfig
@@ -13,16 +14,45 @@ from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable
 
 
+class FrameLink(StrEnum):
+    """Transform from the frame of a robot's poses to its map frame, by the highest part that is not the identity."""
+
+    NONE = "none"
+    """The poses are given in the map frame."""
+    IDENTITY = "identity"
+    FIXED = "fixed"
+    """Constant in all messages that were read, such as a surveyed place."""
+    MOVING = "moving"
+    """A correction that changes, as SLAM and localisation publish it."""
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """Map frame of a robot as its logs give it.
+
+    ``name`` is None for a trajectory file without a configured ``map_frame``. ``pose_frame`` is the frame that the
+    poses are given in, below the map frame (None for a file); ``link`` joins the two. ``tree`` holds all frames that TF
+    joins to the map frame, ``body`` the frames of the robot's body and sensor.
+    """
+
+    name: str | None
+    pose_frame: str | None = None
+    link: FrameLink = FrameLink.NONE
+    tree: frozenset[str] = frozenset()
+    body: frozenset[str] = frozenset()
+
+
 @dataclass(frozen=True)
 class ResolvedRobot(RobotConfig):
     """Robot configuration with a sensor topic and a pose source.
 
-    ``log_span_ns`` holds the log times of the first and the last message of any topic in the robot's logs, without the
-    clock offset; None where it is unknown or the logs hold no messages. Raises ConfigError without a sensor topic or
-    without a pose source.
+    ``span_ns`` holds the stamps of the first and the last message of any topic in the robot's logs, without the clock
+    offset; None where it is unknown or the logs hold no messages. ``frame`` is the map frame as found in the logs; None
+    where it is unknown. Raises ConfigError without a sensor topic or without a pose source.
     """
 
-    log_span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
+    span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
+    frame: MapFrame | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,9 +62,9 @@ class ResolvedRobot(RobotConfig):
             raise ConfigError(f"robot '{self.robot_id}': needs a pose_topic or pose_file")
 
     @classmethod
-    def from_config(cls, robot: RobotConfig, log_span_ns: tuple[int, int] | None) -> Self:
+    def from_config(cls, robot: RobotConfig, span_ns: tuple[int, int] | None, frame: MapFrame | None) -> Self:
         """Return the resolved robot of a configuration. Raises ConfigError without a sensor topic or a pose source."""
-        return cls(**_values(robot, RobotConfig), log_span_ns=log_span_ns)
+        return cls(**_values(robot, RobotConfig), span_ns=span_ns, frame=frame)
 
     def to_config(self) -> RobotConfig:
         """Return the plain configuration, which compares equal to one from a team file."""
@@ -52,26 +82,28 @@ class ResolvedRobot(RobotConfig):
 
     @property
     def start_ns(self) -> int | None:
-        """Log time of the first message of any topic, clock offset applied; None where it is unknown."""
-        return None if self.log_span_ns is None else self.log_span_ns[0] + self.clock_offset_ns
+        """Stamp of the first message of any topic, clock offset applied; None where it is unknown."""
+        return None if self.span_ns is None else self.span_ns[0] + self.clock_offset_ns
 
     @property
     def end_ns(self) -> int | None:
-        """Log time of the last message of any topic, clock offset applied; None where it is unknown."""
-        return None if self.log_span_ns is None else self.log_span_ns[1] + self.clock_offset_ns
+        """Stamp of the last message of any topic, clock offset applied; None where it is unknown."""
+        return None if self.span_ns is None else self.span_ns[1] + self.clock_offset_ns
 
 
 @dataclass(frozen=True)
 class ResolvedRun(RunConfig):
     """Run configuration whose robots are resolved and whose class table is known.
 
-    ``merge_classes`` and ``ignore_hits`` are empty: they are part of ``classes`` already. Changed parameters
-    (``with_parameters``, ``dataclasses.replace``) keep the resolution.
+    ``merge_classes`` and ``ignore_hits`` are empty: they are part of ``classes`` already. ``warnings`` are sentences on
+    frames and clocks of the robots that do not fit together. Changed parameters (``with_parameters``,
+    ``dataclasses.replace``) keep the resolution.
     """
 
     robots: tuple[ResolvedRobot, ...]
     # Without field() the class would inherit the base class's default None.
     classes: ClassTable = field()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,10 +111,12 @@ class ResolvedRun(RunConfig):
             raise ConfigError("merge_classes, ignore_hits: must be empty in a resolved run; edit its classes instead")
 
     @classmethod
-    def from_config(cls, config: RunConfig, robots: Sequence[ResolvedRobot], classes: ClassTable) -> Self:
+    def from_config(
+        cls, config: RunConfig, robots: Sequence[ResolvedRobot], classes: ClassTable, warnings: Sequence[str] = ()
+    ) -> Self:
         """Return a run configuration with its robots and classes resolved."""
         resolved = {"robots": tuple(robots), "classes": classes, "merge_classes": (), "ignore_hits": ()}
-        return cls(**{**_values(config, RunConfig), **resolved})
+        return cls(**{**_values(config, RunConfig), **resolved}, warnings=tuple(warnings))
 
     def to_config(self) -> RunConfig:
         """Return the plain configuration, which compares equal to the one that a result stores."""

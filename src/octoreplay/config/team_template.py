@@ -43,15 +43,25 @@ _EXAMPLES: Mapping[str, Mapping[str, tuple[Any, str]]] = {
 }  # fmt: skip
 """Example and comment of each key that is not a parameter, by the section that follows the key ('' for the first)."""
 
+_ROBOT_EXAMPLES: Mapping[str, Any] = {"T_team_map": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+"""Example of keys of a robot that have no default."""
 
-def team_template(config: RunConfig, missing: Mapping[str, Sequence[str]], folder: Path | None = None) -> str:
+
+def team_template(
+    config: RunConfig,
+    missing: Mapping[str, Sequence[str]],
+    folder: Path | None = None,
+    *,
+    warnings: Sequence[str] = (),
+) -> str:
     """Return the text of a team file with every key: those that ``config`` sets, and the others as comments.
 
-    ``missing`` are sentences that describe missing data, by robot_id ('' for the team); they become comments too.
+    ``missing`` are sentences that describe missing data, by robot_id ('' for the team), ``warnings`` are sentences on
+    robots that do not fit together; they become comments too.
     ``parse_team`` returns ``config`` again. Log paths are written as by ``dump_team``.
     """
     content = team_to_mapping(config, folder)
-    lines = [_HEAD, "robots:"]
+    lines = [_HEAD, *(f"# warning: {sentence}" for sentence in warnings), "robots:"]
     for robot in config.robots:
         lines += _robot_lines(robot, missing.get(robot.robot_id, ()), folder)
     section = ""
@@ -87,7 +97,7 @@ def _robot_lines(robot: RobotConfig, missing: Sequence[str], folder: Path | None
     lines += (f"    {line}" for line in _missing_lines(missing))
     for item in dataclasses.fields(RobotConfig):
         if item.metadata:
-            value = entry.get(item.name, item.default)
+            value = entry.get(item.name, _ROBOT_EXAMPLES.get(item.name, item.default))
             lines.append(_line(item.name, value, item.metadata["help"], is_set=item.name in entry, indent=4))
     return lines
 
