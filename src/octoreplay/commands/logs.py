@@ -68,10 +68,11 @@ def init(logs: tuple[Path, ...], output: Path, force: bool, strict_frames: bool)
     robots = tuple(summary.robot.with_absolute_paths() for summary in description.robots)
     missing = {summary.robot.robot_id: summary.missing for summary in description.robots}
     config = RunConfig(robots, classes=description.class_table)
-    text = team_template(
-        config, {"": description.missing, **missing}, output.parent.resolve(), warnings=description.warnings
+    notes = {summary.robot.robot_id: summary.notes for summary in description.robots}
+    notes[""] = tuple(f"warning: {sentence}" for sentence in description.warnings)
+    write_whole(
+        output, team_template(config, {"": description.missing, **missing}, output.parent.resolve(), notes=notes)
     )
-    write_whole(output, text)
     click.echo(f"wrote {output} ({len(robots)} robot{'s' if len(robots) > 1 else ''})")
     for sentence in (*description.missing, *(sentence for found in missing.values() for sentence in found)):
         click.echo(f"missing for a run: {sentence}", err=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any, Self
 
 from octoreplay.config.robot import RobotConfig
@@ -14,32 +13,37 @@ from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable
 
 
-class FrameLink(StrEnum):
-    """Transform from the frame of a robot's poses to its map frame, by the highest part that is not the identity."""
-
-    NONE = "none"
-    """The poses are given in the map frame."""
-    IDENTITY = "identity"
-    FIXED = "fixed"
-    """Constant in all messages that were read, such as a surveyed place."""
-    MOVING = "moving"
-    """A correction that changes, as SLAM and localisation publish it."""
-
-
 @dataclass(frozen=True)
 class MapFrame:
     """Map frame of a robot as its logs give it.
 
-    ``name`` is None for a trajectory file without a configured ``map_frame``. ``pose_frame`` is the frame that the
-    poses are given in, below the map frame (None for a file); ``link`` joins the two. ``tree`` holds all frames that TF
-    joins to the map frame, ``body`` the frames of the robot's body and sensor.
+    Attributes
+    ----------
+    name : str or None
+        The frame; None for a trajectory file without a configured ``map_frame``.
+    pose_frame : str or None
+        Frame that the poses are given in, at or below the map frame; None for a file.
+    is_corrected : bool
+        A transform between the two changes, as SLAM and localisation publish it.
+    place : tuple of 16 float or None
+        Transform by rows that the map frame's constant transforms give the frames below it; None without one.
+    tree, body : frozenset of str
+        Frames that TF joins to the map frame, and frames of the robot's body and sensor.
     """
 
     name: str | None
     pose_frame: str | None = None
-    link: FrameLink = FrameLink.NONE
+    is_corrected: bool = False
+    place: tuple[float, ...] | None = None
     tree: frozenset[str] = frozenset()
     body: frozenset[str] = frozenset()
+
+    @property
+    def origin(self) -> str:
+        """Clause on the way of the poses to the map frame; empty where they are given in it."""
+        if self.pose_frame in (None, self.name):
+            return ""
+        return f"poses in {self.pose_frame}, {'corrected' if self.is_corrected else 'placed'} by TF"
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class ResolvedRobot(RobotConfig):
             raise ConfigError(f"robot '{self.robot_id}': needs a pose_topic or pose_file")
 
     @classmethod
-    def from_config(cls, robot: RobotConfig, span_ns: tuple[int, int] | None, frame: MapFrame | None) -> Self:
+    def from_config(cls, robot: RobotConfig, span_ns: tuple[int, int] | None, frame: MapFrame | None = None) -> Self:
         """Return the resolved robot of a configuration. Raises ConfigError without a sensor topic or a pose source."""
         return cls(**_values(robot, RobotConfig), span_ns=span_ns, frame=frame)
 

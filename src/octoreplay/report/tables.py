@@ -16,7 +16,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.config.resolved import FrameLink, MapFrame, ResolvedRun
+from octoreplay.config.resolved import MapFrame, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
@@ -353,14 +353,6 @@ def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
     }  # fmt: skip
     width = max(len(name) for name in names.values())
     values = {name: value for field, name in names.items() if (value := getattr(robot, field))}
-    if frame is not None and frame.link in _LINKS and "map frame" in values:
-        values["map frame"] += f" ({_LINKS[frame.link].format(frame.pose_frame)})"
+    if frame is not None and frame.origin:
+        values["map frame"] += f" ({frame.origin})"
     return [f"{name:<{width}}  {value}" for name, value in values.items()]
-
-
-_LINKS = {
-    FrameLink.IDENTITY: "poses in {}, at the same place by TF",
-    FrameLink.FIXED: "poses in {}, placed by TF",
-    FrameLink.MOVING: "poses in {}, corrected by TF",
-}
-"""How poses that are given in another frame reach the map frame."""

@@ -64,6 +64,13 @@ class RobotSummary:
     span_ns: tuple[int, int] | None
     missing: tuple[str, ...]
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on choices that the team file can change."""
+        if self.frame is None or not self.frame.origin:
+            return ()
+        return (f"map_frame: {self.frame.origin}; map_frame: {self.frame.pose_frame} leaves these transforms out",)
+
 
 @dataclass(frozen=True)
 class LogDescription:

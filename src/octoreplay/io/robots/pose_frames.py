@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from octoreplay.config.resolved import FrameLink, MapFrame
+from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo, first_whole_message
@@ -56,7 +56,8 @@ def find_map_frame(robot: RobotConfig, group: LogGroup) -> MapFrame:
         # The poses are looked up from the configured frame on.
         pose_frame = name
     frames = frozenset(frame for frame in tree.frames if tree.is_connected(frame, name))
-    return MapFrame(name, pose_frame, _link(tree, name, pose_frame), frames, own)
+    place = _place(tree, name, pose_frame)
+    return MapFrame(name, pose_frame, _is_corrected(tree, name, pose_frame), place, frames, own)
 
 
 def sampled_tree(sensor_topic: str, group: LogGroup) -> FrameTree:
@@ -128,17 +129,22 @@ def _usable_chain(tree: FrameTree, pose_frame: str, own: frozenset[str]) -> list
     return chain
 
 
-def _link(tree: FrameTree, name: str, pose_frame: str) -> FrameLink:
-    """Link from the poses' frame to the map frame, as far as TF gives it."""
+def _place(tree: FrameTree, name: str, pose_frame: str) -> tuple[float, ...] | None:
+    """Product of the constant transforms that lead down from the map frame to the poses' frame, by rows."""
     chain = list(tree.ancestors(pose_frame))
-    if name == pose_frame or not tree.is_connected(name, pose_frame):
-        return FrameLink.NONE
-    if name not in chain:
-        return FrameLink.FIXED if tree.is_fixed(name, pose_frame) else FrameLink.MOVING
-    for child in reversed(chain[: chain.index(name)]):
+    result, is_placed = np.eye(4), False
+    for child in reversed(chain[: chain.index(name)] if name in chain else []):
         sample = tree.edge_sample(child)
         if sample is None or not sample[1]:
-            return FrameLink.MOVING
-        if not np.allclose(sample[0], np.eye(4), atol=1e-9):
-            return FrameLink.FIXED
-    return FrameLink.IDENTITY
+            break
+        result, is_placed = result @ sample[0], True
+    return tuple(result.ravel().tolist()) if is_placed else None
+
+
+def _is_corrected(tree: FrameTree, name: str, pose_frame: str) -> bool:
+    """True where a transform between the map frame and the poses' frame changes."""
+    chain = list(tree.ancestors(pose_frame))
+    if name not in chain:
+        return tree.is_connected(name, pose_frame) and not tree.is_fixed(name, pose_frame)
+    samples = [tree.edge_sample(child) for child in chain[: chain.index(name)]]
+    return any(sample is None or not sample[1] for sample in samples)

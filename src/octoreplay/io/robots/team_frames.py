@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
-from octoreplay.config.resolved import FrameLink, MapFrame
+import numpy as np
+
+from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 
-_COMMON_FRAMES = ("earth", "ecef", "map", "utm", "world")
+_COMMON_FRAMES = ("earth", "ecef", "map", "mocap", "utm", "world")
 """Names of frames that do not belong to one robot (REP 105: map, earth), without their namespaces."""
 
 
@@ -18,12 +20,12 @@ def frames_warning(robots: Sequence[tuple[RobotConfig, MapFrame]]) -> str | None
     A robot with a ``T_team_map`` is placed in the team's frame. The others need one frame between them, which is then
     the team's:
 
-    - Two robots in one TF tree with the same root share that root.
-    - Logs whose TF places the robots by fixed transforms below a frame of the same name share that frame, unless all
-      these transforms are the identity, which stands for a missing localisation.
+    - Two robots in one TF tree share its root.
+    - Robots that TF places by different constant transforms below a frame of the same name share that frame. Equal
+      transforms are placeholders, such as an identity that stands for a missing localisation.
     - Robots whose poses are given in a frame of the same name share it if the name is that of a common frame: map,
-      world, earth, ecef or utm. An odometry frame, or a frame of any other name, begins where its robot started.
-    - A map frame above moving corrections belongs to the robot whose SLAM or localisation publishes them.
+      world, earth, ecef, utm or mocap. An odometry frame, or a frame of any other name, begins where its robot started.
+    - A map frame right above a correction belongs to the robot whose SLAM or localisation publishes it.
     """
     unplaced = [(robot, frame) for robot, frame in robots if robot.T_team_map is None]
     groups = _groups(unplaced)
@@ -40,17 +42,15 @@ def _described(frame: MapFrame) -> str:
     """Map frame as a warning names it."""
     if frame.name is None:
         return "trajectory file without a frame"
-    if frame.link is FrameLink.MOVING:
-        return f"'{frame.name}' of its own localisation"
-    return f"'{frame.name}'" + (f", equal to '{frame.pose_frame}'" if frame.link is FrameLink.IDENTITY else "")
+    return f"'{frame.name}'" + (f": {frame.origin}" if frame.origin else "")
 
 
 def _groups(robots: Sequence[tuple[RobotConfig, MapFrame]]) -> list[list[tuple[RobotConfig, MapFrame]]]:
     """Robots grouped by related frames, in the order of the robots."""
-    is_anchor = _anchors([frame for _, frame in robots])
+    anchor_of = _anchors([frame for _, frame in robots])
     group_of = list(range(len(robots)))
     for a, b in combinations(range(len(robots)), 2):
-        if _is_related(robots[a], robots[b], is_anchor):
+        if _is_related(robots[a], robots[b], anchor_of):
             old, new = max(group_of[a], group_of[b]), min(group_of[a], group_of[b])
             group_of = [new if group == old else group for group in group_of]
     return [[robots[i] for i, found in enumerate(group_of) if found == group] for group in sorted(set(group_of))]
@@ -58,15 +58,23 @@ def _groups(robots: Sequence[tuple[RobotConfig, MapFrame]]) -> list[list[tuple[R
 
 def _anchors(frames: Sequence[MapFrame]) -> Callable[[MapFrame], str | None]:
     """Function that gives the name of the frame that a robot shares with other logs; None for a frame of its own."""
-    placing = {frame.name for frame in frames if frame.link is FrameLink.FIXED}
-    placing |= {frame.name for frame in frames if frame.link is FrameLink.NONE and _is_common(frame.name)}
+    stated = {frame.name for frame in frames if not frame.origin and _is_common(frame.name)}
+    places: dict[str | None, list[tuple[float, ...]]] = {}
+    for frame in frames:
+        if frame.place is not None:
+            places.setdefault(frame.name, []).append(frame.place)
+    placing = stated | {
+        name
+        for name, found in places.items()
+        if not any(np.allclose(a, b, rtol=0.0, atol=1e-6) for a, b in combinations(found, 2))
+    }
 
     def anchor_of(frame: MapFrame) -> str | None:
-        if frame.link is FrameLink.MOVING:
-            return None
-        if frame.link is FrameLink.FIXED or (frame.link is FrameLink.IDENTITY and frame.name in placing):
+        if frame.place is not None and frame.name in placing:
             return frame.name
-        name = frame.pose_frame if frame.link is FrameLink.IDENTITY else frame.name
+        if frame.is_corrected:
+            return None
+        name = frame.name if frame.pose_frame is None else frame.pose_frame
         return name if _is_common(name) else None
 
     return anchor_of
