@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -18,15 +17,13 @@ from rich.text import Text
 
 from octoreplay.config.resolved import MapFrame, ResolvedRun
 from octoreplay.config.robot import RobotConfig
+from octoreplay.io.robots.team_clocks import instant
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.io.robots.describe import LogDescription, LogSummary
     from octoreplay.result import PointQuery
-
-_YEAR_2000_NS = 946_684_800_000_000_000
-"""Earlier stamps are not dates but times since some start of a clock."""
 
 _CAUSES = {
     "no_label": "no label", "no_pose": "no pose", "late": "late",
@@ -66,13 +63,6 @@ def seconds(value: float) -> str:
         return f"{value:.1f} s"
     whole = round(value)
     return f"{whole // 60} min {whole % 60:02d} s"
-
-
-def instant(stamp_ns: int) -> str:
-    """Format a stamp as an RFC 3339 date, or in seconds where it is not a date."""
-    if stamp_ns < _YEAR_2000_NS:
-        return f"{stamp_ns / 1e9:.3f} s"
-    return datetime.datetime.fromtimestamp(stamp_ns // 1_000_000_000, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def results(summary: RunSummary) -> RenderableType:

@@ -85,7 +85,7 @@ class LogDescription:
     overlap_ns: tuple[int, int] | None
     class_table: ClassTable | None
     missing: tuple[str, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def describe(logs: Sequence[Path], *, strict_frames: bool = False) -> LogDescription:

@@ -32,7 +32,7 @@ def find_map_frame(robot: RobotConfig, group: LogGroup) -> MapFrame:
 
     That of the logs is the highest frame that TF joins to the poses, in the first and the last seconds of the logs,
     with these exceptions: a frame more than 10 km away; a frame above one with two parents; and any frame above the
-    poses' frame where the chain leads through the robot's own body. Raises InputError where the poses are TF and the
+    poses' frame where the chain leads through the robot's own body or is a cycle. Raises InputError where the poses are TF and the
     sensor's frame is unknown or has no parent.
     """
     if robot.pose_file is not None:
@@ -120,7 +120,7 @@ def _tf_pose_frame(robot: RobotConfig, sensor_frame: str | None, tree: FrameTree
 def _usable_chain(tree: FrameTree, pose_frame: str, own: frozenset[str]) -> list[str]:
     """The poses' frame and the frames above it, as far as they can serve as map frame."""
     chain = list(tree.ancestors(pose_frame))
-    if own.intersection(chain):
+    if own.intersection(chain) or tree.is_cyclic(pose_frame):
         return [pose_frame]
     for number, child in enumerate(chain[:-1]):
         sample = tree.edge_sample(child)

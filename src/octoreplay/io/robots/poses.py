@@ -152,6 +152,10 @@ class FrameTree:
         """Names of all frames, sorted."""
         return tuple(sorted({*self._parents, *self._parents.values()}))
 
+    def is_cyclic(self, frame: str) -> bool:
+        """True where the chain of a frame's parents never ends."""
+        return self.root_of(frame) in self._parents
+
     def has_two_parents(self, frame: str) -> bool:
         """True where TF gave transforms of a frame to two parents."""
         return frame_name(frame) in self._other_parents

@@ -161,21 +161,31 @@ def _share_time(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 def _shifted_spans(clocks: Mapping[str, RobotClock]) -> str | None:
     """Sign 4."""
-    names = sorted(clocks, key=lambda name: clocks[name].span_ns)
-    first = names[(len(names) - 1) // 2]
-    start, end = clocks[first].span_ns
-    parts = []
-    for robot_id in (name for name in clocks if name != first):
-        shifts = (clocks[robot_id].span_ns[0] - start, clocks[robot_id].span_ns[1] - end)
-        is_shifted = min(shifts) > _LARGEST_DIFFERENCE_NS or max(shifts) < -_LARGEST_DIFFERENCE_NS
-        if is_shifted and abs(shifts[1] - shifts[0]) <= _SAME_LENGTH_NS:
-            parts.append(f"that of {robot_id} begins {shifts[0] / 1e9:+.1f} s and ends {shifts[1] / 1e9:+.1f} s")
-    if not parts:
+    shifted = {name: _shifted_from(name, clocks) for name in clocks}
+    # One clock that is off differs from all others, and each of them only from this one.
+    reference = min((name for name in clocks if shifted[name]), key=lambda name: len(shifted[name]), default=None)
+    if reference is None:
         return None
+    parts = []
+    for robot_id, shifts in shifted[reference].items():
+        side = "after" if shifts[0] > 0 else "before"
+        first, last = (abs(shift) / 1e9 for shift in shifts)
+        parts.append(f"the log of {robot_id} begins {first:.1f} s and ends {last:.1f} s {side} that of {reference}")
     return (
-        f"the clocks of the robots may differ: relative to the log of {first}, {_listed(parts)} apart, with the same "
-        f"length; if they were recorded at the same time, give clock_offset"
+        f"the clocks of the robots may differ: {_listed(parts)}; if they were recorded at the same time, give "
+        f"clock_offset"
     )
+
+
+def _shifted_from(reference: str, clocks: Mapping[str, RobotClock]) -> dict[str, tuple[int, int]]:
+    """Robots whose logs have the length of a robot's log and begin and end elsewhere, with both differences [ns]."""
+    start, end = clocks[reference].span_ns
+    shifts = {name: (clock.span_ns[0] - start, clock.span_ns[1] - end) for name, clock in clocks.items()}
+    return {
+        name: (first, last)
+        for name, (first, last) in shifts.items()
+        if abs(last - first) <= _SAME_LENGTH_NS and min(abs(first), abs(last)) > _LARGEST_DIFFERENCE_NS
+    }
 
 
 def _spans(names: list[str], clocks: Mapping[str, RobotClock]) -> str:

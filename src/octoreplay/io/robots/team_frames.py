@@ -41,7 +41,7 @@ def frames_warning(robots: Sequence[tuple[RobotConfig, MapFrame]]) -> str | None
 def _described(frame: MapFrame) -> str:
     """Map frame as a warning names it."""
     if frame.name is None:
-        return "trajectory file without a frame"
+        return "poses that name no frame"
     return f"'{frame.name}'" + (f": {frame.origin}" if frame.origin else "")
 
 
