@@ -32,8 +32,8 @@ def find_map_frame(robot: RobotConfig, group: LogGroup) -> MapFrame:
 
     That of the logs is the highest frame that TF joins to the poses, in the first and the last seconds of the logs,
     with these exceptions: a frame more than 10 km away; a frame above one with two parents; and any frame above the
-    poses' frame where the chain leads through the robot's own body or is a cycle. Raises InputError where the poses are TF and the
-    sensor's frame is unknown or has no parent.
+    poses' frame where the chain leads through the robot's own body or is a cycle. Raises InputError where the poses are
+    TF and the sensor's frame is unknown or has no parent.
     """
     if robot.pose_file is not None:
         return MapFrame(robot.map_frame)
