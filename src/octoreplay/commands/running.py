@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +16,10 @@ from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
+
+if TYPE_CHECKING:
+    from octoreplay.config.resolved import ResolvedRun
+    from octoreplay.config.run import RunConfig
 
 
 @with_parameters
@@ -64,6 +69,9 @@ def run(
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         tables.show(out, tables.class_list(config.classes))
+    else:
+        for line in _found_frames(base, config):
+            out.print(line, soft_wrap=True)
     for sentence in config.warnings:
         warn(err, sentence)
     if save_team is not None:
@@ -76,6 +84,13 @@ def run(
     show_warnings(err, summary, shown=config.warnings)
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
     return EXIT_DATA_LOST if summary.lost_data else 0
+
+
+def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
+    """Lines on the robots whose poses TF transforms to a map frame that the configuration does not name."""
+    for robot, resolved in zip(given.robots, config.robots, strict=True):
+        if robot.map_frame is None and resolved.frame is not None and resolved.frame.origin:
+            yield f"{resolved.robot_id}: map frame {resolved.map_frame} ({resolved.frame.origin})"
 
 
 @click.command(short_help="Write the logs of a simulated team.")
