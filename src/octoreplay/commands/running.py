@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
-from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar
+from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
 from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
+
+if TYPE_CHECKING:
+    from octoreplay.config.resolved import ResolvedRun
+    from octoreplay.config.run import RunConfig
 
 
 @with_parameters
@@ -64,6 +69,11 @@ def run(
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         tables.show(out, tables.class_list(config.classes))
+    else:
+        for line in _found_frames(base, config):
+            out.print(line, soft_wrap=True)
+    for sentence in config.warnings:
+        warn(err, sentence)
     if save_team is not None:
         save_team_file(config, save_team)
         out.print(f"saved {save_team}", soft_wrap=True)
@@ -71,9 +81,16 @@ def run(
         return 0
     summary = replay_with_bar(config, output)
     tables.show(out, tables.results(summary))
-    show_warnings(err, summary)
+    show_warnings(err, summary, shown=config.warnings)
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
     return EXIT_DATA_LOST if summary.lost_data else 0
+
+
+def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
+    """Lines on the robots whose poses TF transforms to a map frame that the configuration does not name."""
+    for robot, resolved in zip(given.robots, config.robots, strict=True):
+        if robot.map_frame is None and resolved.frame is not None and resolved.frame.origin:
+            yield f"{resolved.robot_id}: map frame {resolved.map_frame} ({resolved.frame.origin})"
 
 
 @click.command(short_help="Write the logs of a simulated team.")
