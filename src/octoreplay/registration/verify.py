@@ -11,7 +11,7 @@ from octoreplay.registration.own_map import FREE, OccupiedCells, OwnMap, class_b
 from octoreplay.registration.search import column_score
 from octoreplay.transforms import inverse
 
-# Logarithm of the likelihood ratio of a right pose against the best wrong ones that one cell gives: same, other, contra.
+# Log-likelihood ratio of a right pose against the best wrong ones, for each cell that is the same, other or contra.
 # Measured on simulated villages. A ground cell tells less, because its neighbours tell the same.
 _OBSTACLE_WEIGHTS = (0.094, -0.65, -2.26)
 _GROUND_WEIGHTS = (0.018, -0.27, -0.35)
