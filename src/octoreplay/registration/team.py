@@ -47,25 +47,29 @@ class TeamAlignment:
 def align_team(
     maps: Sequence[OwnMap],
     *,
+    dof: int = 4,
     guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
     limits: AcceptLimits | None = None,
     run: Run = map,
 ) -> TeamAlignment:
-    """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
+    """Return the frames of robots from their maps in their own frames.
 
-    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run``
-    aligns the pairs, one call for each; the result does not depend on it.
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``guesses`` are further
+    candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run`` aligns the pairs, one call
+    for each; the result does not depend on it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
 
     def align(pair: tuple[int, int]) -> PairAlignment:
-        return align_pair(maps, *pair, guesses=known.get(pair, ()), limits=limits)
+        return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
-    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits)
+    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits, is_upright=dof == 4)
 
 
-def join_pairs(maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: AcceptLimits) -> TeamAlignment:
+def join_pairs(
+    maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: AcceptLimits, *, is_upright: bool = True
+) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
 
     A pair that joins two components is refused where any two maps of both contradict each other under it; a pair within
@@ -87,7 +91,7 @@ def join_pairs(maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: A
             # The frame of j's component in that of i's.
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
-            refusal = _contradiction(maps, poses, members[new], members[old], T, limits)
+            refusal = _contradiction(maps, poses, members[new], members[old], T, limits, is_upright)
             if not refusal:
                 for index in members[old]:
                     poses[index] = T @ poses[index]
@@ -120,12 +124,13 @@ def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
 def _contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
+    is_upright: bool,
 ) -> str:  # fmt: skip
     """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty without contradiction."""
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
-            obstacles = verify(maps[i], maps[j], pose).obstacles
+            obstacles = verify(maps[i], maps[j], pose, is_upright=is_upright).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
                 first, second = sorted((i, j))
                 share = obstacles.share_contra
