@@ -56,6 +56,8 @@ class Surface:
 
         Local surfaces come from the principal components of the points of equal code within ``radius`` [m].
         """
+        if len(points) == 0:
+            return cls(points, codes, np.zeros((0, 3, 3)), weights)
         tree = cKDTree(_keys(points, codes))
         _, neighbours = tree.query(_keys(points, codes), k=_NUM_NEIGHBOURS, distance_upper_bound=radius)
         exists = neighbours < len(points)
