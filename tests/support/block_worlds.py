@@ -39,7 +39,7 @@ class BlockWorld:
         T = inverse(T_world_own)
         reach = radius + 1.0
         corners = np.array([[x, y, z] for x in (-reach, reach) for y in (-reach, reach) for z in (-1.0, HEIGHT + 1)])
-        corners = (corners + (*centre, 0.0)) @ T[:3, :3].T + T[:3, 3]
+        corners = (corners + np.array([*centre, 0.0])) @ T[:3, :3].T + T[:3, 3]
         low, high = np.floor(corners.min(axis=0) / resolution), np.ceil(corners.max(axis=0) / resolution)
         axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
         keys = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int64)
