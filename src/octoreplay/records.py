@@ -5,6 +5,7 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, field, fields
 from typing import Any, TypeAlias, TypeVar, cast
@@ -249,9 +250,80 @@ class LinkMetrics:
     bytes_per_second: float
 
 
+MIN_COMPARED_CELLS = 500
+"""Number of compared cells from which the contradiction of a pair of robots counts as the team's."""
+
+
 @dataclass(frozen=True)
-class TickMetrics:
-    """Metrics of the team after one tick; docs/metrics.md defines them."""
+class PairMetrics:
+    """Contradiction of the evidence of two robots that share known cells; docs/metrics.md defines it.
+
+    Attributes
+    ----------
+    first, second : str
+        The robots, in the team's order.
+    overlap_cells : int
+        Cells that both know.
+    occupied_cells : int
+        Of these, cells that one calls occupied and the other occupied or free.
+    contradiction : float
+        Share of the occupied cells that the other robot calls free; NaN without occupied cells.
+    contradiction_of_first, contradiction_of_second : float
+        The same over the cells that this robot calls occupied and the other one occupied or free.
+    both_occupied_cells : int
+        Cells that both call occupied.
+    label_contradiction : float
+        Share of these with different labels; NaN without such cells.
+    """
+
+    first: str
+    second: str
+    overlap_cells: int
+    occupied_cells: int
+    contradiction: float
+    contradiction_of_first: float
+    contradiction_of_second: float
+    both_occupied_cells: int
+    label_contradiction: float
+
+
+def by_contradiction(pairs: Iterable[PairMetrics]) -> list[PairMetrics]:
+    """Return the pairs with at least MIN_COMPARED_CELLS occupied cells, the largest contradiction first."""
+    counted = [pair for pair in pairs if pair.occupied_cells >= MIN_COMPARED_CELLS]
+    return sorted(counted, key=lambda pair: -pair.contradiction)
+
+
+def by_label_contradiction(pairs: Iterable[PairMetrics]) -> list[PairMetrics]:
+    """Return the pairs with at least MIN_COMPARED_CELLS cells that both call occupied, the largest first."""
+    counted = [pair for pair in pairs if pair.both_occupied_cells >= MIN_COMPARED_CELLS]
+    return sorted(counted, key=lambda pair: -pair.label_contradiction)
+
+
+class PairTotals:
+    """Team numbers of the pairs of robots: properties of every record with a field ``pairs``."""
+
+    pairs: tuple[PairMetrics, ...]
+
+    @property
+    def contradiction(self) -> float:
+        """Largest contradiction of a pair with enough occupied cells; NaN without such a pair."""
+        ranked = by_contradiction(self.pairs)
+        return ranked[0].contradiction if ranked else math.nan
+
+    @property
+    def label_contradiction(self) -> float:
+        """Largest label contradiction of a pair with enough cells that both call occupied; NaN without such a pair."""
+        ranked = by_label_contradiction(self.pairs)
+        return ranked[0].label_contradiction if ranked else math.nan
+
+
+@dataclass(frozen=True)
+class TickMetrics(PairTotals):
+    """Metrics of the team after one tick; docs/metrics.md defines them.
+
+    ``pairs`` are the pairs of robots that share known cells, in the robots' order. They are empty in results that were
+    written before the contradiction of evidence was measured.
+    """
 
     tick: int
     stamp_ns: int
@@ -265,6 +337,7 @@ class TickMetrics:
     max_change: float
     robots: tuple[RobotMetrics, ...]
     links: tuple[LinkMetrics, ...]
+    pairs: tuple[PairMetrics, ...] = ()
 
     @property
     def counted_robots(self) -> tuple[RobotMetrics, ...]:
@@ -301,7 +374,7 @@ class LinkTotals:
 
 @dataclass(frozen=True)
 class MapState:
-    """Map of one robot as stored in a result: a packet of the map codec, either a key frame or a delta.
+    """Map or evidence of one robot as stored in a result: a packet of the map codec, a key frame or a delta.
 
     A delta holds the bricks that changed since the state ``base_sequence`` of the same robot.
     """
