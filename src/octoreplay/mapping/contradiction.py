@@ -14,6 +14,9 @@ from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt64Array
 
+CONTRADICTION_LIMIT = 0.35
+"""Contradiction above which a pair's frames are reported as wrong (measured in benchmarks/contradiction.py)."""
+
 
 def state_limits(sensor: SensorConfig) -> tuple[np.float32, np.float32]:
     """Return the log-odds from which a cell of the evidence is occupied, and those up to which it is free.

@@ -11,7 +11,16 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import CENTRAL, FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics
+from octoreplay.records import (
+    CENTRAL,
+    FrameCounts,
+    LeafTable,
+    LinkTotals,
+    MapState,
+    PairMetrics,
+    RunSummary,
+    TickMetrics,
+)
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
@@ -71,6 +80,14 @@ class Recorder:
         self._num_published = 0
         self._sent_bytes = 0
         self._links = LinkTotals()
+
+    @property
+    def last_pairs(self) -> tuple[tuple[PairMetrics, ...], list[str]]:
+        """Pairs of robots after the last tick, and the robots with evidence; empty before the first tick."""
+        if self.last is None:
+            return (), []
+        evidence = zip(self.last.graph.robot_ids, self.last.evidence, strict=True)
+        return self.last.metrics.pairs, [robot_id for robot_id, octree in evidence if octree.num_cells]
 
     def record(self, tick: Tick) -> None:
         """Record one tick."""

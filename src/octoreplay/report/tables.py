@@ -19,7 +19,19 @@ from rich.text import Text
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
+from octoreplay.mapping.contradiction import CONTRADICTION_LIMIT
+from octoreplay.records import (
+    MIN_COMPARED_CELLS,
+    ClassTable,
+    FrameCounts,
+    LeafTable,
+    LinkMetrics,
+    PairMetrics,
+    RunSummary,
+    TickMetrics,
+    by_contradiction,
+    by_label_contradiction,
+)
 
 if TYPE_CHECKING:
     from octoreplay.io.robots.describe import LogDescription, LogSummary
@@ -33,6 +45,9 @@ _CAUSES = {
     "undecodable": "unreadable",
 }  # fmt: skip
 """Causes of frames that were not mapped: fields of FrameCounts and their headings."""
+
+MAX_PAIRS = 8
+"""Largest number of rows of the table of pairs."""
 
 
 def number(value: float) -> str:
@@ -76,13 +91,57 @@ def instant(stamp_ns: int) -> str:
 
 
 def results(summary: RunSummary) -> RenderableType:
-    """Return the results of a run as tables: the team, each robot, lossy links and frames that were not mapped."""
+    """Return the results of a run as tables: team, robots, contradicting pairs, lossy links, frames not mapped."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
+    if is_contradictory(summary.last.pairs):
+        parts.append(pairs_table(summary.last.pairs))
     if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
         parts.append(_links_table(summary.links))
     if any(counts.skipped for counts in summary.frame_counts.values()):
         parts.append(_frames_table(summary.frame_counts))
     return _spaced(parts)
+
+
+def worst_contradiction(pairs: Sequence[PairMetrics]) -> str:
+    """Return the largest contradiction with its number of cells and its pair; a dash without a pair that counts."""
+    ranked = by_contradiction(pairs)
+    if not ranked:
+        return _absent(pairs)
+    worst = ranked[0]
+    cells = f"{worst.occupied_cells:,} occupied cells"
+    return f"{share(worst.contradiction)} of {cells}, {worst.first} and {worst.second}"
+
+
+def worst_label_contradiction(pairs: Sequence[PairMetrics]) -> str:
+    """Return the largest label contradiction with its number of cells and its pair; a dash without one that counts."""
+    ranked = by_label_contradiction(pairs)
+    if not ranked:
+        return _absent(pairs)
+    worst = ranked[0]
+    cells = f"{worst.both_occupied_cells:,} occupied cells"
+    return f"{share(worst.label_contradiction)} of {cells}, {worst.first} and {worst.second}"
+
+
+def is_contradictory(pairs: Sequence[PairMetrics]) -> bool:
+    """True where a pair that counts contradicts each other in more than CONTRADICTION_LIMIT of its cells."""
+    return any(pair.contradiction > CONTRADICTION_LIMIT for pair in by_contradiction(pairs))
+
+
+def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
+    """Return a table of the pairs that contradict each other most, and of how many pairs they are."""
+    ranked = by_contradiction(pairs)
+    rows = ranked[:MAX_PAIRS]
+    table = styled_table(f"Contradiction of evidence, {len(rows)} of {len(ranked)} pairs")
+    table.add_column("pair", overflow="fold")
+    for name in ("cells that\nboth know", "occupied", "contradiction", "of the\nfirst", "of the\nsecond", "labels"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for pair in rows:
+        shares = (pair.contradiction, pair.contradiction_of_first, pair.contradiction_of_second)
+        table.add_row(
+            f"{pair.first}, {pair.second}", f"{pair.overlap_cells:,}", f"{pair.occupied_cells:,}", *map(share, shares),
+            share(pair.label_contradiction),
+        )  # fmt: skip
+    return table
 
 
 def chosen_inputs(config: RunConfig) -> Table:
@@ -226,6 +285,9 @@ def _team_table(summary: RunSummary) -> Table:
     robots = last.counted_robots
     worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
+    if len(last.robots) > 1:
+        table.add_row("contradiction, worst pair", worst_contradiction(last.pairs))
+        table.add_row("label contradiction", worst_label_contradiction(last.pairs))
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
     grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
@@ -238,6 +300,11 @@ def _team_table(summary: RunSummary) -> Table:
         delivered = sum(link.num_delivered for link in summary.links) / num_sent
         table.add_row("packets", f"{num_sent:,} over {len(summary.links)} links, {share(delivered)} delivered")
     return table
+
+
+def _absent(pairs: Sequence[PairMetrics]) -> str:
+    """Text in place of a number that no pair has."""
+    return f"- (no pair shares {MIN_COMPARED_CELLS} occupied cells)" if pairs else "-"
 
 
 _AGREEMENTS = ("agreement", "agreement_occupied")

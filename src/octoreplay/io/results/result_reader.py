@@ -147,7 +147,7 @@ class ResultReader:
         ]
 
     def state_stamp(self, robot_id: str, tick: int, *, evidence: bool = False) -> int | None:
-        """Return the stamp [ns] of a robot's map or evidence stored at a tick, None without one. Raises as ``states``."""
+        """Return the stamp [ns] of a robot's map or evidence stored at a tick, or None. Raises as ``states``."""
         topic = self._state_topic(robot_id, evidence)
         for first_ns, first in self._messages(topic):
             # Ticks are one publish period apart, so only the chunks at the tick's time need be read.
