@@ -268,6 +268,9 @@ class PairMetrics:
         Of these, cells that one calls occupied and the other occupied or free.
     contradiction : float
         Share of the occupied cells that the other robot calls free; NaN without occupied cells.
+    clear_contradiction : float
+        Share of the occupied cells that the other robot calls free and around which it has no occupied cell, among the
+        26 neighbours; NaN without occupied cells.
     contradiction_of_first, contradiction_of_second : float
         The same over the cells that this robot calls occupied and the other one occupied or free.
     both_occupied_cells : int
@@ -281,22 +284,25 @@ class PairMetrics:
     overlap_cells: int
     occupied_cells: int
     contradiction: float
+    clear_contradiction: float
     contradiction_of_first: float
     contradiction_of_second: float
     both_occupied_cells: int
     label_contradiction: float
 
 
-def by_contradiction(pairs: Iterable[PairMetrics]) -> list[PairMetrics]:
-    """Return the pairs with at least MIN_COMPARED_CELLS occupied cells, the largest contradiction first."""
-    counted = [pair for pair in pairs if pair.occupied_cells >= MIN_COMPARED_CELLS]
-    return sorted(counted, key=lambda pair: -pair.contradiction)
+PAIR_SHARES = {
+    "contradiction": "occupied_cells",
+    "clear_contradiction": "occupied_cells",
+    "label_contradiction": "both_occupied_cells",
+}
+"""Shares of a pair that have a number for the team, and the number of cells that each is a share of."""
 
 
-def by_label_contradiction(pairs: Iterable[PairMetrics]) -> list[PairMetrics]:
-    """Return the pairs with at least MIN_COMPARED_CELLS cells that both call occupied, the largest first."""
-    counted = [pair for pair in pairs if pair.both_occupied_cells >= MIN_COMPARED_CELLS]
-    return sorted(counted, key=lambda pair: -pair.label_contradiction)
+def ranked_pairs(pairs: Iterable[PairMetrics], name: str) -> list[PairMetrics]:
+    """Return the pairs with at least MIN_COMPARED_CELLS cells for the share ``name``, the largest share first."""
+    counted = [pair for pair in pairs if getattr(pair, PAIR_SHARES[name]) >= MIN_COMPARED_CELLS]
+    return sorted(counted, key=lambda pair: -float(getattr(pair, name)))
 
 
 class PairTotals:
@@ -306,15 +312,22 @@ class PairTotals:
 
     @property
     def contradiction(self) -> float:
-        """Largest contradiction of a pair with enough occupied cells; NaN without such a pair."""
-        ranked = by_contradiction(self.pairs)
-        return ranked[0].contradiction if ranked else math.nan
+        """Largest contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("contradiction")
+
+    @property
+    def clear_contradiction(self) -> float:
+        """Largest clear contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("clear_contradiction")
 
     @property
     def label_contradiction(self) -> float:
-        """Largest label contradiction of a pair with enough cells that both call occupied; NaN without such a pair."""
-        ranked = by_label_contradiction(self.pairs)
-        return ranked[0].label_contradiction if ranked else math.nan
+        """Largest label contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("label_contradiction")
+
+    def _largest(self, name: str) -> float:
+        """Largest value of a share over the pairs with enough cells."""
+        return max((getattr(pair, name) for pair in ranked_pairs(self.pairs, name)), default=math.nan)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import MIN_COMPARED_CELLS, by_contradiction, by_label_contradiction
+from octoreplay.records import MIN_COMPARED_CELLS, ranked_pairs
 from reference.contradiction import cell_states, pair_metrics
 from support.long_suite import examples
 from support.octree_factory import cube, octree_of
@@ -39,6 +39,22 @@ def test_pair_by_hand():
     # The first calls cells 0, 1 and 3 occupied, of which the second frees 1; the second 0, 2 and 3.
     assert (pair.contradiction_of_first, pair.contradiction_of_second) == (1 / 3, 1 / 3)
     assert (pair.both_occupied_cells, pair.label_contradiction) == (2, 0.5)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("distance", "is_clear"), [(-2, True), (-1, False), (1, False), (2, True)])
+def test_a_contradiction_is_clear_without_an_occupied_cell_beside_it(axis, distance, is_clear):
+    for start in range(-4, 5):
+        hit, beside = [0, 0, 0], [0, 0, 0]
+        hit[axis], beside[axis] = start, start + distance
+        (pair,) = compare({tuple(hit): GROUND}, {tuple(hit): FREE, tuple(beside): GROUND})
+        assert (pair.contradiction, pair.clear_contradiction) == (1.0, float(is_clear))
+
+
+def test_cells_at_the_end_of_the_key_space_have_fewer_neighbours():
+    low, high = -(1 << 18), (1 << 18) - 1
+    (pair,) = compare({(low, low, low): GROUND}, {(low, low, low): FREE, (high, low, low): GROUND})
+    assert pair.clear_contradiction == 1.0
 
 
 def test_directions_differ_where_one_robot_frees_what_the_other_hits():
@@ -73,10 +89,10 @@ def test_the_teams_number_counts_pairs_with_enough_cells():
     (small,) = compare(cube((0, 0, 0), 4, GROUND), cube((0, 0, 0), 4, FREE))
     (large,) = compare(cube((0, 0, 0), 8, GROUND), cube((0, 0, 0), 8, TREE))
     assert small.occupied_cells < MIN_COMPARED_CELLS <= large.occupied_cells
-    assert by_contradiction([small, large]) == [large]
+    assert ranked_pairs([small, large], "contradiction") == [large]
     worse = dataclasses.replace(large, contradiction=0.5)
-    assert by_contradiction([large, worse]) == [worse, large]
-    assert by_label_contradiction([small, worse]) == [worse]
+    assert ranked_pairs([large, worse], "contradiction") == [worse, large]
+    assert ranked_pairs([small, worse], "label_contradiction") == [worse]
 
 
 cells_of_robots = st.integers(1, 12).flatmap(
@@ -84,7 +100,7 @@ cells_of_robots = st.integers(1, 12).flatmap(
         st.just(num_classes),
         st.lists(
             st.dictionaries(
-                st.tuples(st.integers(-3, 5), st.integers(0, 3), st.integers(0, 1)),
+                st.tuples(st.integers(-3, 5), st.integers(-1, 4), st.integers(-2, 1)),
                 st.lists(
                     st.sampled_from([-5.0, -0.6, float(np.float32(-0.3)), -0.2, 0.0, 0.4, 0.5, 1.0, 5.0]),
                     min_size=num_classes, max_size=num_classes,
@@ -98,7 +114,7 @@ cells_of_robots = st.integers(1, 12).flatmap(
 
 
 def dense(evidence, num_classes):
-    """The evidence as (N, M, C) and the known cells as (N, M)."""
+    """The evidence as (N, M, C), the known cells as (N, M) and the keys (M, 3)."""
     keys = sorted(set().union(*evidence))
     values, known = (
         np.zeros((len(evidence), len(keys), num_classes), np.float32),
@@ -108,7 +124,7 @@ def dense(evidence, num_classes):
         for index, key in enumerate(keys):
             if key in cells:
                 values[robot, index], known[robot, index] = cells[key], True
-    return values, known
+    return values, known, np.array(keys, np.int64).reshape(-1, 3)
 
 
 def same(found, expected):
@@ -120,8 +136,9 @@ def same(found, expected):
 @given(cells_of_robots)
 def test_random_evidence_as_the_twin(team):
     num_classes, evidence = team
-    states = cell_states(*dense(evidence, num_classes), OCCUPIED_FROM, FREE_TO)
-    expected = pair_metrics([f"robot_{index}" for index in range(len(evidence))], states)
+    values, known, keys = dense(evidence, num_classes)
+    states = cell_states(values, known, OCCUPIED_FROM, FREE_TO)
+    expected = pair_metrics([f"robot_{index}" for index in range(len(evidence))], states, keys)
     assert same(compare(*evidence, num_classes=num_classes), expected)
 
 

@@ -16,12 +16,10 @@ from octoreplay.errors import ConfigError, suggestion
 from octoreplay.records import (
     CONVERGED,
     MIN_COMPARED_CELLS,
-    PairMetrics,
     RobotMetrics,
     RunSummary,
     TickMetrics,
-    by_contradiction,
-    by_label_contradiction,
+    ranked_pairs,
 )
 
 if TYPE_CHECKING:
@@ -248,13 +246,11 @@ def _team_value(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     return lambda checked: [Measurement(getattr(checked.summary.last, name), seconds=checked.end)]
 
 
-def _pair_values(
-    name: str, ranked: Callable[[Iterable[PairMetrics]], list[PairMetrics]]
-) -> Callable[[_CheckedResult], Iterable[Measurement]]:
+def _pair_values(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a field of PairMetrics in the last tick, of the pairs with enough cells."""
 
     def measure(checked: _CheckedResult) -> Iterable[Measurement]:
-        for pair in ranked(checked.summary.last.pairs):
+        for pair in ranked_pairs(checked.summary.last.pairs, name):
             yield Measurement(getattr(pair, name), seconds=checked.end, pair=f"{pair.first} and {pair.second}")
 
     return measure
@@ -350,10 +346,13 @@ QUANTITIES = (
     Quantity("contradiction", ("max",),
              f"share of the cells that one robot calls occupied and the other free, of the pair with the largest share"
              f" at the end; pairs with at least {MIN_COMPARED_CELLS} such cells",
-             _pair_values("contradiction", by_contradiction), is_share=True, absent=_NO_PAIR),
+             _pair_values("contradiction"), is_share=True, absent=_NO_PAIR),
+    Quantity("clear_contradiction", ("max",),
+             "the same without the free cells that have an occupied cell of the same robot beside them",
+             _pair_values("clear_contradiction"), is_share=True, absent=_NO_PAIR),
     Quantity("label_contradiction", ("max",),
              "share with different labels of the cells that two robots call occupied, likewise",
-             _pair_values("label_contradiction", by_label_contradiction), is_share=True, absent=_NO_PAIR),
+             _pair_values("label_contradiction"), is_share=True, absent=_NO_PAIR),
     Quantity("entropy_bits", ("max",), "mean entropy of a known cell [bits], worst robot at the end",
              _robot_values("entropy_bits")),
     Quantity("num_leaves", ("max", "min"), "leaves of the largest (max) or the smallest (min) map at the end",

@@ -12,10 +12,10 @@ import numpy as np
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt64Array
+from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt8Array, UInt64Array, ranked_pairs
 
-CONTRADICTION_LIMIT = 0.35
-"""Contradiction above which a pair's frames are reported as wrong (measured in benchmarks/contradiction.py)."""
+CLEAR_LIMIT, LABEL_LIMIT = 0.06, 0.15
+"""Clear contradiction and label contradiction of a pair above which a run warns (docs/metrics.md has the measurement)."""
 
 
 def state_limits(sensor: SensorConfig) -> tuple[np.float32, np.float32]:
@@ -25,6 +25,11 @@ def state_limits(sensor: SensorConfig) -> tuple[np.float32, np.float32]:
     miss makes it free.
     """
     return np.float32(min(sensor.hit / 2, sensor.clamp_max)), np.float32(max(sensor.miss, sensor.clamp_min))
+
+
+def contradicting_pairs(pairs: Sequence[PairMetrics]) -> list[PairMetrics]:
+    """Return the pairs of which the clear contradiction is above CLEAR_LIMIT, the largest first."""
+    return [pair for pair in ranked_pairs(pairs, "clear_contradiction") if pair.clear_contradiction > CLEAR_LIMIT]
 
 
 class EvidenceComparer:
@@ -47,7 +52,8 @@ class EvidenceComparer:
         # A brick's index in this octree is its row in the slots.
         self._bricks = SemanticOctree(1.0, 1)
         self._slots: Int32Array = np.empty((0, num_robots), np.int32)
-        self._states: UInt64Array = np.empty((0, self._num_masks), np.uint64)
+        self._counted: UInt64Array = np.empty((0, self._num_masks), np.uint64)
+        self._latest = self._counted
         self._num_slots = 0
         self._counts: Int64Array = np.zeros((num_robots, num_robots, kernels.NUM_COUNTS), np.int64)
 
@@ -64,27 +70,37 @@ class EvidenceComparer:
         rows = [self._bricks.find_or_add(octree.codes[new]) for octree, new in zip(evidence, changed, strict=True)]
         self._add_slots(rows)
 
-        def classify(octree: SemanticOctree, indices: Int64Array) -> UInt64Array:
-            states = np.empty((indices.size, self._num_masks), np.uint64)
-            kernels.classify_bricks(octree.bricks, indices, *self._limits, self._num_classes, states)
-            return states
+        def refresh(robot: int) -> UInt8Array:
+            return self._refresh(robot, evidence[robot], changed[robot], rows[robot])
 
-        new_states = (map if threads is None else threads.map)(classify, evidence, changed)
-        for robot, (own_rows, states) in enumerate(zip(rows, new_states, strict=True)):
-            kernels.update_counts(self._slots, self._states, robot, own_rows, states, self._counts)
+        marks = (map if threads is None else threads.map)(refresh, range(len(evidence)))
+        for robot, stale in enumerate(marks):
+            kernels.update_counts(self._slots, self._counted, self._latest, robot, stale, self._counts)
         return self._pairs()
 
     def _add_slots(self, rows: Sequence[Int64Array]) -> None:
         """Add a slot with an unknown state where a robot has a brick for the first time."""
         num_rows = self._bricks.num_bricks
         if num_rows > len(self._slots):
-            self._slots = np.concatenate([self._slots, _new_rows(self._slots, num_rows, -1)])
+            self._slots = _with_rows(self._slots, num_rows, -1)
         for robot, own_rows in enumerate(rows):
             fresh = own_rows[self._slots[own_rows, robot] < 0]
             self._slots[fresh, robot] = np.arange(self._num_slots, self._num_slots + fresh.size)
             self._num_slots += fresh.size
-        if self._num_slots > len(self._states):
-            self._states = np.concatenate([self._states, _new_rows(self._states, self._num_slots, 0)])
+        if self._num_slots > len(self._counted):
+            self._counted = _with_rows(self._counted, self._num_slots, 0)
+            self._latest = _with_rows(self._latest, len(self._counted), 0)
+
+    def _refresh(self, robot: int, octree: SemanticOctree, indices: Int64Array, rows: Int64Array) -> UInt8Array:
+        """Update the latest states of a robot's bricks; returns the marks of the rows whose state changed."""
+        team, neighbours = self._bricks.bricks, np.empty((3, 3, 3), np.int64)
+        marks = np.zeros(self._bricks.num_bricks, np.uint8)
+        kernels.classify_bricks(
+            octree.bricks, indices, self._slots[rows, robot], *self._limits, self._num_classes, self._latest
+        )
+        kernels.mark_stale(team, self._slots, self._counted, self._latest, robot, rows, neighbours, marks)
+        kernels.update_near(team, self._slots, self._latest, robot, marks, neighbours, np.empty((3, 3, 3), np.uint64))
+        return marks
 
     def _pairs(self) -> tuple[PairMetrics, ...]:
         """Metrics of the pairs with known cells in common."""
@@ -93,14 +109,16 @@ class EvidenceComparer:
 
     def _pair(self, i: int, j: int) -> PairMetrics:
         """Metrics of the robots i < j."""
-        overlap, first_free, both, other_label = self._counts[i, j].tolist()
-        second_free = int(self._counts[j, i, kernels.OCCUPIED_FREE])
+        overlap, first_free, first_clear, both, other_label = self._counts[i, j].tolist()
+        _, second_free, second_clear, _, _ = self._counts[j, i].tolist()
+        occupied = first_free + second_free + both
         return PairMetrics(
             first=self._robot_ids[i],
             second=self._robot_ids[j],
             overlap_cells=overlap,
-            occupied_cells=first_free + second_free + both,
-            contradiction=_share(first_free + second_free, first_free + second_free + both),
+            occupied_cells=occupied,
+            contradiction=_share(first_free + second_free, occupied),
+            clear_contradiction=_share(first_clear + second_clear, occupied),
             contradiction_of_first=_share(first_free, first_free + both),
             contradiction_of_second=_share(second_free, second_free + both),
             both_occupied_cells=both,
@@ -113,6 +131,8 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else math.nan
 
 
-def _new_rows(array: ArrayT, wanted: int, value: int) -> ArrayT:
-    """Rows of ``value`` that bring an array to at least ``wanted`` rows, and to at least twice its size."""
-    return cast("ArrayT", np.full((max(wanted - len(array), len(array), 64), array.shape[1]), value, array.dtype))
+def _with_rows(array: ArrayT, wanted: int, value: int) -> ArrayT:
+    """Copy an array into one of at least ``wanted`` rows; the new rows hold ``value``."""
+    larger = np.full((max(wanted, 2 * len(array), 64), array.shape[1]), value, array.dtype)
+    larger[: len(array)] = array
+    return cast("ArrayT", larger)

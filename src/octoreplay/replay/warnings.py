@@ -8,8 +8,8 @@ from pathlib import Path
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.mapping.contradiction import CONTRADICTION_LIMIT
-from octoreplay.records import PairMetrics, by_contradiction
+from octoreplay.mapping.contradiction import LABEL_LIMIT, contradicting_pairs
+from octoreplay.records import PairMetrics, ranked_pairs
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -78,17 +78,21 @@ def frame_warnings(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> tu
     ``robot_ids`` are the robots with evidence, ``pairs`` those of them that share known cells.
     """
     sentences = []
-    bad = [pair for pair in by_contradiction(pairs) if pair.contradiction > CONTRADICTION_LIMIT]
-    if bad:
-        worst, others = bad[0], ""
-        if len(bad) > 1:
-            common = set.intersection(*({pair.first, pair.second} for pair in bad))
-            ends = f", all with {common.pop()}," if common else ""
-            plural = "pairs" if len(bad) > 2 else "pair"
-            others = f", and {len(bad) - 1} more {plural}{ends} in more than {100 * CONTRADICTION_LIMIT:.0f} %"
+    clear = contradicting_pairs(pairs)
+    if clear:
+        worst = clear[0]
         sentences.append(
             f"{worst.first} and {worst.second} contradict each other in {100 * worst.contradiction:.0f} % of the"
-            f" {worst.occupied_cells:,} occupied cells that both know{others}: try `octoreplay align`"
+            f" {worst.occupied_cells:,} occupied cells that both know, {100 * worst.clear_contradiction:.0f} % by more"
+            f" than a cell{_others(clear)}: try `octoreplay align`"
+        )
+    labels = [pair for pair in ranked_pairs(pairs, "label_contradiction") if pair.label_contradiction > LABEL_LIMIT]
+    if labels:
+        worst = labels[0]
+        sentences.append(
+            f"{worst.first} and {worst.second} have different labels in {100 * worst.label_contradiction:.0f} % of the"
+            f" {worst.both_occupied_cells:,} cells that both call occupied{_others(labels)}: compare their labels, or"
+            " try `octoreplay align`"
         )
     groups = _groups_with_common_space(pairs, robot_ids)
     if len(groups) > 1:
@@ -102,6 +106,15 @@ def frame_warnings(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> tu
             sentence = f"the robots are in {len(groups)} groups that share no known space ({names})"
         sentences.append(f"{sentence}: nothing to agree on between them; check the poses and T_team_map")
     return tuple(sentences)
+
+
+def _others(pairs: Sequence[PairMetrics]) -> str:
+    """Clause on the pairs after the first one."""
+    if len(pairs) < 2:
+        return ""
+    common = set.intersection(*({pair.first, pair.second} for pair in pairs))
+    names = f", all with {common.pop()}" if common else ""
+    return f" ({len(pairs) - 1} more {'pairs' if len(pairs) > 2 else 'pair'}{names})"
 
 
 def _groups_with_common_space(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> list[list[str]]:

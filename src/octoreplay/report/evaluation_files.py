@@ -11,9 +11,9 @@ from typing import Any
 
 from octoreplay.evaluate.records import MAP_SCORES, SCORES, EvaluatedTick, Evaluation, MapScores
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, PAIR_SHARES
 
-_TICK_COLUMNS = ("label_disagreement", "contradiction", "label_contradiction")
+_TICK_COLUMNS = ("label_disagreement", *PAIR_SHARES)
 """Scores of the team in every row of the CSV."""
 
 OVER_ROBOTS: dict[str, Callable[[Sequence[float]], float]] = {
@@ -58,8 +58,7 @@ def evaluation_json(evaluation: Evaluation) -> str:
     ticks = [
         {
             **vars(tick),
-            "contradiction": tick.contradiction,
-            "label_contradiction": tick.label_contradiction,
+            **{name: getattr(tick, name) for name in PAIR_SHARES},
             "maps": [_map_fields(evaluation, scores) for scores in tick.maps],
             **{
                 kind: {**dict(zip(SCORES, numbers, strict=True)), "iou": iou}

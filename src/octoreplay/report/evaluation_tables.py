@@ -10,16 +10,15 @@ from rich.table import Table
 from rich.text import Text
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation
+from octoreplay.mapping.contradiction import contradicting_pairs
 from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import OVER_ROBOTS
 from octoreplay.report.tables import (
-    is_contradictory,
     number,
     pairs_table,
     share,
     styled_table,
-    worst_contradiction,
-    worst_label_contradiction,
+    worst_pair,
 )
 
 MAX_ROBOT_COLUMNS = 6
@@ -46,10 +45,11 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
         _title(f"Maps {final.seconds:.1f} s after the start, agreement with {_reference(evaluation)}"),
         _maps_table(final),
         f"cells with different labels: {share(final.label_disagreement)}",
-        f"contradiction of evidence, worst pair: {worst_contradiction(final.pairs)}",
-        f"label contradiction, worst pair: {worst_label_contradiction(final.pairs)}",
+        f"contradiction of evidence, worst pair: {worst_pair(final.pairs, 'contradiction')}",
+        f"contradiction by more than a cell: {worst_pair(final.pairs, 'clear_contradiction')}",
+        f"label contradiction: {worst_pair(final.pairs, 'label_contradiction')}",
     ]
-    if is_contradictory(final.pairs):
+    if contradicting_pairs(final.pairs):
         parts += ["", pairs_table(final.pairs)]
     if evaluation.truth is not None:
         parts += ["", _title(f"Against {evaluation.truth}"), _truth_table(final)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
-from octoreplay.records import TickMetrics
+from octoreplay.records import PAIR_SHARES, TickMetrics
 from octoreplay.report.contradiction_plots import contradiction_figure
 from octoreplay.report.figures import (
     BLUE,
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 _TEAM_COLUMNS = (
     "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
-    "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change", "contradiction",
-    "label_contradiction",
+    "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change",
+    *PAIR_SHARES,
 )  # fmt: skip
 _ROBOT_COLUMNS = (
     "active", "num_scans", "num_iterations", "agreement", "agreement_occupied", "num_leaves", "num_cells",
@@ -44,7 +44,7 @@ _LINK_COLUMNS = (
     "num_gaps", "num_damaged", "bytes_per_second",
 )  # fmt: skip
 _PAIR_COLUMNS = (
-    "overlap_cells", "occupied_cells", "contradiction", "contradiction_of_first", "contradiction_of_second",
+    "overlap_cells", "occupied_cells", "contradiction", "clear_contradiction", "contradiction_of_first", "contradiction_of_second",
     "both_occupied_cells", "label_contradiction",
 )  # fmt: skip
 

@@ -19,9 +19,10 @@ from rich.text import Text
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.mapping.contradiction import CONTRADICTION_LIMIT
+from octoreplay.mapping.contradiction import contradicting_pairs
 from octoreplay.records import (
     MIN_COMPARED_CELLS,
+    PAIR_SHARES,
     ClassTable,
     FrameCounts,
     LeafTable,
@@ -29,8 +30,7 @@ from octoreplay.records import (
     PairMetrics,
     RunSummary,
     TickMetrics,
-    by_contradiction,
-    by_label_contradiction,
+    ranked_pairs,
 )
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def instant(stamp_ns: int) -> str:
 def results(summary: RunSummary) -> RenderableType:
     """Return the results of a run as tables: team, robots, contradicting pairs, lossy links, frames not mapped."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
-    if is_contradictory(summary.last.pairs):
+    if contradicting_pairs(summary.last.pairs):
         parts.append(pairs_table(summary.last.pairs))
     if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
         parts.append(_links_table(summary.links))
@@ -102,44 +102,28 @@ def results(summary: RunSummary) -> RenderableType:
     return _spaced(parts)
 
 
-def worst_contradiction(pairs: Sequence[PairMetrics]) -> str:
-    """Return the largest contradiction with its number of cells and its pair; a dash without a pair that counts."""
-    ranked = by_contradiction(pairs)
+def worst_pair(pairs: Sequence[PairMetrics], name: str) -> str:
+    """Return the largest share ``name`` of a pair with its number of cells; a dash without a pair that counts."""
+    ranked = ranked_pairs(pairs, name)
     if not ranked:
-        return _absent(pairs)
-    worst = ranked[0]
-    cells = f"{worst.occupied_cells:,} occupied cells"
-    return f"{share(worst.contradiction)} of {cells}, {worst.first} and {worst.second}"
-
-
-def worst_label_contradiction(pairs: Sequence[PairMetrics]) -> str:
-    """Return the largest label contradiction with its number of cells and its pair; a dash without one that counts."""
-    ranked = by_label_contradiction(pairs)
-    if not ranked:
-        return _absent(pairs)
-    worst = ranked[0]
-    cells = f"{worst.both_occupied_cells:,} occupied cells"
-    return f"{share(worst.label_contradiction)} of {cells}, {worst.first} and {worst.second}"
-
-
-def is_contradictory(pairs: Sequence[PairMetrics]) -> bool:
-    """True where a pair that counts contradicts each other in more than CONTRADICTION_LIMIT of its cells."""
-    return any(pair.contradiction > CONTRADICTION_LIMIT for pair in by_contradiction(pairs))
+        return f"- (no pair shares {MIN_COMPARED_CELLS} occupied cells)" if pairs else "-"
+    pair = ranked[0]
+    num_cells = getattr(pair, PAIR_SHARES[name])
+    return f"{share(getattr(pair, name))} of {num_cells:,} occupied cells, {pair.first} and {pair.second}"
 
 
 def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
     """Return a table of the pairs that contradict each other most, and of how many pairs they are."""
-    ranked = by_contradiction(pairs)
+    ranked = ranked_pairs(pairs, "clear_contradiction")
     rows = ranked[:MAX_PAIRS]
     table = styled_table(f"Contradiction of evidence, {len(rows)} of {len(ranked)} pairs")
     table.add_column("pair", overflow="fold")
-    for name in ("cells that\nboth know", "occupied", "contradiction", "of the\nfirst", "of the\nsecond", "labels"):
+    for name in ("shared\ncells", "of these\noccupied", "contra-\ndiction", "more than\na cell", "other\nlabel"):
         table.add_column(name, justify="right", no_wrap=True)
     for pair in rows:
-        shares = (pair.contradiction, pair.contradiction_of_first, pair.contradiction_of_second)
         table.add_row(
-            f"{pair.first}, {pair.second}", f"{pair.overlap_cells:,}", f"{pair.occupied_cells:,}", *map(share, shares),
-            share(pair.label_contradiction),
+            f"{pair.first}, {pair.second}", f"{pair.overlap_cells:,}", f"{pair.occupied_cells:,}",
+            *(share(getattr(pair, name)) for name in PAIR_SHARES),
         )  # fmt: skip
     return table
 
@@ -286,8 +270,9 @@ def _team_table(summary: RunSummary) -> Table:
     worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
     if len(last.robots) > 1:
-        table.add_row("contradiction, worst pair", worst_contradiction(last.pairs))
-        table.add_row("label contradiction", worst_label_contradiction(last.pairs))
+        table.add_row("contradiction, worst pair", worst_pair(last.pairs, "contradiction"))
+        table.add_row("by more than a cell", worst_pair(last.pairs, "clear_contradiction"))
+        table.add_row("labels, worst pair", worst_pair(last.pairs, "label_contradiction"))
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
     grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
@@ -300,11 +285,6 @@ def _team_table(summary: RunSummary) -> Table:
         delivered = sum(link.num_delivered for link in summary.links) / num_sent
         table.add_row("packets", f"{num_sent:,} over {len(summary.links)} links, {share(delivered)} delivered")
     return table
-
-
-def _absent(pairs: Sequence[PairMetrics]) -> str:
-    """Text in place of a number that no pair has."""
-    return f"- (no pair shares {MIN_COMPARED_CELLS} occupied cells)" if pairs else "-"
 
 
 _AGREEMENTS = ("agreement", "agreement_occupied")

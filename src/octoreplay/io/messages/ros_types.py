@@ -79,9 +79,11 @@ float64 bytes_per_second
 string first
 string second
 uint64 overlap_cells
-# Cells that one calls occupied and the other occupied or free, and the share that the other calls free.
+# Cells that one calls occupied and the other occupied or free; the share that the other calls free, and the share
+# around which it has no occupied cell either.
 uint64 occupied_cells
 float64 contradiction
+float64 clear_contradiction
 float64 contradiction_of_first
 float64 contradiction_of_second
 # Cells that both call occupied, and the share with different labels.
@@ -94,6 +96,7 @@ std_msgs/Header header
 uint32 tick
 # The largest of a pair with enough cells.
 float64 contradiction
+float64 clear_contradiction
 float64 label_contradiction
 octoreplay_msgs/PairMetrics[] pairs
 """,

@@ -21,7 +21,7 @@ from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_f
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.records import PAIR_SHARES, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
 from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
@@ -168,7 +168,7 @@ class ResultWriter:
         type_name = "octoreplay_msgs/msg/Contradiction"
         value = message(
             type_name, header=header(metrics.stamp_ns, TEAM_FRAME), tick=metrics.tick,
-            contradiction=metrics.contradiction, label_contradiction=metrics.label_contradiction, pairs=pairs,
+            **{name: getattr(metrics, name) for name in PAIR_SHARES}, pairs=pairs,
         )  # fmt: skip
         self._writer.write(CONTRADICTION_TOPIC, type_name, value, metrics.stamp_ns)
 
