@@ -35,10 +35,10 @@ from octoreplay.simulate.team import SimulationConfig, simulate_team
 SENSOR = SensorConfig()
 SHIFTS = (0.3, 0.5, 1.0, 3.0)
 YAWS = (2.0, 5.0, 10.0, 45.0)
-WRONG = (
-    *((shift, 0.0) for shift in SHIFTS), *((0.0, yaw) for yaw in YAWS), (0.3, 5.0), (1.0, 10.0), (3.0, 45.0),
-)  # fmt: skip
+WRONG = (*((shift, 0.0) for shift in SHIFTS), *((0.0, yaw) for yaw in YAWS), (3.0, 45.0))
 """Wrong frames: shift [m] and yaw [degrees]."""
+NOISES = ((0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2))
+"""Share of wrong labels and standard deviation of the poses [m] of the villages' second runs."""
 NUM_DISPLACED = 2
 """Number of robots of each team that are displaced, one after the other."""
 COLUMNS = (
@@ -61,10 +61,9 @@ class Scene:
 
 
 def villages(seeds: Sequence[int], folder: Path) -> Iterator[Scene]:
-    """Simulated villages: each seed with 10 % label noise and exact poses, and one other noise in turn."""
-    others = itertools.cycle([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2)])
-    for seed, other in zip(seeds, others, strict=False):
-        for label_noise, pose_noise in ((0.1, 0.0), other):
+    """Simulated villages: each seed with 10 % label noise and exact poses, and with one of the other noises."""
+    for seed in seeds:
+        for label_noise, pose_noise in ((0.1, 0.0), NOISES[seed % len(NOISES)]):
             name = f"village {seed}, labels {label_noise:g}, poses {pose_noise:g}"
             with tempfile.TemporaryDirectory(dir=folder) as logs:
                 config = SimulationConfig(

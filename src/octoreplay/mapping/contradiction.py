@@ -15,7 +15,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt8Array, UInt64Array, ranked_pairs
 
 CLEAR_LIMIT, LABEL_LIMIT = 0.06, 0.15
-"""Clear contradiction and label contradiction of a pair above which a run warns (docs/metrics.md has the measurement)."""
+"""Clear contradiction and label contradiction of a pair above which a run warns; docs/metrics.md has the source."""
 
 
 def state_limits(sensor: SensorConfig) -> tuple[np.float32, np.float32]:

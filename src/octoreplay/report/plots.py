@@ -44,7 +44,8 @@ _LINK_COLUMNS = (
     "num_gaps", "num_damaged", "bytes_per_second",
 )  # fmt: skip
 _PAIR_COLUMNS = (
-    "overlap_cells", "occupied_cells", "contradiction", "clear_contradiction", "contradiction_of_first", "contradiction_of_second",
+    "overlap_cells", "occupied_cells", "contradiction", "clear_contradiction", "contradiction_of_first",
+    "contradiction_of_second",
     "both_occupied_cells", "label_contradiction",
 )  # fmt: skip
 
