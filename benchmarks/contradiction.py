@@ -39,7 +39,7 @@ WRONG = (*((shift, 0.0) for shift in SHIFTS), *((0.0, yaw) for yaw in YAWS), (3.
 """Wrong frames: shift [m] and yaw [degrees]."""
 NOISES = ((0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2))
 """Share of wrong labels and standard deviation of the poses [m] of the villages' second runs."""
-NUM_DISPLACED = 2
+NUM_DISPLACED = 1
 """Number of robots of each team that are displaced, one after the other."""
 COLUMNS = (
     "scene", "kind", "resolution", "label_noise", "pose_noise", "seed", "displaced", "shift", "yaw",
