@@ -10,7 +10,13 @@ import pytest
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.evaluation import evaluate_result
-from octoreplay.mapping.contradiction import CLEAR_LIMIT, LABEL_LIMIT, EvidenceComparer, state_limits
+from octoreplay.mapping.contradiction import (
+    CLEAR_LIMIT,
+    CONTRADICTION_LIMIT,
+    LABEL_LIMIT,
+    EvidenceComparer,
+    state_limits,
+)
 from octoreplay.records import PairMetrics
 from octoreplay.replay.run import replay_team
 from octoreplay.replay.warnings import frame_warnings
@@ -20,6 +26,11 @@ from support.fixture_paths import PAIR_TEAM
 
 FORGETTING = (ScheduleEntry(5.0, 8.0, robots_off=("robot_1",), forget=True),)
 PAIR = PairMetrics("a", "b", 20_000, 12_400, 0.38, CLEAR_LIMIT + 0.1, 0.3, 0.2, 9_000, 0.02)
+
+
+def cells(robot_ids):
+    """Known cells of each robot, of which PAIR shares a fifth."""
+    return dict.fromkeys(robot_ids, 100_000)
 
 
 @pytest.mark.parametrize(
@@ -74,24 +85,30 @@ def test_evidence_is_stored_at_the_end_only_by_default(pair_result):
 
 
 def test_contradicting_robots_are_named_with_the_remedy():
-    (sentence,) = frame_warnings([PAIR], ["a", "b"])
+    (sentence,) = frame_warnings([PAIR], cells("ab"))
     assert sentence == (
         f"a and b contradict each other in 38 % of the 12,400 occupied cells that both know,"
-        f" {100 * PAIR.clear_contradiction:.0f} % by more than a cell: try `octoreplay align`"
+        f" clearly in {100 * PAIR.clear_contradiction:.0f} %: try `octoreplay align`"
     )
     others = [dataclasses.replace(PAIR, first="b", second=name, clear_contradiction=0.9) for name in "cde"]
-    (sentence,) = frame_warnings([PAIR, *others], list("abcde"))
+    (sentence,) = frame_warnings([PAIR, *others], cells("abcde"))
     assert sentence.startswith("b and c contradict")
-    assert "90 % by more than a cell (3 more pairs, all with b): try" in sentence
+    assert "clearly in 90 % (3 more pairs, all with b): try" in sentence
     apart = dataclasses.replace(PAIR, first="c", second="d")
     agreeing = dataclasses.replace(PAIR, second="c", clear_contradiction=0.0)
-    (sentence,) = frame_warnings([PAIR, apart, agreeing], list("abcd"))
+    (sentence,) = frame_warnings([PAIR, apart, agreeing], cells("abcd"))
     assert "(1 more pair): try" in sentence
+
+
+def test_robots_with_few_scans_contradict_each_other_without_firmly_free_cells():
+    pair = dataclasses.replace(PAIR, contradiction=CONTRADICTION_LIMIT + 0.1, clear_contradiction=0.0)
+    (sentence,) = frame_warnings([pair], cells("ab"))
+    assert "clearly in 0 %" in sentence
 
 
 def test_robots_with_other_labels_are_named():
     pair = dataclasses.replace(PAIR, clear_contradiction=0.0, label_contradiction=LABEL_LIMIT + 0.1)
-    (sentence,) = frame_warnings([pair], ["a", "b"])
+    (sentence,) = frame_warnings([pair], cells("ab"))
     share = f"{100 * pair.label_contradiction:.0f} %"
     assert sentence.startswith(f"a and b have different labels in {share} of the 9,000 cells that both call occupied: ")
 
@@ -99,14 +116,14 @@ def test_robots_with_other_labels_are_named():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"clear_contradiction": CLEAR_LIMIT},
+        {"contradiction": CONTRADICTION_LIMIT, "clear_contradiction": CLEAR_LIMIT},
         {"occupied_cells": 499},
         {"clear_contradiction": 0.0, "label_contradiction": LABEL_LIMIT},
         {"clear_contradiction": 0.0, "label_contradiction": 1.0, "both_occupied_cells": 499},
     ],
 )
 def test_no_warning_up_to_the_limits_and_for_few_cells(changes):
-    assert frame_warnings([dataclasses.replace(PAIR, **changes)], ["a", "b"]) == ()
+    assert frame_warnings([dataclasses.replace(PAIR, **changes)], cells("ab")) == ()
 
 
 def shared(*pairs):
@@ -126,13 +143,21 @@ def shared(*pairs):
     ],
 )
 def test_robots_without_common_space_are_named_in_one_sentence(pairs, ids, beginning):
-    (sentence,) = frame_warnings(shared(*pairs), list(ids))
+    (sentence,) = frame_warnings(shared(*pairs), cells(ids))
     assert sentence.startswith(beginning)
+
+
+@pytest.mark.parametrize(("overlap", "occupied", "warns"), [(4999, 499, True), (5000, 499, False), (4999, 500, False)])
+def test_robots_that_share_too_little_space_are_named(overlap, occupied, warns):
+    pair = dataclasses.replace(PAIR, overlap_cells=overlap, occupied_cells=occupied, clear_contradiction=0.0)
+    sentences = frame_warnings([pair], cells("ab"))
+    beginning = "a and b share hardly any known space (at most 4,999 cells): little to agree on"
+    assert [sentence.startswith(beginning) for sentence in sentences] == [True] * warns
 
 
 @pytest.mark.parametrize(("pairs", "ids"), [([], ""), ([], "a"), (["ab"], "ab"), (["ab", "bc"], "abc")])
 def test_robots_that_share_space_give_no_warning(pairs, ids):
-    assert frame_warnings(shared(*pairs), list(ids)) == ()
+    assert frame_warnings(shared(*pairs), cells(ids)) == ()
 
 
 def test_a_wrong_frame_is_reported_by_run_and_evaluation(tmp_path):
