@@ -29,7 +29,6 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.contradiction import (
     CLEAR_LIMIT,
-    CONTRADICTION_LIMIT,
     LABEL_LIMIT,
     EvidenceComparer,
     state_limits,
@@ -46,7 +45,7 @@ WRONG = (*((shift, 0.0) for shift in SHIFTS), *((0.0, yaw) for yaw in YAWS), (3.
 """Wrong frames: shift [m] and yaw [degrees]."""
 NOISES = ((0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2))
 """Share of wrong labels and standard deviation of the poses [m] of the villages' second runs."""
-LIMITS = dict(zip(PAIR_SHARES, (CONTRADICTION_LIMIT, CLEAR_LIMIT, LABEL_LIMIT), strict=True))
+LIMITS = {"clear_contradiction": CLEAR_LIMIT, "label_contradiction": LABEL_LIMIT}
 """Limits of the warnings by share."""
 NUM_DISPLACED = 1
 """Number of robots of each team that are displaced, one after the other."""

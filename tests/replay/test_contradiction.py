@@ -100,12 +100,6 @@ def test_contradicting_robots_are_named_with_the_remedy():
     assert "(1 more pair): try" in sentence
 
 
-def test_robots_with_few_scans_contradict_each_other_without_firmly_free_cells():
-    pair = dataclasses.replace(PAIR, contradiction=CONTRADICTION_LIMIT + 0.1, clear_contradiction=0.0)
-    (sentence,) = frame_warnings([pair], cells("ab"))
-    assert "clearly in 0 %" in sentence
-
-
 def test_robots_with_other_labels_are_named():
     pair = dataclasses.replace(PAIR, clear_contradiction=0.0, label_contradiction=LABEL_LIMIT + 0.1)
     (sentence,) = frame_warnings([pair], cells("ab"))
@@ -116,7 +110,7 @@ def test_robots_with_other_labels_are_named():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"contradiction": CONTRADICTION_LIMIT, "clear_contradiction": CLEAR_LIMIT},
+        {"contradiction": 1.0, "clear_contradiction": CLEAR_LIMIT},
         {"occupied_cells": 499},
         {"clear_contradiction": 0.0, "label_contradiction": LABEL_LIMIT},
         {"clear_contradiction": 0.0, "label_contradiction": 1.0, "both_occupied_cells": 499},

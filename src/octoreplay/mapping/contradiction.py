@@ -14,8 +14,8 @@ from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt8Array, UInt64Array, ranked_pairs
 
-CONTRADICTION_LIMIT, CLEAR_LIMIT, LABEL_LIMIT = 0.7, 0.035, 0.25
-"""Contradiction, clear contradiction and label contradiction of a pair above which a run warns.
+CLEAR_LIMIT, LABEL_LIMIT = 0.035, 0.25
+"""Clear contradiction and label contradiction of a pair above which a run warns.
 
 They lie between the values of right frames and those of wrong ones (benchmarks/contradiction.py, docs/metrics.md).
 """
@@ -51,12 +51,8 @@ def state_limits(sensor: SensorConfig) -> StateLimits:
 
 
 def contradicting_pairs(pairs: Sequence[PairMetrics]) -> list[PairMetrics]:
-    """Return the pairs whose contradiction or clear contradiction is above its limit, the largest excess first."""
-
-    def excess(pair: PairMetrics) -> float:
-        return max(pair.contradiction / CONTRADICTION_LIMIT, pair.clear_contradiction / CLEAR_LIMIT)
-
-    return sorted((pair for pair in ranked_pairs(pairs, "contradiction") if excess(pair) > 1), key=excess, reverse=True)
+    """Return the pairs whose clear contradiction is above CLEAR_LIMIT, the largest first."""
+    return [pair for pair in ranked_pairs(pairs, "clear_contradiction") if pair.clear_contradiction > CLEAR_LIMIT]
 
 
 class EvidenceComparer:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from octoreplay.mapping.contradiction import CLEAR_LIMIT, CONTRADICTION_LIMIT, LABEL_LIMIT
+from octoreplay.mapping.contradiction import CLEAR_LIMIT, LABEL_LIMIT
 from octoreplay.records import TickMetrics, ranked_pairs
 from octoreplay.report.figures import COLORS, GREY, new_figure, style
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 MAX_COLORED = 5
 """Number of pairs with a colour and a name of their own; the others are grey."""
-_PANELS: Mapping[str, tuple[str, float]] = {
-    "contradiction": ("occupied / free", CONTRADICTION_LIMIT),
+_PANELS: Mapping[str, tuple[str, float | None]] = {
+    "contradiction": ("occupied / free", None),
     "clear_contradiction": ("clearly", CLEAR_LIMIT),
     "label_contradiction": ("other label", LABEL_LIMIT),
 }
@@ -44,7 +44,8 @@ def contradiction_figure(metrics: Sequence[TickMetrics], times: Any) -> Figure:
     for panel, (name, (y_label, limit)) in zip(axes, _PANELS.items(), strict=True):
         style(panel, y_label=y_label)
         _draw(panel, times, curves[name], worst)
-        panel.axhline(100 * limit, color="#222222", linewidth=0.8, linestyle="--", label="limit of the warning")
+        if limit is not None:
+            panel.axhline(100 * limit, color="#222222", linewidth=0.8, linestyle="--", label="limit of the warning")
     axes[0].set_title("Contradiction of evidence, share of the cells [%]", loc="left", fontsize=11)
     axes[-1].set_xlabel("log time [s]")
     handles = {
