@@ -12,7 +12,6 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.evaluation import evaluate_result
 from octoreplay.mapping.contradiction import (
     CLEAR_LIMIT,
-    CONTRADICTION_LIMIT,
     LABEL_LIMIT,
     EvidenceComparer,
     state_limits,
