@@ -89,6 +89,11 @@ def transform_of(numbers: Sequence[float]) -> Float64Array:
     return pose_matrix(numbers[:3], quaternion)
 
 
+def numbers_of(transform: Float64Array) -> tuple[float, ...]:
+    """Return the seven numbers x, y, z, qx, qy, qz, qw of a rigid transform (4, 4); inverse of ``transform_of``."""
+    return (*transform[:3, 3].tolist(), *rotation_to_quaternion(transform[:3, :3]))
+
+
 def rotation_to_quaternion(rotation: npt.ArrayLike) -> Quaternion:
     """Return the quaternion (x, y, z, w), w >= 0, of a rotation matrix (3, 3).
 

@@ -90,16 +90,21 @@ def run(
               help="factor on the noise of a depth camera, whose standard deviation grows with depth")  # fmt: skip
 @click.option("--pose-noise", type=float, default=0.0, show_default=True,
               help="standard deviation of the recorded poses' error, correlated over ten seconds [m]")  # fmt: skip
+@click.option("--odometry-drift", default="0,0", show_default=True, metavar="PERCENT,DEGREES",
+              help="drift of the recorded poses: of the way [%], of the heading per 10 m [degrees]")  # fmt: skip
+@click.option("--own-frames", is_flag=True,
+              help="record each robot's poses in an odometry frame of its own")  # fmt: skip
 @click.option("--kinds-per-class", type=int, default=1, show_default=True,
               help="divide each of the eight classes into this many classes")  # fmt: skip
 @click.option("--world-size", type=float, default=70.0, show_default=True, help="edge length of the square village [m]")
-def simulate(folder: Path, robots: int, image: str, **options: Any) -> int:
+def simulate(folder: Path, robots: int, image: str, odometry_drift: str, **options: Any) -> int:
     """Simulate a team that explores a village and write its logs into DIR.
 
-    Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply). Equal options give equal
-    bytes.
+    Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply; with own frames or drift
+    also frames.yaml and truth/ROBOT.tum). Equal options give equal bytes.
     """
-    team_file = simulate_with_bar(folder, {"num_robots": robots, "image": _image_size(image), **options})
+    values = {"num_robots": robots, "image": _image_size(image), "odometry_drift": _drift(odometry_drift)}
+    team_file = simulate_with_bar(folder, {**values, **options})
     click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
     return 0
 
@@ -152,3 +157,12 @@ def _image_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise ConfigError(f"image: expects WIDTHxHEIGHT such as 160x120, got '{text}'")
     return int(width), int(height)
+
+
+def _drift(text: str) -> tuple[float, float]:
+    """Percent and degrees of a text PERCENT,DEGREES."""
+    try:
+        percent, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"odometry_drift: expects PERCENT,DEGREES such as 1,0.5, got '{text}'") from None
+    return percent, degrees

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any
 
@@ -55,6 +55,17 @@ def check_ranges(config: Any) -> None:
             raise ConfigError(f"{item.name}: {value} must be greater than {meta['above']:g}")
         if isinstance(value, float) and meta["above"] == 0.0 and value < SMALLEST:
             raise ConfigError(f"{item.name}: {value:g} is below the least value {SMALLEST:g}")
+
+
+def transform_problem(name: str, numbers: Sequence[float]) -> str | None:
+    """Return what is wrong with a transform x, y, z, qx, qy, qz, qw called ``name``; None if nothing is."""
+    if len(numbers) != 7:
+        return f"{name} expects 7 numbers x, y, z, qx, qy, qz, qw"
+    if not all(math.isfinite(number) for number in numbers):
+        return f"{name} must be finite, not {tuple(numbers)}"
+    if abs(math.hypot(*numbers[3:]) - 1.0) > 1e-3:
+        return f"{name}'s quaternion must have length 1"
+    return None
 
 
 def is_number(value: Any) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from octoreplay.config.fields import LARGEST, help_text
+from octoreplay.config.fields import LARGEST, help_text, transform_problem
 from octoreplay.errors import ConfigError
 from octoreplay.records import CENTRAL
 
@@ -131,10 +131,9 @@ class RobotConfig:
         """Problems of transforms, intrinsics and the body box."""
         for name in ("T_team_map", "T_body_sensor"):
             value = getattr(self, name)
-            if value is not None and len(value) != 7:
-                yield f"{name} expects 7 numbers x, y, z, qx, qy, qz, qw"
-            elif value is not None and abs(math.hypot(*value[3:]) - 1.0) > 1e-3:
-                yield f"{name}'s quaternion must have length 1"
+            problem = None if value is None else transform_problem(name, value)
+            if problem is not None:
+                yield problem
         if self.intrinsics is not None and (len(self.intrinsics) != 4 or min(self.intrinsics[:2]) <= 0):
             yield "intrinsics expects 4 numbers fx, fy, cx, cy"
         box = self.body_box

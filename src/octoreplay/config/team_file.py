@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from octoreplay.config.network import LinkConfig, ScheduleEntry
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, coerced
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.config.yaml_file import load_yaml, read_text
+from octoreplay.config.yaml_file import dump_yaml, load_yaml, read_text
 from octoreplay.errors import ConfigError, suggestion
 
 _ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
@@ -201,16 +200,7 @@ def dump_team(config: RunConfig, folder: Path | None = None) -> str:
 
     Log paths below ``folder`` are written relative to it. ``parse_team`` returns the same configuration.
     """
-    from ruamel.yaml import YAML
-
-    buffer = io.StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    # The library's type annotation allows only None.
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    yaml.width = 110
-    yaml.dump(team_to_mapping(config, folder), buffer)
-    return buffer.getvalue()
+    return dump_yaml(team_to_mapping(config, folder))
 
 
 def team_to_mapping(config: RunConfig, folder: Path | None) -> dict[str, Any]:

@@ -1,7 +1,9 @@
-"""Reading of YAML files, with errors of one sentence."""
+"""Reading and writing of YAML files, with errors of one sentence."""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,3 +31,17 @@ def load_yaml(text: str, name: str) -> Any:
         line = getattr(getattr(error, "problem_mark", None), "line", None)
         where = "" if line is None else f" (line {line + 1})"
         raise ConfigError(f"{name}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from error
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """Return the text of a mapping as YAML in its own order of keys; the innermost lists and mappings take one line."""
+    from ruamel.yaml import YAML
+
+    buffer = io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    # The library's type annotation allows only None.
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.width = 110
+    yaml.dump(content, buffer)
+    return buffer.getvalue()

@@ -56,14 +56,18 @@ def explore(
     period: float,
     *,
     motion: Motion | None = None,
+    headings: Float64Array | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Exploration:
     """Drive a team through a world for ``num_steps`` states, ``period`` [s] apart.
 
-    The robots start on a ring around the origin, all heading along x, so that their first views overlap. The result is
-    deterministic; ties go to the lower index. ``progress`` is called with the finished share, 0 to 1.
+    The robots start on a ring around the origin with ``headings`` (N,) [rad]; by default all head along x, so that
+    their first views overlap. The result is deterministic; ties go to the lower index. ``progress`` is called with the
+    finished share, 0 to 1.
     """
     team = _Team(world, num_robots, num_steps, period, motion or Motion())
+    if headings is not None:
+        team.states[:, 0, 2] = headings
     for step in range(num_steps):
         team.observe(step)
         if step + 1 < num_steps:

@@ -9,18 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
+from octoreplay.config.frames_file import dump_frames
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.sensor import MapConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
-from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter, topics
-from octoreplay.records import CameraModel, ClassTable, Float64Array
+from octoreplay.io.datasets.pose_files import write_tum
+from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter, topics
+from octoreplay.records import CameraModel, ClassTable, Float64Array, Int64Array
 from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore
+from octoreplay.simulate.odometry import drift_corrections, own_frame
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import MAX_KINDS, Terrain, village_classes
 from octoreplay.simulate.world_files import write_ground_truth, write_mesh
+from octoreplay.transforms import inverse, numbers_of
 
 START_NS = 1_700_000_000_000_000_000
 """Stamp of a simulation's first message, constant so that equal settings give equal bytes."""
@@ -56,6 +60,11 @@ class SimulationConfig:
         Factor on the standard deviation of a depth camera's noise.
     pose_noise : float
         Standard deviation of the recorded x and y [m]; a tenth of it is that of the heading [rad].
+    odometry_drift : tuple of float
+        Drift of the recorded poses as in dead reckoning: position [% of the way], heading [degrees per 10 m of way].
+    own_frames : bool
+        True to record each robot's poses in a frame of its own, which starts at its first pose. The robots start with
+        random headings.
     kinds_per_class : int
         Number of classes that each of the eight classes is divided into.
     world_size : float
@@ -73,6 +82,8 @@ class SimulationConfig:
     label_noise: float = 0.1
     depth_noise: float = 1.0
     pose_noise: float = 0.0
+    odometry_drift: tuple[float, float] = (0.0, 0.0)
+    own_frames: bool = False
     kinds_per_class: int = 1
     world_size: float = 70.0
     max_depth: float = 20.0
@@ -89,6 +100,8 @@ class SimulationConfig:
             ("label_noise", self.label_noise, 0.0, 1.0),
             ("depth_noise", self.depth_noise, 0.0, 100.0),
             ("pose_noise", self.pose_noise, 0.0, 10.0),
+            ("odometry_drift in percent", self.odometry_drift[0], 0.0, 100.0),
+            ("odometry_drift in degrees per 10 m", self.odometry_drift[1], 0.0, 90.0),
             ("kinds_per_class", self.kinds_per_class, 1, MAX_KINDS),
             ("world_size", self.world_size, 20.0, 1000.0),
             ("max_depth", self.max_depth, 1.0, 65.0),
@@ -107,6 +120,11 @@ class SimulationConfig:
     def class_table(self) -> ClassTable:
         """Classes of the label images."""
         return village_classes(self.kinds_per_class)
+
+    @property
+    def has_pose_truth(self) -> bool:
+        """True if the true frames and trajectories are written, because the recorded ones differ from them."""
+        return self.own_frames or any(self.odometry_drift)
 
     @property
     def robot_ids(self) -> tuple[str, ...]:
@@ -131,6 +149,8 @@ def simulate_team(
 ) -> SimulationSummary:
     """Simulate a team and write one log per robot, ``team.yaml``, ``world.npz`` and ``world.ply`` into a folder.
 
+    With own frames or drift, ``frames.yaml`` holds the true T_team_map of each robot, from the frame of its recorded
+    poses to the village's (``load_frames_file``), and ``truth/ROBOT.tum`` its true poses in the village's frame.
     Equal settings give equal bytes. ``progress`` is called with the finished share, 0 to 1. Files get their names only
     when all of them are complete. Raises OutputError if the folder is not empty or cannot be written, InputError if
     Open3D cannot be loaded.
@@ -158,7 +178,7 @@ def simulate_team(
         tuple(folder / f"{robot_id}.mcap" for robot_id in config.robot_ids),
         num_frames,
         num_cells,
-        sum((folder / name).stat().st_size for name in names),
+        sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
     )
 
 
@@ -194,10 +214,12 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
         config.num_robots,
         schedule.num_poses,
         schedule.pose_period_ns / 1e9,
+        headings=_start_headings(config),
         progress=lambda share: progress(0.1 + 0.2 * share),
     )
     total = config.num_robots * len(schedule.exposures(0, config.num_robots))
     num_frames = 0
+    frames: dict[str, tuple[float, ...]] = {}
     for index, robot_id in enumerate(config.robot_ids):
         recorder = _Recorder(config, world.terrain, camera, drive, index, schedule)
         with RobotLogWriter(
@@ -207,12 +229,25 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
             config.class_table,
             T_body_sensor=T_BODY_CAMERA,
             start_ns=START_NS,
+            map_frame=f"{robot_id}/odom" if config.own_frames else MAP_FRAME,
         ) as log:
             for _ in recorder.record(log):
                 num_frames += 1
                 progress(min(1.0, 0.3 + 0.7 * num_frames / total))
+        if config.has_pose_truth:
+            frames[robot_id] = numbers_of(recorder.T_map_odom)
+            (work / "truth").mkdir(exist_ok=True)
+            write_tum(work / "truth" / f"{robot_id}.tum", schedule.stamps_ns, recorder.poses)
+    if config.has_pose_truth:
+        (work / "frames.yaml").write_text(dump_frames(frames), encoding="utf-8")
     (work / "team.yaml").write_text(dump_team(_team(work, config), work), encoding="utf-8")
     return num_frames, num_cells
+
+
+def _start_headings(config: SimulationConfig) -> Float64Array | None:
+    """Headings (N,) of the robots at the start; None for the default, in which own frames would not differ in yaw."""
+    rng = np.random.default_rng([config.seed, 6])
+    return rng.uniform(-np.pi, np.pi, config.num_robots) if config.own_frames else None
 
 
 def _team(folder: Path, config: SimulationConfig) -> RunConfig:
@@ -249,13 +284,22 @@ class _Schedule:
         pose_period_ns = round(1e9 / config.rate / stride)
         return cls(pose_period_ns, stride, max(2, round(config.duration * 1e9 / pose_period_ns) + 1))
 
+    @property
+    def stamps_ns(self) -> Int64Array:
+        """Stamps (T,) of the poses."""
+        return START_NS + self.pose_period_ns * np.arange(self.num_poses, dtype=np.int64)
+
     def exposures(self, robot_index: int, num_robots: int) -> range:
         """Indices of the poses after which a robot takes an image; they differ between robots, as for real cameras."""
         return range(robot_index * self.stride // num_robots, self.num_poses - 1, self.stride)
 
 
 class _Recorder:
-    """Writer of one robot's poses and images."""
+    """Writer of one robot's poses and images.
+
+    ``poses`` (T, 4, 4) are the true poses of the base in the village's frame; ``T_map_odom`` (4, 4) transforms from the
+    frame of the recorded poses to the village's.
+    """
 
     def __init__(
         self,
@@ -270,17 +314,25 @@ class _Recorder:
         self._camera = camera
         self._schedule = schedule
         self._states = drive.states[index]
-        self._poses = body_poses(terrain, self._states)
+        self.poses = body_poses(terrain, self._states)
         period, rng = schedule.pose_period_ns / 1e9, np.random.default_rng([config.seed, 3, index])
         errors = pose_errors(config.pose_noise, len(self._states), period, rng)
-        self._recorded = body_poses(terrain, self._states + errors)
+        recorded = body_poses(terrain, self._states + errors)
+        if any(config.odometry_drift):
+            rng = np.random.default_rng([config.seed, 4, index])
+            recorded = drift_corrections(self.poses, *config.odometry_drift, rng) @ recorded
+        self.T_map_odom = np.eye(4)
+        if config.own_frames:
+            self.T_map_odom = own_frame(self.poses[0], np.random.default_rng([config.seed, 5, index]))
+            recorded = inverse(self.T_map_odom) @ recorded
+        self._recorded = recorded
         self._exposures = schedule.exposures(index, config.num_robots)
         self._rng = np.random.default_rng([config.seed, 2, index])
 
     def record(self, log: RobotLogWriter) -> Iterator[int]:
         """Write all poses and images in the order of time; yield each image's stamp."""
         period_ns = self._schedule.pose_period_ns
-        for step, (state, T_map_body) in enumerate(zip(self._states, self._poses, strict=True)):
+        for step, (state, T_map_body) in enumerate(zip(self._states, self.poses, strict=True)):
             recorded = self._recorded[step]
             stamp_ns = START_NS + step * period_ns
             following = self._states[min(step + 1, len(self._states) - 1)]
@@ -288,7 +340,7 @@ class _Recorder:
             log.write_pose(stamp_ns, recorded, speed, float(following[2] - state[2]) * 1e9 / period_ns)
             if step in self._exposures:
                 # Exposed midway between two poses, so that readers have to interpolate.
-                T_map_camera = midway(T_map_body, self._poses[step + 1]) @ T_BODY_CAMERA
+                T_map_camera = midway(T_map_body, self.poses[step + 1]) @ T_BODY_CAMERA
                 self._write_image(log, stamp_ns + period_ns // 2, T_map_camera)
                 yield stamp_ns + period_ns // 2
 

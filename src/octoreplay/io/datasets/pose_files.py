@@ -7,16 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay.errors import InputError
 from octoreplay.io.robots.trajectories import Trajectory, read_rows, rigid, trajectory
+from octoreplay.io.text_files import write_whole
 from octoreplay.io.text_tables import floats, read_matrix, rows
 from octoreplay.records import Float64Array
-from octoreplay.transforms import inverse
+from octoreplay.transforms import inverse, numbers_of
 
 POSE_GAP_NS = 200_000_000
 """Largest time between two poses that are interpolated."""
@@ -92,6 +95,18 @@ def read_tum_track(path: Path) -> Trajectory:
     if found.stamps_ns is None:
         raise InputError(f"{path}: expects rows of a time, a position and a quaternion (TUM)")
     return trajectory(found.stamps_ns, found)
+
+
+def write_tum(path: Path, stamps_ns: npt.ArrayLike, poses: Float64Array) -> None:
+    """Write a trajectory as a TUM file: poses (T, 4, 4) float64 and their stamps (T,) int64 [ns].
+
+    ``read_tum_track`` returns the same stamps and positions; rotations become unit quaternions. Raises OutputError if
+    the file cannot be written.
+    """
+    lines = ["# time x y z qx qy qz qw\n"]
+    for stamp_ns, T in zip(np.asarray(stamps_ns, dtype=np.int64).tolist(), poses, strict=True):
+        lines.append(f"{Decimal(stamp_ns).scaleb(-9):f} {' '.join(map(repr, numbers_of(T)))}\n")
+    write_whole(path, "".join(lines))
 
 
 def track_reader(track: Trajectory, stamp_ns: int) -> PoseReader:

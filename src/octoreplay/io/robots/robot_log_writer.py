@@ -16,7 +16,7 @@ from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.transforms import rotation_to_quaternion
 
 MAP_FRAME = "map"
-"""Frame that the logs' poses are given in."""
+"""Default frame of the poses."""
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a forward looking optical frame (z forward, x right, y down) in a body (x forward, y left): REP 103."""
@@ -30,8 +30,8 @@ class RobotLogWriter:
 
     Topics of robot R: ``/R/camera/depth/image_raw`` (16UC1 in millimetres or 32FC1 in metres),
     ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16), ``/R/labels/label_info`` (once),
-    ``/R/odom``, ``/tf`` (map to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame). Without a
-    ``camera`` the log is a lidar's: ``/R/lidar/points`` in the frame R/lidar replaces the images.
+    ``/R/odom``, ``/tf`` (``map_frame`` to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame).
+    Without a ``camera`` the log is a lidar's: ``/R/lidar/points`` in the frame R/lidar replaces the images.
 
     ``class_table`` is None for a log without labels. ``T_body_sensor`` is (4, 4) float64, from the camera's optical
     frame, or the lidar's, to the base. ``start_ns`` is the stamp of messages that are written once, at the beginning.
@@ -47,11 +47,12 @@ class RobotLogWriter:
         *,
         T_body_sensor: Float64Array,
         start_ns: int,
+        map_frame: str = MAP_FRAME,
     ) -> None:
         self.path = path
         self._camera = camera
         self._depth_topic, self._label_topic, self._info_topic, self._pose_topic, label_info = topics(robot_id)
-        self._body_frame = f"{robot_id}/base_link"
+        self._map_frame, self._body_frame = map_frame, f"{robot_id}/base_link"
         self._cloud_topic = cloud_topic(robot_id)
         self._sensor_frame = f"{robot_id}/lidar" if camera is None else f"{robot_id}/camera_optical_frame"
         self._writer = RosMcapWriter(path)
@@ -71,7 +72,7 @@ class RobotLogWriter:
 
     def write_pose(self, stamp_ns: int, T_map_body: Float64Array, speed: float = 0.0, turn_rate: float = 0.0) -> None:
         """Append the base's pose, (4, 4) float64, as odometry and TF; ``speed`` in m/s, ``turn_rate`` in rad/s."""
-        self._write_transform("/tf", stamp_ns, MAP_FRAME, self._body_frame, T_map_body)
+        self._write_transform("/tf", stamp_ns, self._map_frame, self._body_frame, T_map_body)
         pose = message(
             "geometry_msgs/msg/Pose",
             position=_xyz("geometry_msgs/msg/Point", T_map_body[:3, 3]),
@@ -84,7 +85,7 @@ class RobotLogWriter:
         )
         odometry = message(
             "nav_msgs/msg/Odometry",
-            header=header(stamp_ns, MAP_FRAME),
+            header=header(stamp_ns, self._map_frame),
             child_frame_id=self._body_frame,
             pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
             twist=message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
