@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
@@ -28,8 +29,19 @@ INLIER_THRESHOLD = 16.81
 _MU_FACTOR = 1.4
 _MAX_ROUNDS = 60
 _MAX_STEPS = 50
-_CONVERGED = 1e-8
+_LEAST_DECREASE = 1e-9
 _MAX_DAMPING = 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class Bias:
+    """Dependence of a measurement on an unknown systematic error b: the measurement's error is ``jacobian`` b.
+
+    ``index`` is the systematic error's number, ``jacobian`` (6, k) float64.
+    """
+
+    index: int
+    jacobian: Float64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +50,7 @@ class PoseGraphEdge:
 
     ``first`` and ``second`` are indices of poses, ``T_first_second`` (4, 4) float64 maps the second pose's frame to the
     first's, and ``information`` (6, 6) float64 is the inverse covariance of the error. A trusted edge is never
-    rejected.
+    rejected. Edges with the same ``bias`` share a systematic error.
     """
 
     first: int
@@ -46,6 +58,7 @@ class PoseGraphEdge:
     T_first_second: Float64Array
     information: Float64Array
     is_trusted: bool = False
+    bias: Bias | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +75,16 @@ class PoseGraphSolution:
     """Solution of a pose graph.
 
     - ``poses`` (n, 4, 4) float64.
+    - ``biases`` (b, k) float64: systematic errors.
     - ``weights`` (m,) float64: weight of each edge, 0 for a rejected and 1 for an accepted edge.
     - ``squared_errors`` (m,) float64: squared Mahalanobis error of each edge.
     - ``components`` (n,) int64: number of the connected component of each pose, over the edges with a weight above 0.
-    - ``covariances`` (k, 6, 6) float64: marginal covariances of the chosen poses. Without a prior in a pose's
+    - ``covariances`` (c, 6, 6) float64: marginal covariances of the chosen poses. Without a prior in a pose's
       component, they are relative to the component's held pose.
     """
 
     poses: Float64Array
+    biases: Float64Array
     weights: Float64Array
     squared_errors: Float64Array
     components: Int64Array
@@ -81,6 +96,7 @@ def solve(
     edges: Sequence[PoseGraphEdge],
     priors: Sequence[PosePrior] = (),
     *,
+    bias_information: Float64Array | None = None,
     inlier_threshold: float = INLIER_THRESHOLD,
     covariances_of: Sequence[int] = (),
 ) -> PoseGraphSolution:
@@ -95,6 +111,8 @@ def solve(
         Initial poses in one frame.
     edges, priors : sequences
         Measurements. Information matrices are symmetric and positive semidefinite.
+    bias_information : (b, k, k) float64, optional
+        Inverse prior covariances of the systematic errors, whose means are 0.
     inlier_threshold : float
         Largest squared Mahalanobis error of an accepted edge.
     covariances_of : sequence of int
@@ -105,36 +123,51 @@ def solve(
     ValueError
         An edge or a prior names a pose that does not exist.
     """
-    graph = _Graph(len(initial), edges, priors)
-    poses, weights = _graduated(graph, np.array(initial, np.float64), inlier_threshold)
-    squared = graph.squared_errors(poses)
+    graph = _Graph(len(initial), edges, priors, bias_information)
+    state = _State(np.array(initial, np.float64), np.zeros(graph.bias_shape))
+    state, weights = _graduated(graph, state, inlier_threshold)
+    num_edges = len(edges)
     return PoseGraphSolution(
-        poses,
-        weights[: graph.num_edges],
-        squared[: graph.num_edges],
+        state.poses,
+        state.biases,
+        weights[:num_edges],
+        graph.squared_errors(state)[:num_edges],
         graph.components(weights),
-        graph.covariances(poses, weights, covariances_of),
+        graph.covariances(state, weights, covariances_of),
     )
 
 
-def _graduated(graph: _Graph, poses: Float64Array, threshold: float) -> tuple[Float64Array, Float64Array]:
-    """Poses and weights by graduated non-convexity: the surrogate cost is convex at first, the truncated one at last."""
+class _State(NamedTuple):
+    """Unknowns: poses (n, 4, 4) and systematic errors (b, k)."""
+
+    poses: Float64Array
+    biases: Float64Array
+
+    def moved(self, step: Float64Array) -> _State:
+        """State after a step (6n + bk,)."""
+        split = 6 * len(self.poses)
+        poses = moved(self.poses, step[:split].reshape(-1, 6))
+        return _State(poses, self.biases + step[split:].reshape(self.biases.shape))
+
+
+def _graduated(graph: _Graph, state: _State, threshold: float) -> tuple[_State, Float64Array]:
+    """State and weights by graduated non-convexity: the surrogate cost is convex first and the truncated one last."""
     weights = np.ones(len(graph.trusted))
-    poses = _optimised(graph, poses, weights)
+    state = _optimised(graph, state, weights)
     doubtful = np.flatnonzero(~graph.trusted)
-    squared = graph.squared_errors(poses)[doubtful]
+    squared = graph.squared_errors(state)[doubtful]
     if squared.size == 0 or squared.max() <= threshold:
-        return poses, weights
+        return state, weights
     mu = threshold / (2.0 * squared.max() - threshold)
     for _ in range(_MAX_ROUNDS):
         weights[doubtful] = _truncated_weights(squared, mu, threshold)
-        poses = _optimised(graph, poses, weights)
-        squared = graph.squared_errors(poses)[doubtful]
+        state = _optimised(graph, state, weights)
+        squared = graph.squared_errors(state)[doubtful]
         if np.isin(weights, (0.0, 1.0)).all():
             break
         mu *= _MU_FACTOR
     weights[doubtful] = squared <= threshold
-    return _optimised(graph, poses, weights), weights
+    return _optimised(graph, state, weights), weights
 
 
 def _truncated_weights(squared: Float64Array, mu: float, threshold: float) -> Float64Array:
@@ -145,37 +178,40 @@ def _truncated_weights(squared: Float64Array, mu: float, threshold: float) -> Fl
     return np.where(squared <= mu / (mu + 1.0) * threshold, 1.0, np.clip(weights, 0.0, 1.0))
 
 
-def _optimised(graph: _Graph, poses: Float64Array, weights: Float64Array) -> Float64Array:
-    """Poses of the least weighted squared error, by Levenberg-Marquardt."""
-    is_free = graph.free_poses(weights)
-    columns = np.flatnonzero(np.repeat(is_free, 6))
+def _optimised(graph: _Graph, state: _State, weights: Float64Array) -> _State:
+    """State of the least weighted squared error, by Levenberg-Marquardt."""
+    columns = graph.free_columns(weights)
     if columns.size == 0:
-        return poses
-    cost, damping = graph.cost(poses, weights), 1e-6
+        return state
+    cost, damping = graph.cost(state, weights), 1e-6
+    step = np.zeros(graph.num_columns)
     for _ in range(_MAX_STEPS):
-        hessian, gradient = graph.normal_equations(poses, weights)
-        hessian, gradient = hessian[columns][:, columns], gradient[columns]
-        while True:
-            step = np.zeros(6 * len(poses))
-            step[columns] = _factorised(hessian, damping).solve(-gradient)
-            candidate = moved(poses, step.reshape(-1, 6))
+        hessian, gradient = graph.normal_equations(state, weights, columns)
+        new_cost = np.inf
+        while new_cost > cost and damping < _MAX_DAMPING:
+            step[columns] = -_factorised(hessian, damping).solve(gradient)
+            candidate = state.moved(step)
             new_cost = graph.cost(candidate, weights)
-            if new_cost <= cost or damping > _MAX_DAMPING:
-                break
             damping *= 10.0
         if new_cost > cost:
-            return poses
-        poses, decrease, cost = candidate, cost - new_cost, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if decrease <= _CONVERGED * (1.0 + cost) and np.abs(step).max() < 1e-6:
             break
-    return poses
+        is_done = cost - new_cost <= _LEAST_DECREASE * (1.0 + cost)
+        state, cost, damping = candidate, new_cost, max(damping * 0.01, 1e-9)
+        if is_done:
+            break
+    return state
 
 
 class _Graph:
-    """Arrays of all measurements: the edges, then the priors as edges from the world to a pose."""
+    """Arrays of all measurements: the edges, then the priors of poses as edges from the world."""
 
-    def __init__(self, num_poses: int, edges: Sequence[PoseGraphEdge], priors: Sequence[PosePrior]) -> None:
+    def __init__(
+        self,
+        num_poses: int,
+        edges: Sequence[PoseGraphEdge],
+        priors: Sequence[PosePrior],
+        bias_information: Float64Array | None,
+    ) -> None:
         self.num_poses, self.num_edges = num_poses, len(edges)
         # The pose after the last is the world: the identity, which never moves.
         self.first = np.array([e.first for e in edges] + [num_poses] * len(priors), np.int64)
@@ -186,8 +222,21 @@ class _Graph:
         measured = [e.T_first_second for e in edges] + [p.T_world_pose for p in priors]
         self.measured = np.array(measured, np.float64).reshape(-1, 4, 4)
         information = [e.information for e in edges] + [p.information for p in priors]
-        self.information = np.array(information, np.float64).reshape(-1, 6, 6)
+        self.roots = _square_roots(np.array(information, np.float64).reshape(-1, 6, 6))
         self.trusted: BoolArray = np.array([e.is_trusted for e in edges] + [True] * len(priors), np.bool_)
+        bias_information = np.zeros((0, 1, 1)) if bias_information is None else np.asarray(bias_information)
+        self.bias_shape = bias_information.shape[:2]
+        self.bias_roots = _square_roots(bias_information)
+        self.bias_edges = np.array([k for k, e in enumerate(edges) if e.bias is not None], np.int64)
+        biases = [e.bias for e in edges if e.bias is not None]
+        self.bias_of = np.array([bias.index for bias in biases], np.int64)
+        jacobians = np.array([bias.jacobian for bias in biases], np.float64)
+        self.bias_jacobians = jacobians.reshape(len(biases), 6, self.bias_shape[1])
+
+    @property
+    def num_columns(self) -> int:
+        """Number of unknowns."""
+        return 6 * self.num_poses + self.bias_shape[0] * self.bias_shape[1]
 
     def components(self, weights: Float64Array) -> Int64Array:
         """Component (n,) of each pose over the edges with a weight; priors do not join poses."""
@@ -196,55 +245,73 @@ class _Graph:
         joined = coo_matrix((np.ones(used.size), (self.first[used], self.second[used])), shape)
         return np.asarray(connected_components(joined, directed=False)[1], np.int64)
 
-    def free_poses(self, weights: Float64Array) -> BoolArray:
-        """True (n,) for poses that may move: all but the first of each component without a prior."""
+    def free_columns(self, weights: Float64Array) -> Int64Array:
+        """Unknowns that may change: all but the first pose of each component without a prior."""
         components = self.components(weights)
         has_prior = np.zeros(components.max(initial=-1) + 1, np.bool_)
         has_prior[components[self.second[self.num_edges :]]] = True
         _, lowest = np.unique(components, return_index=True)
-        is_free = np.ones(self.num_poses, np.bool_)
-        is_free[lowest[~has_prior]] = False
-        return is_free
+        is_free = np.ones(self.num_columns, np.bool_)
+        is_free[(6 * lowest[~has_prior, None] + np.arange(6)).ravel()] = False
+        return np.flatnonzero(is_free)
 
-    def errors(self, poses: Float64Array) -> tuple[Float64Array, Float64Array]:
+    def errors(self, state: _State) -> tuple[Float64Array, Float64Array]:
         """Errors (m, 6), and the transforms (m, 4, 4) from the second to the first poses."""
-        with_world = np.concatenate([poses, np.eye(4)[None]])
+        with_world = np.concatenate([state.poses, np.eye(4)[None]])
         relative = inverses(with_world[self.first]) @ with_world[self.second]
         rotation_z = self.measured[:, :3, :3].transpose(0, 2, 1)
         shift = np.einsum("mij,mj->mi", rotation_z, relative[:, :3, 3] - self.measured[:, :3, 3])
-        return np.concatenate([shift, rotation_logs(rotation_z @ relative[:, :3, :3])], axis=1), relative
+        errors = np.concatenate([shift, rotation_logs(rotation_z @ relative[:, :3, :3])], axis=1)
+        errors[self.bias_edges] -= np.einsum("eij,ej->ei", self.bias_jacobians, state.biases[self.bias_of])
+        return errors, relative
 
-    def squared_errors(self, poses: Float64Array) -> Float64Array:
+    def squared_errors(self, state: _State) -> Float64Array:
         """Squared Mahalanobis errors (m,)."""
-        errors, _ = self.errors(poses)
-        return np.einsum("mi,mij,mj->m", errors, self.information, errors)
+        return np.square(np.einsum("mij,mj->mi", self.roots, self.errors(state)[0])).sum(axis=1)
 
-    def cost(self, poses: Float64Array, weights: Float64Array) -> float:
-        """Half the weighted sum of squared errors."""
-        return 0.5 * float(weights @ self.squared_errors(poses))
+    def cost(self, state: _State, weights: Float64Array) -> float:
+        """Half the weighted sum of squared errors, with those of the systematic errors."""
+        biases = np.einsum("bij,bj->bi", self.bias_roots, state.biases)
+        return 0.5 * float(weights @ self.squared_errors(state) + np.square(biases).sum())
 
-    def normal_equations(self, poses: Float64Array, weights: Float64Array) -> tuple[csc_matrix, Float64Array]:
-        """Hessian (6n, 6n) and gradient (6n,) of the cost, with the Gauss-Newton approximation."""
-        errors, relative = self.errors(poses)
+    def normal_equations(
+        self, state: _State, weights: Float64Array, columns: Int64Array
+    ) -> tuple[csc_matrix, Float64Array]:
+        """Hessian (c, c) and gradient (c,) of the cost by some unknowns (c,), with the Gauss-Newton approximation."""
+        errors, relative = self.errors(state)
+        roots = self.roots * np.sqrt(weights)[:, None, None]
         first, second = self._jacobians(errors, relative)
-        information = self.information * weights[:, None, None]
-        weighted = [np.einsum("mia,mij->maj", jacobian, information) for jacobian in (first, second)]
-        blocks, rows, columns = [], [], []
-        for left, row in zip(weighted, (self.first, self.second), strict=True):
-            for right, column in ((first, self.first), (second, self.second)):
-                blocks.append(left @ right)
-                rows.append(row)
-                columns.append(column)
-        hessian = _block_matrix(np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), self.num_poses)
-        gradient = np.zeros((self.num_poses + 1, 6))
-        for left, row in zip(weighted, (self.first, self.second), strict=True):
-            np.add.at(gradient, row, np.einsum("maj,mj->ma", left, errors))
-        return hessian, gradient[:-1].ravel()
+        jacobian = self._rows(roots, first, second)[:, columns]
+        biases = np.einsum("bij,bj->bi", self.bias_roots, state.biases)
+        whitened = np.concatenate([np.einsum("mij,mj->mi", roots, errors).ravel(), biases.ravel()])
+        return (jacobian.T @ jacobian).tocsc(), jacobian.T @ whitened
+
+    def _rows(self, roots: Float64Array, first: Float64Array, second: Float64Array) -> csr_matrix:
+        """Jacobian of all whitened errors: those of the measurements, then those of the systematic errors."""
+        num_rows, (num_biases, size) = 6 * len(self.first), self.bias_shape
+        edges, start = np.arange(len(self.first)), 6 * self.num_poses
+        inside = np.flatnonzero(self.first < self.num_poses)
+        parts = (
+            ((roots @ first)[inside], 6 * inside, 6 * self.first[inside]),
+            (roots @ second, 6 * edges, 6 * self.second),
+            (-roots[self.bias_edges] @ self.bias_jacobians, 6 * self.bias_edges, start + size * self.bias_of),
+            (self.bias_roots, num_rows + size * np.arange(num_biases), start + size * np.arange(num_biases)),
+        )
+        values, rows, columns = [], [], []
+        for blocks, row, column in parts:
+            values.append(blocks.ravel())
+            rows.append(np.broadcast_to((row[:, None] + np.arange(blocks.shape[1]))[:, :, None], blocks.shape).ravel())
+            columns.append(
+                np.broadcast_to((column[:, None] + np.arange(blocks.shape[2]))[:, None], blocks.shape).ravel()
+            )
+        shape = (num_rows + size * num_biases, self.num_columns)
+        return coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
 
     def _jacobians(self, errors: Float64Array, relative: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Derivatives (m, 6, 6) of the errors by the steps of the first and of the second poses."""
         first, second = np.zeros((2, len(errors), 6, 6))
         rotation_z = self.measured[:, :3, :3].transpose(0, 2, 1)
+        # The systematic error is subtracted after the logarithm and small.
         inverse_right = inverse_right_jacobians(errors[:, 3:])
         first[:, :3, :3] = -rotation_z
         first[:, :3, 3:] = rotation_z @ cross_matrices(relative[:, :3, 3])
@@ -253,15 +320,14 @@ class _Graph:
         second[:, 3:, 3:] = inverse_right
         return first, second
 
-    def covariances(self, poses: Float64Array, weights: Float64Array, chosen: Sequence[int]) -> Float64Array:
-        """Marginal covariances (k, 6, 6) of chosen poses; 0 for a held pose."""
+    def covariances(self, state: _State, weights: Float64Array, chosen: Sequence[int]) -> Float64Array:
+        """Marginal covariances (c, 6, 6) of chosen poses; 0 for a held pose."""
         result = np.zeros((len(chosen), 6, 6))
-        columns = np.flatnonzero(np.repeat(self.free_poses(weights), 6))
+        columns = self.free_columns(weights)
         if columns.size == 0 or not chosen:
             return result
-        hessian, _ = self.normal_equations(poses, weights)
-        factor = _factorised(hessian[columns][:, columns], 1e-12)
-        place = np.full(6 * self.num_poses, -1)
+        factor = _factorised(self.normal_equations(state, weights, columns)[0], 0.0)
+        place = np.full(self.num_columns, -1)
         place[columns] = np.arange(columns.size)
         for row, index in enumerate(chosen):
             places = place[6 * index : 6 * index + 6]
@@ -272,21 +338,16 @@ class _Graph:
         return result
 
 
-def _block_matrix(blocks: Float64Array, rows: Int64Array, columns: Int64Array, num_poses: int) -> csc_matrix:
-    """Sparse matrix (6n, 6n) of blocks (k, 6, 6) at block positions (k,); blocks of the world are left out."""
-    inside = (rows < num_poses) & (columns < num_poses)
-    blocks, rows, columns = blocks[inside], rows[inside], columns[inside]
-    within = np.arange(6)
-    row = np.broadcast_to(6 * rows[:, None, None] + within[:, None], blocks.shape)
-    column = np.broadcast_to(6 * columns[:, None, None] + within, blocks.shape)
-    shape = (6 * num_poses, 6 * num_poses)
-    return coo_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape).tocsc()
+def _square_roots(information: Float64Array) -> Float64Array:
+    """Matrices S (n, k, k) with S^T S = information (n, k, k)."""
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1))
 
 
 def _factorised(hessian: csc_matrix, damping: float) -> SuperLU:
     """Factors of the damped Hessian; a symmetric ordering keeps them sparse."""
-    damped = hessian.copy()
     diagonal = hessian.diagonal()
+    damped = hessian.copy()
     # Directions that no measurement constrains stay where they are.
-    damped.setdiag(diagonal * (1.0 + damping) + 1e-9 * max(diagonal.max(initial=0.0), 1.0))
+    damped.setdiag(diagonal * (1.0 + damping) + 1e-12 * max(diagonal.max(initial=0.0), 1.0))
     return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

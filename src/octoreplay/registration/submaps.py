@@ -18,6 +18,7 @@ _CLASS_DISTANCE = 1e3
 _NUM_NEIGHBOURS = 14
 _NORMAL_RADIUS = 0.7
 _FLATNESS = 0.12
+CONS = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +114,14 @@ def step(a, b, T, gate, sigma):
     w = 1.0 / (1.0 + (r / k) ** 2) ** 2
     H = (J * w[:, None]).T @ J
     g = J.T @ (w * r)
-    return H, g, w.sum(), len(r), float(np.sqrt((w * r * r).sum() / max(w.sum(), 1e-9)))
+    return H, g, float((np.abs(r) < 0.12).mean()) if len(r) else 0.0, len(r), float(np.sqrt((w * r * r).sum() / max(w.sum(), 1e-9)))
 
 
 def register(a, b, T, gates, sigma=0.15, num_per_one=20.0):
     """T_ab and information after GN steps"""
     for gate in gates:
         H, g, n, num, rms = step(a, b, T, gate, sigma)
-        if num < 60:
+        if num < 60 or (gate < 0.45 and n < CONS):
             return None
         scale = num_per_one * sigma**2
         # Weak directions stay: a prior of the start pose
