@@ -76,6 +76,8 @@ def test_help_imports_nothing_heavy() -> None:
         (["metrics", PAIR / "husky_1.mcap"], 1, "no result of octoreplay"),
         (["query", "none.mcap"], 2, "name a point with --at X Y Z, or a box"),
         (["simulate", "x", "--image", "big"], 2, "image: expects WIDTHxHEIGHT such as 160x120, got 'big'"),
+        (["simulate", "x", "--odometry-drift", "1"], 2, "odometry_drift: expects PERCENT,DEGREES such as 1,0.5, got"),
+        (["simulate", "x", "--odometry-drift=1,nan"], 2, "odometry_drift in degrees per 10 m: nan is not between 0"),
         (["simulate", "x", "--robots", "0"], 2, "num_robots: 0 is not between 1 and 100"),
     ],
 )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from octoreplay._version import __version__
 
 if TYPE_CHECKING:
+    from octoreplay.config.frames_file import load_frames_file
     from octoreplay.config.robot import RobotConfig
     from octoreplay.config.run import RunConfig
     from octoreplay.config.team_file import load_team_file
@@ -55,6 +56,7 @@ _MODULES = {
     "discover": "io.robots.discover",
     "evaluate_result": "evaluate.evaluation",
     "export_ply": "report.export",
+    "load_frames_file": "config.frames_file",
     "load_team_file": "config.team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
@@ -69,8 +71,8 @@ __all__ = [
     "CheckRow", "ClassTable", "ConfigError", "Evaluation", "InputError", "LeafTable", "OctoreplayError", "OutputError",
     "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RunConfig", "RunSummary",
     "SemanticClass", "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "TickMetrics", "__version__",
-    "check_result", "compare_results", "discover", "evaluate_result", "export_ply", "load_team_file", "open_log",
-    "open_result", "replay_team", "resolve", "run_sweep", "simulate_team",
+    "check_result", "compare_results", "discover", "evaluate_result", "export_ply", "load_frames_file",
+    "load_team_file", "open_log", "open_result", "replay_team", "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +12,24 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from fixtures.make_fixtures import FIXTURES
+from octoreplay.config.frames_file import load_frames_file
+from octoreplay.config.robot import RobotConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, OutputError
+from octoreplay.io.datasets.pose_files import read_tum_track
 from octoreplay.simulate import team
+from octoreplay.simulate.odometry import drift_corrections
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
-from support.long_suite import one_in
+from octoreplay.transforms import transform_of
+from support.long_suite import long, one_in
 from support.stored_messages import matrix, pixels, read_messages, stamp_ns
 
 COMMITTED = Path(__file__).resolve().parents[1] / "fixtures"
+FILES = ("frames.yaml", "husky_1.mcap", "husky_2.mcap", "team.yaml", "truth", "world.npz", "world.ply")
 SMALL = SimulationConfig(num_robots=2, duration=3.0, rate=5.0, image=(32, 24), seed=5, world_size=24.0)
+CLEAN = dataclasses.replace(SMALL, label_noise=0.0)
 EXACT = SimulationConfig(
     num_robots=2, duration=6.0, rate=2.0, image=(80, 60), seed=6, world_size=24.0, label_noise=0.0, depth_noise=0.0
 )
@@ -34,8 +42,34 @@ def small(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("clean") / "team"
+    simulate_team(folder, CLEAN)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("own") / "team"
+    simulate_team(folder, dataclasses.replace(EXACT, own_frames=True))
+    return folder
+
+
+def logged_poses(messages, robot_id: str) -> np.ndarray:
+    """Poses (T, 4, 4) of a robot's odometry."""
+    poses = [odometry.pose.pose for _, odometry in messages[f"/{robot_id}/odom"]]
+    return np.array([matrix(pose.position, pose.orientation) for pose in poses])
+
+
+def true_poses(folder: Path, robot_id: str) -> np.ndarray:
+    """Poses (T, 4, 4) of a robot's TUM file."""
+    track = read_tum_track(folder / "truth" / f"{robot_id}.tum")
+    return np.array([track.matrix_at(stamp, 0) for stamp in track.stamps_ns.tolist()])
+
+
 def camera_pose(messages, robot_id: str, stamp: int) -> np.ndarray:
-    """Camera pose in the map frame, interpolated from the logged poses."""
+    """Camera pose in the frame of the logged poses, interpolated between two of them."""
     stamps = np.array([t for t, _ in messages[f"/{robot_id}/odom"]])
     k = int(np.searchsorted(stamps, stamp, side="right")) - 1
     first, second = (messages[f"/{robot_id}/odom"][i][1].pose.pose for i in (k, k + 1))
@@ -179,6 +213,63 @@ def test_kinds_divide_every_class_of_images_and_truth(small, tmp_path):
     assert len(set(split.values())) > 12
 
 
+def test_own_frames_start_at_the_robots_first_poses_and_differ_in_yaw(own):
+    frames = {robot_id: transform_of(numbers) for robot_id, numbers in load_frames_file(own / "frames.yaml").items()}
+    yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in frames.values()]
+    assert abs(yaws[0] - yaws[1]) > 0.1
+    for robot_id, T_team_map in frames.items():
+        messages = read_messages(own / f"{robot_id}.mcap")
+        assert {odometry.header.frame_id for _, odometry in messages[f"/{robot_id}/odom"]} == {f"{robot_id}/odom"}
+        assert {tf.transforms[0].header.frame_id for _, tf in messages["/tf"]} == {f"{robot_id}/odom"}
+        logged, true = logged_poses(messages, robot_id), true_poses(own, robot_id)
+        np.testing.assert_allclose(logged[0, :3, 3], 0.0, atol=1e-9)
+        assert logged[0, 0, 0] > 0.99
+        np.testing.assert_allclose(T_team_map @ logged, true, atol=1e-9)
+    config = load_team_file(own / "team.yaml")
+    assert all(robot.T_team_map == RobotConfig("a", (Path("a"),)).T_team_map for robot in config.robots)
+
+
+@pytest.mark.parametrize("own_frames", [False, pytest.param(True, marks=long)])
+def test_removing_frame_and_drift_gives_the_true_poses(small, tmp_path, own_frames):
+    config = dataclasses.replace(SMALL, odometry_drift=(3.0, 4.0), own_frames=own_frames)
+    folder = tmp_path / "team"
+    simulate_team(folder, config)
+    assert tuple(sorted(path.name for path in folder.iterdir())) == FILES
+    frames = load_frames_file(folder / "frames.yaml")
+    for index, robot_id in enumerate(config.robot_ids):
+        messages, true = read_messages(folder / f"{robot_id}.mcap"), true_poses(folder, robot_id)
+        logged = transform_of(frames[robot_id]) @ logged_poses(messages, robot_id)
+        drift = drift_corrections(true, 3.0, 4.0, np.random.default_rng([config.seed, 4, index]))
+        np.testing.assert_allclose(np.linalg.inv(drift) @ logged, true, atol=1e-9)
+        np.testing.assert_allclose(logged[0], true[0], atol=1e-9)
+        assert np.abs(logged[-1] - true[-1]).max() > 1e-3
+    if not own_frames:
+        # Drift changes the recorded poses only, and the frame of the poses is the village's.
+        exact = read_messages(small / "husky_1.mcap")
+        np.testing.assert_allclose(logged_poses(exact, "husky_1"), true_poses(folder, "husky_1"), atol=1e-9)
+        assert frames["husky_1"] == (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        assert (folder / "team.yaml").read_bytes() == (small / "team.yaml").read_bytes()
+        images = "/husky_1/camera/depth/image_raw"
+        pairs = zip(exact[images], read_messages(folder / "husky_1.mcap")[images], strict=True)
+        assert all(np.array_equal(one.data, other.data) for (_, one), (_, other) in pairs)
+
+
+def test_patchy_noise_has_the_given_share_and_is_the_same_in_every_image(clean, tmp_path):
+    simulate_team(tmp_path / "patchy", dataclasses.replace(CLEAN, patchy_noise=0.3))
+    wrong: dict[tuple[int, ...], list[bool]] = defaultdict(list)
+    images, patchy = (read_messages(folder / "husky_1.mcap") for folder in (clean, tmp_path / "patchy"))
+    pairs = zip(measured_points(images, "husky_1"), measured_points(patchy, "husky_1"), strict=True)
+    for (points, labels), (same_points, noisy) in pairs:
+        np.testing.assert_array_equal(points, same_points)
+        for cube, is_wrong in zip(np.floor(points / 2.0).astype(int).tolist(), labels != noisy, strict=True):
+            wrong[tuple(cube)].append(bool(is_wrong))
+    shares = np.array([np.mean(found) for found in wrong.values()])
+    assert len(shares) > 50
+    assert 0.15 < (shares > 0.5).mean() < 0.45
+    # Depth noise moves some points to a neighbouring cube.
+    assert (np.minimum(shares, 1.0 - shares) < 0.25).mean() > 0.8
+
+
 def test_robots_stand_on_the_ground(small):
     terrain = make_village(SMALL.world_size, SMALL.seed).terrain
     for _, odometry in read_messages(small / "husky_1.mcap")["/husky_1/odom"]:
@@ -187,13 +278,15 @@ def test_robots_stand_on_the_ground(small):
         np.testing.assert_allclose(T[:3, 2], terrain.normal(T[:2, 3]), atol=1e-9)
 
 
-def test_points_of_exact_images_are_in_the_ground_truth(tmp_path):
-    simulate_team(tmp_path / "team", EXACT)
-    truth, resolution = truth_of(tmp_path / "team")
+def test_points_of_exact_images_in_the_frames_of_frames_yaml_are_in_the_ground_truth(own):
+    truth, resolution = truth_of(own)
+    frames = load_frames_file(own / "frames.yaml")
+    assert tuple(frames) == EXACT.robot_ids
     total = known = agreed = 0
-    for robot_id in EXACT.robot_ids:
-        for points, labels in measured_points(read_messages(tmp_path / "team" / f"{robot_id}.mcap"), robot_id):
-            keys = np.floor(points / resolution).astype(int).tolist()
+    for robot_id, numbers in frames.items():
+        T_team_map = transform_of(numbers)
+        for points, labels in measured_points(read_messages(own / f"{robot_id}.mcap"), robot_id):
+            keys = np.floor((points @ T_team_map[:3, :3].T + T_team_map[:3, 3]) / resolution).astype(int).tolist()
             found = np.array([truth.get(tuple(key), 0) for key in keys])
             total += len(found)
             known += int((found > 0).sum())
@@ -204,17 +297,14 @@ def test_points_of_exact_images_are_in_the_ground_truth(tmp_path):
     assert agreed / known > 0.95
 
 
-def test_label_noise_has_the_given_share(small, tmp_path):
-    clean_folder = tmp_path / "clean"
-    simulate_team(clean_folder, SimulationConfig(**{**vars(SMALL), "label_noise": 0.0}))
+def test_label_noise_has_the_given_share(small, clean):
     topic = "/husky_1/camera/labels/image_raw"
-    noisy, clean = (
-        np.stack([pixels(m) for _, m in read_messages(folder / "husky_1.mcap")[topic]])
-        for folder in (small, clean_folder)
+    noisy, true = (
+        np.stack([pixels(m) for _, m in read_messages(folder / "husky_1.mcap")[topic]]) for folder in (small, clean)
     )
-    np.testing.assert_array_equal(noisy == 255, clean == 255)
-    measured = clean != 255
-    assert (noisy != clean)[measured].mean() == pytest.approx(0.1, abs=0.015)
+    np.testing.assert_array_equal(noisy == 255, true == 255)
+    measured = true != 255
+    assert (noisy != true)[measured].mean() == pytest.approx(0.1, abs=0.015)
     depth = np.stack([pixels(m) for _, m in read_messages(small / "husky_1.mcap")["/husky_1/camera/depth/image_raw"]])
     np.testing.assert_array_equal(depth == 0, noisy == 255)
 
@@ -272,7 +362,8 @@ def test_a_failed_simulation_removes_its_files(tmp_path, monkeypatch, error, exi
 @pytest.mark.parametrize(
     "options",
     [{"num_robots": 0}, {"duration": 0.5}, {"rate": 0.0}, {"image": (4, 120)}, {"image": (160, 1)}, {"seed": -1},
-     {"resolution": 0.0}, {"label_noise": 1.5}, {"world_size": 5.0}, {"max_depth": 66.0}, {"duration": float("nan")}],
+     {"resolution": 0.0}, {"label_noise": 1.5}, {"patchy_noise": 1.5}, {"odometry_drift": (101.0, 0.0)},
+     {"odometry_drift": (0.0, -1.0)}, {"world_size": 5.0}, {"max_depth": 66.0}, {"duration": float("nan")}],
 )  # fmt: skip
 def test_options_out_of_range_are_refused_by_name(options):
     name = next(iter(options))

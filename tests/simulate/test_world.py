@@ -8,7 +8,7 @@ from plyfile import PlyData
 
 from octoreplay.errors import OutputError
 from octoreplay.simulate.village import make_village
-from octoreplay.simulate.world import BUILDING, CAR, DIRT_ROAD, FENCE, GRASS, Terrain, World, village_classes
+from octoreplay.simulate.world import BUILDING, CAR, DIRT_ROAD, FENCE, GRASS, ROOF, Terrain, World, village_classes
 from octoreplay.simulate.world_files import labelled_cells, write_ground_truth, write_mesh
 
 FLAT = Terrain(np.zeros((1, 2)), np.zeros(1), np.zeros(1))
@@ -45,6 +45,23 @@ def test_the_village_depends_on_the_seed_only(village):
     np.testing.assert_array_equal(village.vertices, again.vertices)
     np.testing.assert_array_equal(village.triangle_classes, again.triangle_classes)
     assert village.vertices.shape != other.vertices.shape or not np.array_equal(village.vertices, other.vertices)
+
+
+def test_a_village_of_identical_houses_repeats_itself_from_block_to_block():
+    world = make_village(70.0, 3, identical_houses=True)
+    np.testing.assert_array_equal(world.terrain.height(world.vertices[:, :2]), 0.0)
+    assert set(np.unique(world.triangle_classes)) == {GRASS, DIRT_ROAD, BUILDING, ROOF}
+    houses = world.vertices[np.unique(world.triangles[world.triangle_classes > DIRT_ROAD])].astype(np.float64)
+    # Sixteen houses: the blocks are 27 m apart, and the houses of a block 12 m.
+    x, y = np.meshgrid([-19.5, -7.5, 7.5, 19.5], [-19.5, -7.5, 7.5, 19.5], indexing="ij")
+    apart = np.stack([x.ravel(), y.ravel()], axis=1)
+    nearest = np.argmin(np.hypot(*(houses[:, None, :2] - apart).transpose(2, 0, 1)), axis=1)
+    shapes = [np.unique(np.round(houses[nearest == k] - [*apart[k], 0.0], 3), axis=0) for k in range(16)]
+    assert len(shapes[0]) > 10
+    for shape in shapes[1:]:
+        np.testing.assert_array_equal(shape, shapes[0])
+    other = make_village(70.0, 4, identical_houses=True)
+    assert not np.array_equal(world.vertices, other.vertices)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

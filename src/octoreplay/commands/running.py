@@ -86,6 +86,8 @@ def run(
 @click.option("--resolution", type=float, default=0.3, show_default=True,
               help="cell size of the ground truth, and resolution in the team file [m]")  # fmt: skip
 @click.option("--label-noise", type=float, default=0.1, show_default=True, help="share of pixels with a wrong label")
+@click.option("--patchy-noise", type=float, default=0.0, show_default=True,
+              help="share of the places, cubes of 2 m, that a robot always labels wrongly")  # fmt: skip
 @click.option("--depth-noise", type=float, default=1.0, show_default=True, metavar="FACTOR",
               help="factor on the noise of a depth camera, whose standard deviation grows with depth")  # fmt: skip
 @click.option("--pose-noise", type=float, default=0.0, show_default=True,

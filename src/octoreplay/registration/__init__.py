@@ -1,1 +1,1 @@
-"""Frames of a team: registration of maps and submaps, pose graph, repair of drift; arrays only, no files and no clock."""
+"""Frames of a team: own maps, search, verification and refinement of pairs, frames of a team, and repair of drift."""

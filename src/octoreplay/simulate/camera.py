@@ -18,6 +18,10 @@ NO_LABEL = 255
 """Raw label of a pixel without a measurement."""
 
 
+_PATCH_EDGE = 2.0
+_PATCH_GRID = (64, 64, 16)
+
+
 class MeshCamera:
     """Camera that renders depth and label images of a world.
 
@@ -52,6 +56,32 @@ class MeshCamera:
         depth[beyond] = 0.0
         labels[beyond] = NO_LABEL
         return depth, labels
+
+    def points(self, depth: Float32Array, T_world_camera: Float64Array) -> Float64Array:
+        """Return the world coordinates (H, W, 3) [m] of a depth image's pixels."""
+        points: Float64Array = (depth[..., None] * self._rays) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        return points
+
+
+class LabelPatches:
+    """Places at which a robot's network gives a wrong class: cubes of space that keep their error in every image.
+
+    In a ``share`` of the cubes the classes are shifted cyclically by a number that is drawn for the cube. Errors
+    of this kind do not average out over images.
+    """
+
+    def __init__(self, share: float, num_classes: int, rng: np.random.Generator) -> None:
+        wrong = rng.random(_PATCH_GRID) < share
+        self._shifts = np.where(wrong, rng.integers(1, num_classes, _PATCH_GRID), 0)
+        self._num_classes = num_classes
+
+    def apply(self, labels: UInt8Array, points: Float64Array) -> UInt8Array:
+        """Return the label image (H, W) with the errors at ``points`` (H, W, 3), the pixels' world coordinates [m]."""
+        # The grid repeats itself beyond its edges.
+        cubes = np.mod(np.floor(points / _PATCH_EDGE).astype(np.int64), _PATCH_GRID)
+        shifts = self._shifts[cubes[..., 0], cubes[..., 1], cubes[..., 2]]
+        shifted = (labels.astype(np.int64) - 1 + shifts) % self._num_classes + 1
+        return np.where(labels == NO_LABEL, labels, shifted).astype(np.uint8)
 
 
 def depth_noise_sigma(depth: npt.ArrayLike) -> Float64Array:

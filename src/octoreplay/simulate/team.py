@@ -18,7 +18,7 @@ from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.datasets.pose_files import write_tum
 from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter, topics
 from octoreplay.records import CameraModel, ClassTable, Float64Array, Int64Array
-from octoreplay.simulate.camera import MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
+from octoreplay.simulate.camera import LabelPatches, MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore
 from octoreplay.simulate.odometry import drift_corrections, own_frame
 from octoreplay.simulate.village import make_village
@@ -56,6 +56,8 @@ class SimulationConfig:
         Cell size of the ground truth, and resolution in the team file [m].
     label_noise : float
         Share of the pixels that get a wrong class.
+    patchy_noise : float
+        Share of the cubes of 2 m in which a robot's labels are always wrong; drawn for each robot.
     depth_noise : float
         Factor on the standard deviation of a depth camera's noise.
     pose_noise : float
@@ -69,6 +71,8 @@ class SimulationConfig:
         Number of classes that each of the eight classes is divided into.
     world_size : float
         Edge length of the drivable square [m].
+    identical_houses : bool
+        True for a village that repeats itself: copies of one house between straight roads on flat ground.
     max_depth : float
         Range of the camera [m].
     """
@@ -80,12 +84,14 @@ class SimulationConfig:
     seed: int = 0
     resolution: float = 0.3
     label_noise: float = 0.1
+    patchy_noise: float = 0.0
     depth_noise: float = 1.0
     pose_noise: float = 0.0
     odometry_drift: tuple[float, float] = (0.0, 0.0)
     own_frames: bool = False
     kinds_per_class: int = 1
     world_size: float = 70.0
+    identical_houses: bool = False
     max_depth: float = 20.0
 
     def __post_init__(self) -> None:
@@ -98,6 +104,7 @@ class SimulationConfig:
             ("seed", self.seed, 0, 2**32 - 1),
             ("resolution", self.resolution, 0.02, 5.0),
             ("label_noise", self.label_noise, 0.0, 1.0),
+            ("patchy_noise", self.patchy_noise, 0.0, 1.0),
             ("depth_noise", self.depth_noise, 0.0, 100.0),
             ("pose_noise", self.pose_noise, 0.0, 10.0),
             ("odometry_drift in percent", self.odometry_drift[0], 0.0, 100.0),
@@ -203,7 +210,8 @@ def _prepare(folder: Path) -> bool:
 
 def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float], None]) -> tuple[int, int]:
     """Write all files; return the numbers of images and of labelled cells."""
-    world = make_village(config.world_size, config.seed).with_kinds(config.kinds_per_class)
+    world = make_village(config.world_size, config.seed, identical_houses=config.identical_houses)
+    world = world.with_kinds(config.kinds_per_class)
     camera = MeshCamera(world, config.camera)
     num_cells = write_ground_truth(work / "world.npz", world, config.resolution, config.class_table)
     write_mesh(work / "world.ply", world, config.class_table)
@@ -328,6 +336,10 @@ class _Recorder:
         self._recorded = recorded
         self._exposures = schedule.exposures(index, config.num_robots)
         self._rng = np.random.default_rng([config.seed, 2, index])
+        self._patches: LabelPatches | None = None
+        if config.patchy_noise > 0:
+            rng = np.random.default_rng([config.seed, 7, index])
+            self._patches = LabelPatches(config.patchy_noise, config.class_table.num_classes, rng)
 
     def record(self, log: RobotLogWriter) -> Iterator[int]:
         """Write all poses and images in the order of time; yield each image's stamp."""
@@ -348,6 +360,8 @@ class _Recorder:
         """Render and write one image with the noise of a depth camera and of a segmentation network."""
         config = self._config
         depth, labels = self._camera.take(T_map_camera, config.max_depth)
+        if self._patches is not None:
+            labels = self._patches.apply(labels, self._camera.points(depth, T_map_camera))
         if config.depth_noise > 0:
             depth = add_depth_noise(depth, self._rng, config.depth_noise)
         if config.label_noise > 0:

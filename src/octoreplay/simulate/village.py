@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -17,18 +18,29 @@ _ROAD_SPACING = 28.0
 _GROUND_STEP = 0.5
 _GROUND_MARGIN = 8.0
 _SQUARE_RADIUS = 8.0
+_ROAD_BEND = 2.5
+_HOUSE_OFFSET = 6.0
 
 
-def make_village(size: float, seed: int) -> World:
+def make_village(size: float, seed: int, *, identical_houses: bool = False) -> World:
     """Return a village with a drivable square of ``size`` [m]; equal seeds give equal villages.
 
     Roads cross at the origin, where a disc is kept clear. Houses with gable roofs stand along the roads, some behind
     fences. Cars are parked at the roadsides, and trees stand off the roads. Gaps between objects are wide enough for
     robots.
+
+    With ``identical_houses`` the world repeats itself: straight roads on flat ground, and in each block between them
+    four copies of one house and nothing else. The seed changes the heights of the house only.
     """
     rng = np.random.default_rng([seed, 1])
+    if identical_houses:
+        flat = Terrain(np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        village = _Builder(size, flat, _Roads(size, rng, bend=0.0), rng)
+        village.add_ground()
+        village.add_identical_houses(seed)
+        return village.world()
     terrain = _make_terrain(rng)
-    village = _Builder(size, terrain, rng)
+    village = _Builder(size, terrain, _Roads(size, rng, bend=_ROAD_BEND), rng)
     village.add_ground()
     village.add_cars()
     village.add_houses()
@@ -39,11 +51,11 @@ def make_village(size: float, seed: int) -> World:
 class _Builder:
     """Mesh of a village under construction. ``taken`` are the circles (x, y, radius) of the placed objects."""
 
-    def __init__(self, size: float, terrain: Terrain, rng: np.random.Generator) -> None:
+    def __init__(self, size: float, terrain: Terrain, roads: _Roads, rng: np.random.Generator) -> None:
         self.size = size
         self.terrain = terrain
         self.rng = rng
-        self.roads = _Roads(size, rng)
+        self.roads = roads
         self.vertices: list[Float64Array] = []
         self.triangles: list[npt.NDArray[np.int64]] = []
         self.classes: list[UInt8Array] = []
@@ -102,6 +114,14 @@ class _Builder:
             if fenced:
                 self.add_fence(x, y, yaw, length / 2 + 2.6, width / 2 + 2.6)
             wanted -= 1
+
+    def add_identical_houses(self, seed: int) -> None:
+        """Add four copies of one house to each block between the roads."""
+        for x, y in itertools.product(self.roads.block_centers(), repeat=2):
+            for dx, dy in itertools.product((-_HOUSE_OFFSET, _HOUSE_OFFSET), repeat=2):
+                # Every house repeats the draws of the first.
+                self.rng = np.random.default_rng([seed, 1])
+                self.add_house(x + dx, y + dy, 0.0, 7.0, 5.0)
 
     def add_house(self, x: float, y: float, yaw: float, length: float, width: float) -> None:
         """Add one house: walls with gables, and an overhanging roof."""
@@ -227,19 +247,22 @@ class _Placement:
 
 
 class _Roads:
-    """Wavy roads along x and along y, one of each through the origin; ``lines`` are their centre lines."""
+    """Roads along x and along y, one of each through the origin; ``lines`` are their centre lines.
 
-    def __init__(self, size: float, rng: np.random.Generator) -> None:
+    They are waves with an amplitude of ``bend`` [m].
+    """
+
+    def __init__(self, size: float, rng: np.random.Generator, bend: float) -> None:
         self.half = size / 2
         # The outermost roads are 8 m inside the edge. A small world has only one crossing.
         count = round((self.half - 8.0) / _ROAD_SPACING)
-        offsets = [k * (self.half - 8.0) / max(1, count) for k in range(-count, count + 1)]
+        self.offsets = [k * (self.half - 8.0) / max(1, count) for k in range(-count, count + 1)]
         self.lines: list[tuple[bool, Float64Array]] = []
         along = np.arange(-self.half - _GROUND_MARGIN, self.half + _GROUND_MARGIN + 0.5, 0.5)
-        for offset in offsets:
+        for offset in self.offsets:
             for is_x in (True, False):
                 wavelength, phase = rng.uniform(50.0, 80.0), rng.uniform(0.0, 2 * math.pi)
-                across = offset + 2.5 * (np.sin(2 * math.pi * along / wavelength + phase) - math.sin(phase))
+                across = offset + bend * (np.sin(2 * math.pi * along / wavelength + phase) - math.sin(phase))
                 self.lines.append((is_x, np.stack([along, across] if is_x else [across, along], axis=1)))
         self.points = np.concatenate([line for _, line in self.lines])
 
@@ -247,6 +270,10 @@ class _Roads:
     def total_length(self) -> float:
         """Length of all roads [m]."""
         return len(self.lines) * 2 * self.half
+
+    def block_centers(self) -> list[float]:
+        """Centres of the blocks between neighbouring straight roads along one axis [m]."""
+        return [(a + b) / 2 for a, b in itertools.pairwise(self.offsets)]
 
     def distance(self, xy: Float64Array) -> Float64Array:
         """Return distances (P,) [m] of points (P, 2) to the nearest centre line."""

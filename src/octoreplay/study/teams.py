@@ -109,7 +109,8 @@ def _in_place_of(folder: Path) -> Iterator[Path]:
 
 def _content(folder: Path, config: SimulationConfig) -> dict[str, Any]:
     """Content of a team's settings file."""
-    files = {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != SETTINGS_FILE}
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / SETTINGS_FILE)
+    files = {str(path.relative_to(folder)): path.stat().st_size for path in paths}
     settings = json.loads(json_text(config))
     return {"version": __version__, "settings": settings, "files": files}
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from octoreplay.errors import InputError
-from octoreplay.io.datasets.pose_files import read_poses
+from octoreplay.errors import InputError, OutputError
+from octoreplay.io.datasets.pose_files import read_poses, read_tum_track, write_tum
 from support.poses import pose
 
 
@@ -96,3 +96,15 @@ def test_a_tum_row_that_is_not_finite_has_no_pose(tmp_path):
 def test_other_files_are_refused(tmp_path, lines, message):
     with pytest.raises(InputError, match=message):
         read_poses(save(tmp_path / "a.txt", *lines))
+
+
+def test_a_written_tum_file_is_read_back(tmp_path):
+    stamps = np.array([1_700_000_000_000_000_001, 1_700_000_000_050_000_000, 1_700_000_123_999_999_999])
+    poses = np.array([pose(index) for index in range(3)])
+    write_tum(tmp_path / "track.tum", stamps, poses)
+    track = read_tum_track(tmp_path / "track.tum")
+    np.testing.assert_array_equal(track.stamps_ns, stamps)
+    np.testing.assert_array_equal(track.positions, poses[:, :3, 3])
+    np.testing.assert_allclose([track.matrix_at(stamp, 0) for stamp in stamps.tolist()], poses, atol=1e-12)
+    with pytest.raises(OutputError, match=r"track\.tum: cannot be written"):
+        write_tum(tmp_path / "none" / "track.tum", stamps, poses)

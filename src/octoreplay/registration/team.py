@@ -1,0 +1,143 @@
+"""Frames of a team: alignments of all pairs, joined into components in which all maps agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from octoreplay.records import Float64Array
+from octoreplay.registration.own_map import OwnMap
+from octoreplay.registration.pairs import AcceptLimits, PairAlignment, align_pair
+from octoreplay.registration.verify import verify
+from octoreplay.transforms import inverse
+
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Function that calls another one with each of some items: ``map``, or the ``map`` of an executor."""
+
+# Largest difference between two chains of poses that join the same robots.
+_LARGEST_LOOP_SHIFT, _LARGEST_LOOP_ANGLE = 1.0, 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class TeamAlignment:
+    """Frames of a team.
+
+    Attributes
+    ----------
+    pairs : tuple of PairAlignment
+        All pairs. A pair that is accepted by itself and contradicts the rest of the team is refused.
+    components : tuple of tuples of int
+        Robots whose frames are related, by position in the team; the largest component first, robots in their order.
+    T_component_map : tuple of (4, 4) float64 arrays
+        Pose of each robot's map in the frame of its component's first robot.
+    parents : tuple of int or None
+        Robot through whose pair each robot got its pose; None for the first robot of a component.
+    """
+
+    pairs: tuple[PairAlignment, ...]
+    components: tuple[tuple[int, ...], ...]
+    T_component_map: tuple[Float64Array, ...]
+    parents: tuple[int | None, ...]
+
+
+def align_team(
+    maps: Sequence[OwnMap],
+    *,
+    guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
+    limits: AcceptLimits | None = None,
+    run: Run = map,
+) -> TeamAlignment:
+    """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
+
+    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run`` aligns
+    the pairs, one call for each; the result does not depend on it.
+    """
+    limits = limits or AcceptLimits()
+    known = guesses or {}
+
+    def align(pair: tuple[int, int]) -> PairAlignment:
+        return align_pair(maps, *pair, guesses=known.get(pair, ()), limits=limits)
+
+    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits)
+
+
+def join_pairs(maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: AcceptLimits) -> TeamAlignment:
+    """Return the components that the accepted pairs form, best pair first.
+
+    A pair that joins two components is refused where any two maps of both contradict each other under it; a pair within
+    a component is refused where its pose differs from the component's.
+    """
+    num = len(maps)
+    component = list(range(num))
+    members = {index: [index] for index in range(num)}
+    poses: list[Float64Array] = [np.eye(4) for _ in range(num)]
+    parents: list[int | None] = [None] * num
+    judged = {(pair.first, pair.second): pair for pair in pairs}
+    for pair in sorted(pairs, key=lambda pair: -pair.verification.score):
+        if not pair.is_accepted:
+            continue
+        i, j = pair.first, pair.second
+        if component[i] == component[j]:
+            refusal = _loop_refusal(poses[i] @ pair.T_first_second, poses[j])
+        else:
+            # The frame of j's component in that of i's.
+            T = poses[i] @ pair.T_first_second @ inverse(poses[j])
+            old, new = component[j], component[i]
+            refusal = _contradiction(maps, poses, members[new], members[old], T, limits)
+            if not refusal:
+                for index in members[old]:
+                    poses[index] = T @ poses[index]
+                    component[index] = new
+                _turn_parents(parents, j)
+                parents[j] = i
+                members[new] += members.pop(old)
+        if refusal:
+            judged[i, j] = replace(pair, refusal=refusal)
+    groups = sorted((tuple(sorted(group)) for group in members.values()), key=lambda group: (-len(group), group))
+    for group in groups:
+        _turn_parents(parents, group[0])
+        parents[group[0]] = None
+        back = inverse(poses[group[0]])
+        for index in group:
+            poses[index] = back @ poses[index]
+    return TeamAlignment(tuple(judged.values()), tuple(groups), tuple(poses), tuple(parents))
+
+
+def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
+    """Reason to refuse a pair that closes a loop; empty where both poses (4, 4) agree."""
+    difference = inverse(one) @ other
+    shift = float(np.linalg.norm(difference[:3, 3]))
+    angle = np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
+    if shift <= _LARGEST_LOOP_SHIFT and angle <= _LARGEST_LOOP_ANGLE:
+        return ""
+    return f"differs from the chain of better pairs by {shift:.1f} m and {angle:.1f} degrees"
+
+
+def _contradiction(
+    maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
+    limits: AcceptLimits,
+) -> str:  # fmt: skip
+    """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty without contradiction."""
+    for i in ones:
+        for j in others:
+            pose = inverse(poses[i]) @ T @ poses[j]
+            obstacles = verify(maps[i], maps[j], pose).obstacles
+            if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
+                first, second = sorted((i, j))
+                share = obstacles.share_contra
+                return f"robots {first + 1} and {second + 1} would contradict each other (q_c {share:.3f})"
+    return ""
+
+
+def _turn_parents(parents: list[int | None], root: int) -> None:
+    """Make ``root`` the root of its tree: turn the parents on the way to the old root, in place."""
+    below: int | None = None
+    index: int | None = root
+    while index is not None:
+        above = parents[index]
+        parents[index] = below
+        below, index = index, above
