@@ -118,7 +118,9 @@ def test_a_prior_sets_the_frame_and_its_weight_counts():
     solution = solve(truth, edges, [strong, weak])
     np.testing.assert_allclose(solution.poses[4], T_prior, atol=1e-5)
     free = solve(truth, edges)
-    np.testing.assert_allclose(inverses(solution.poses) @ solution.poses[4], inverses(free.poses) @ free.poses[4], atol=1e-4)
+    np.testing.assert_allclose(
+        inverses(solution.poses) @ solution.poses[4], inverses(free.poses) @ free.poses[4], atol=1e-4
+    )
 
 
 def test_covariances_are_those_of_repeated_measurements():

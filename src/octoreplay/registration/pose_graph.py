@@ -236,7 +236,7 @@ class _Graph:
     @property
     def num_columns(self) -> int:
         """Number of unknowns."""
-        return 6 * self.num_poses + self.bias_shape[0] * self.bias_shape[1]
+        return int(6 * self.num_poses + self.bias_shape[0] * self.bias_shape[1])
 
     def components(self, weights: Float64Array) -> Int64Array:
         """Component (n,) of each pose over the edges with a weight; priors do not join poses."""
@@ -267,7 +267,8 @@ class _Graph:
 
     def squared_errors(self, state: _State) -> Float64Array:
         """Squared Mahalanobis errors (m,)."""
-        return np.square(np.einsum("mij,mj->mi", self.roots, self.errors(state)[0])).sum(axis=1)
+        whitened = np.einsum("mij,mj->mi", self.roots, self.errors(state)[0])
+        return np.asarray(np.square(whitened).sum(axis=1))
 
     def cost(self, state: _State, weights: Float64Array) -> float:
         """Half the weighted sum of squared errors, with those of the systematic errors."""

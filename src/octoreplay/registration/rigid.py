@@ -1,4 +1,4 @@
-"""Batches of rigid transforms and rotations: matrices (n, 4, 4) and (n, 3, 3) float64, rotation vectors (n, 3) [rad]."""
+"""Batches of rigid transforms (n, 4, 4), rotations (n, 3, 3) and rotation vectors (n, 3) [rad]; all are float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Submaps: labelled surfaces of a few seconds of one robot's scans, and the edges between overlapping ones."""
+"""Submaps: labelled surfaces of a few seconds of one robot's scans, and transforms measured between them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,40 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from octoreplay.records import Float64Array, Int64Array, UInt8Array
-from octoreplay.registration.pose_graph import PoseGraphEdge
+from octoreplay.records import BoolArray, Float64Array, Int64Array, UInt8Array
 from octoreplay.registration.rigid import moved
 from octoreplay.transforms import inverse
 
-VOXEL = 0.2
-_CLASS_DISTANCE = 1e3
-_NUM_NEIGHBOURS = 14
-_NORMAL_RADIUS = 0.7
+# Distance between neighbouring classes in the tree's fourth coordinate, in voxels; no gate reaches it.
+_CLASS_DISTANCE = 1e5
+_POINTS_PER_VOXEL = 3
+# A point is on a plane where the smallest variance of its neighbours is below this share of the second one.
 _FLATNESS = 0.12
-CONS = 0.9
+_NUM_NEIGHBOURS, _MIN_NEIGHBOURS, _NEIGHBOUR_RADIUS = 14, 6, 3.5
+_NUM_SAMPLES = 1000
+_LEAST_COSINE = 0.75
+# Standard deviation of a distance to a plane [voxel], and the number of correspondences that count as one.
+_SIGMA, _CORRESPONDENCES_PER_SAMPLE = 0.75, 20.0
+_MIN_CORRESPONDENCES = 60
+# A registration is refused where fewer correspondences than this share are within the distance to the plane [voxel].
+_LEAST_CLOSE_SHARE, _CLOSE = 0.9, 0.6
+# One Gauss-Newton step from a guess; directions without information stay within these deviations [voxel], [rad].
+_STEP_SHIFT, _STEP_ANGLE = 2.5, 0.05
+_OVERLAP_CELL, _MIN_OVERLAP_CELLS, _MIN_OVERLAP_SHARE = 5.0, 8, 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """Surface seen in a few seconds: points (n, 3) with class ids (n,), normals (n, 3) in the frame of the anchor."""
+    """Surface seen by one robot in a few seconds, in the frame of its anchor: the sensor at ``stamp_ns``.
+
+    - ``T_team_anchor`` (4, 4) float64: recorded pose of the anchor.
+    - ``points`` (n, 3) float64 [m], one for each occupied voxel, with ``class_ids`` (n,) uint8.
+    - ``normals`` (n, 3) float64, valid where ``is_flat`` (n,).
+    - ``samples`` (s,) int64: flat points spread over the directions of normals.
+    """
 
     robot: int
     stamp_ns: int
@@ -31,101 +47,155 @@ class Submap:
     points: Float64Array
     class_ids: UInt8Array
     normals: Float64Array
-    is_flat: np.ndarray
-    sample: Int64Array
+    is_flat: BoolArray
+    samples: Int64Array
+    voxel: float
     tree: cKDTree
 
+    @classmethod
+    def of_points(
+        cls, robot: int, stamp_ns: int, T_team_anchor: Float64Array, points: Float64Array, class_ids: UInt8Array,
+        voxel: float,
+    ) -> Submap:  # fmt: skip
+        """Return the submap of measured points (m, 3) in the anchor's frame with their classes (m,).
 
-def surface(points, class_ids, num_samples, rng):
-    """points, majority class per voxel"""
-    keys = np.floor(points / VOXEL).astype(np.int64) + (1 << 19)
-    cell = (keys[:, 0] << 40) | (keys[:, 1] << 20) | keys[:, 2]
-    code = cell * 256 + class_ids
-    order = np.argsort(code, kind="stable")
-    code = code[order]
-    start = np.flatnonzero(np.r_[True, code[1:] != code[:-1]])
-    count = np.diff(np.r_[start, code.size])
-    mean = np.add.reduceat(points[order], start, axis=0) / count[:, None]
-    cells, classes = code[start] // 256, (code[start] % 256).astype(np.uint8)
-    # majority class of each voxel
-    best = np.lexsort((-count, cells))
-    first = best[np.r_[True, cells[best][1:] != cells[best][:-1]]]
-    first = first[(count[first] >= 3) & (classes[first] > 0)]
-    return mean[first], classes[first]
+        Each voxel of the edge ``voxel`` [m] gives the mean of the points of its most frequent class. Points without a
+        class (0) are left out.
+        """
+        points, class_ids = _voxel_means(points, class_ids, voxel)
+        normals, is_flat = _normals(points, _NEIGHBOUR_RADIUS * voxel)
+        tree = cKDTree(_keys(points, class_ids, voxel))
+        samples = _spread_samples(normals, is_flat)
+        return cls(
+            robot, stamp_ns, T_team_anchor, points, class_ids, normals, is_flat, samples, voxel, tree
+        )  # fmt: skip
 
 
-def make_submap(robot, stamp_ns, T_team_anchor, points, class_ids, num_samples=1000):
-    rng = np.random.default_rng(0)
-    p, c = surface(points, class_ids, num_samples, rng)
-    tree4 = cKDTree(np.column_stack([p, c * _CLASS_DISTANCE]))
-    tree = cKDTree(p)
-    d, i = tree.query(p, k=min(_NUM_NEIGHBOURS, len(p)), distance_upper_bound=_NORMAL_RADIUS)
-    ok = i < len(p)
-    x = np.where(ok[..., None], p[np.minimum(i, len(p) - 1)], 0.0)
-    n = ok.sum(1)
-    mean = x.sum(1) / n[:, None]
-    y = np.where(ok[..., None], x - mean[:, None], 0.0)
-    cov = np.einsum("nki,nkj->nij", y, y) / n[:, None, None]
-    w, v = np.linalg.eigh(cov)
-    normals = v[:, :, 0]
-    flat = (n >= 6) & (w[:, 0] < _FLATNESS * w[:, 1])
-    # Samples spread over the directions of normals: each of 13 bins alike.
-    axis = np.abs(normals).argmax(1)
+def _voxel_means(points: Float64Array, class_ids: UInt8Array, voxel: float) -> tuple[Float64Array, UInt8Array]:
+    """Mean (n, 3) and class (n,) of the most frequent class in each voxel with enough points of it."""
+    labelled = class_ids > 0
+    points, class_ids = points[labelled], class_ids[labelled]
+    keys = np.floor(points / voxel).astype(np.int64) + (1 << 17)
+    codes = ((((keys[:, 0] << 18) | keys[:, 1]) << 18 | keys[:, 2]) << 8) | class_ids
+    order = np.argsort(codes, kind="stable")
+    codes = codes[order]
+    starts = np.flatnonzero(np.diff(codes, prepend=-1))
+    counts = np.diff(starts, append=codes.size)
+    means = np.add.reduceat(points[order], starts, axis=0) / counts[:, None] if starts.size else np.empty((0, 3))
+    cells, classes = codes[starts] >> 8, (codes[starts] & 255).astype(np.uint8)
+    # The most frequent class of each voxel comes first; ties go to the lower id.
+    by_count = np.lexsort((classes, -counts, cells))
+    chosen = by_count[np.flatnonzero(np.diff(cells[by_count], prepend=-1))]
+    chosen = chosen[counts[chosen] >= _POINTS_PER_VOXEL]
+    return means[chosen], classes[chosen]
+
+
+def _normals(points: Float64Array, radius: float) -> tuple[Float64Array, BoolArray]:
+    """Normals (n, 3) of the local planes, and whether (n,) the neighbours within ``radius`` [m] lie on a plane."""
+    if len(points) == 0:
+        return np.empty((0, 3)), np.empty(0, np.bool_)
+    _, neighbours = cKDTree(points).query(points, k=_NUM_NEIGHBOURS, distance_upper_bound=radius)
+    exists = neighbours < len(points)
+    count = exists.sum(axis=1)
+    offsets = np.where(exists[..., None], points[np.where(exists, neighbours, 0)] - points[:, None], 0.0)
+    offsets -= (offsets.sum(axis=1) / count[:, None])[:, None] * exists[..., None]
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets) / count[:, None, None])
+    is_flat = (count >= _MIN_NEIGHBOURS) & (variances[:, 0] < _FLATNESS * variances[:, 1])
+    return axes[:, :, 0], is_flat
+
+
+def _spread_samples(normals: Float64Array, is_flat: BoolArray) -> Int64Array:
+    """Flat points, up to a third of the samples for each axis that normals are nearest to, so that ground is no majority."""
+    nearest_axis = np.abs(normals).argmax(axis=1) if len(normals) else np.empty(0, np.int64)
     chosen = []
-    for k in range(3):
-        of = np.flatnonzero(flat & (axis == k))
-        m = min(len(of), num_samples // 3)
-        chosen.append(rng.choice(of, m, replace=False))
-    return Submap(robot, stamp_ns, T_team_anchor, p, c, normals, flat, np.sort(np.concatenate(chosen)), tree4)
+    for axis in range(3):
+        points = np.flatnonzero(is_flat & (nearest_axis == axis))
+        stride = max(1.0, points.size / (_NUM_SAMPLES // 3))
+        chosen.append(points[np.arange(0, points.size, stride).astype(np.int64)])
+    return np.sort(np.concatenate(chosen))
 
 
-def _half(a, b, T, gate, sigma, frame_is_b):
-    """Samples of b matched in a. T maps b to a. H, g in the right perturbation of T (first a, second b)."""
-    s = b.sample
-    p = b.points[s]
-    q = p @ T[:3, :3].T + T[:3, 3]
-    d, i = a.tree.query(np.column_stack([q, b.class_ids[s] * _CLASS_DISTANCE]), distance_upper_bound=gate)
-    ok = i < len(a.points)
-    i = np.minimum(i, len(a.points) - 1)
-    nb = b.normals[s] @ T[:3, :3].T
-    na = a.normals[i]
-    ok &= a.is_flat[i] & (np.abs(np.einsum("ni,ni->n", nb, na)) > 0.75)
-    r = np.einsum("ni,ni->n", na, q - a.points[i])[ok]
-    n = na[ok] @ T[:3, :3]  # in b's frame
-    J = np.concatenate([n, np.cross(p[ok], n)], axis=1)
-    return r, J
+def _keys(points: Float64Array, class_ids: UInt8Array, voxel: float) -> Float64Array:
+    """Coordinates (n, 4) in which points of different classes are far apart."""
+    return np.column_stack([points, class_ids * (_CLASS_DISTANCE * voxel)])
 
 
-def step(a, b, T, gate, sigma):
-    r1, J1 = _half(a, b, T, gate, sigma, True)
-    Ti = inverse(T)
-    r2, J2 = _half(b, a, Ti, gate, sigma, False)
-    # A right step xi of T is a right step of T^-1 by -Ad(T) xi.
-    R, t = T[:3, :3], T[:3, 3]
-    Ad = np.zeros((6, 6))
-    Ad[:3, :3] = R
-    Ad[3:, 3:] = R
-    tx = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    Ad[:3, 3:] = tx @ R
-    J2 = -J2 @ Ad
-    r = np.concatenate([r1, r2])
-    J = np.concatenate([J1, J2])
-    k = gate / 3
-    w = 1.0 / (1.0 + (r / k) ** 2) ** 2
-    H = (J * w[:, None]).T @ J
-    g = J.T @ (w * r)
-    return H, g, float((np.abs(r) < 0.12).mean()) if len(r) else 0.0, len(r), float(np.sqrt((w * r * r).sum() / max(w.sum(), 1e-9)))
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Measured transform between two submaps: ``T_first_second`` (4, 4), ``information`` (6, 6) as in the pose graph."""
+
+    T_first_second: Float64Array
+    information: Float64Array
 
 
-def register(a, b, T, gates, sigma=0.15, num_per_one=20.0):
-    """T_ab and information after GN steps"""
-    for gate in gates:
-        H, g, n, num, rms = step(a, b, T, gate, sigma)
-        if num < 60 or (gate < 0.45 and n < CONS):
-            return None
-        scale = num_per_one * sigma**2
-        # Weak directions stay: a prior of the start pose
-        prior = np.diag([1 / 0.5**2] * 3 + [1 / 0.05**2] * 3)
-        x = np.linalg.solve(H / scale + prior, -g / scale)
-        T = moved(T[None], x[None])[0]
-    return T, H / scale, num, rms
+def register(
+    first: Submap, second: Submap, T_first_second: Float64Array, gate: float, *, is_final: bool
+) -> Registration | None:
+    """Return the transform between two submaps after one step from a guess; None where they do not fit.
+
+    A Gauss-Newton step on the distances between points of one submap and planes of equal class in the other, in both
+    directions (point-to-plane: Chen and Medioni, Image and Vision Computing 1992), weighted by Geman and McClure's
+    function. Points correspond within ``gate`` [m]. Where ``is_final``, nine of ten correspondences must be close to
+    their planes.
+    """
+    forward = _residuals(second, first, T_first_second, gate)
+    backward = _residuals(first, second, inverse(T_first_second), gate)
+    # A step of T_first_second in the second's frame is the opposite step of its inverse, seen in the first's frame.
+    residuals = np.concatenate([forward[0], backward[0]])
+    jacobian = np.concatenate([forward[1], -backward[1] @ _adjoint(T_first_second)])
+    voxel = first.voxel
+    if residuals.size < _MIN_CORRESPONDENCES:
+        return None
+    if is_final and np.mean(np.abs(residuals) < _CLOSE * voxel) < _LEAST_CLOSE_SHARE:
+        return None
+    weights = 1.0 / (1.0 + np.square(residuals * (3.0 / gate))) ** 2
+    weights /= _CORRESPONDENCES_PER_SAMPLE * (_SIGMA * voxel) ** 2
+    information = (jacobian * weights[:, None]).T @ jacobian
+    near_guess = np.diag([(_STEP_SHIFT * voxel) ** -2.0] * 3 + [_STEP_ANGLE**-2.0] * 3)
+    step = -np.linalg.solve(information + near_guess, jacobian.T @ (weights * residuals))
+    return Registration(moved(T_first_second[None], step[None])[0], information)
+
+
+def _residuals(moving: Submap, fixed: Submap, T: Float64Array, gate: float) -> tuple[Float64Array, Float64Array]:
+    """Distances (k,) to planes [m] of the moving samples under T = T_fixed_moving, and derivatives (k, 6) by its step."""
+    points, class_ids = moving.points[moving.samples], moving.class_ids[moving.samples]
+    rotation = T[:3, :3]
+    in_fixed = points @ rotation.T + T[:3, 3]
+    distance, nearest = fixed.tree.query(_keys(in_fixed, class_ids, fixed.voxel), distance_upper_bound=gate)
+    found = np.flatnonzero(np.isfinite(distance))
+    found = found[fixed.is_flat[nearest[found]]]
+    planes = fixed.normals[nearest[found]]
+    own = moving.normals[moving.samples[found]] @ rotation.T
+    agrees = np.abs(np.einsum("ki,ki->k", planes, own)) > _LEAST_COSINE
+    found, planes = found[agrees], planes[agrees]
+    residuals = np.einsum("ki,ki->k", planes, in_fixed[found] - fixed.points[nearest[found]])
+    in_moving = planes @ rotation
+    return residuals, np.concatenate([in_moving, np.cross(points[found], in_moving)], axis=1)
+
+
+def _adjoint(T: Float64Array) -> Float64Array:
+    """Matrix (6, 6) that maps a step (translation, rotation) in the second frame to the first frame."""
+    adjoint = np.zeros((6, 6))
+    x, y, z = T[:3, 3]
+    adjoint[:3, :3] = adjoint[3:, 3:] = T[:3, :3]
+    adjoint[:3, 3:] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ T[:3, :3]
+    return adjoint
+
+
+def overlapping_pairs(submaps: Sequence[Submap], poses: Float64Array) -> list[tuple[int, int]]:
+    """Return the pairs (i, j), i < j, of submaps that occupy common cells under the poses (n, 4, 4) of their anchors."""
+    cells, owners = [], []
+    for index, (submap, pose) in enumerate(zip(submaps, poses, strict=True)):
+        points = submap.points[submap.samples] @ pose[:3, :3].T + pose[:3, 3]
+        keys = np.unique(np.floor(points / (_OVERLAP_CELL * submap.voxel)).astype(np.int64) + (1 << 20), axis=0)
+        cells.append((keys[:, 0] << 42) | (keys[:, 1] << 21) | keys[:, 2])
+        owners.append(np.full(len(keys), index))
+    _, columns = np.unique(np.concatenate(cells), return_inverse=True)
+    rows = np.concatenate(owners)
+    shape = (len(submaps), int(columns.max(initial=-1)) + 1)
+    occupied = coo_matrix((np.ones(rows.size, np.int64), (rows, columns)), shape).tocsr()
+    common = (occupied @ occupied.T).tocoo()
+    size = np.asarray(occupied.sum(axis=1)).ravel()
+    least = np.maximum(_MIN_OVERLAP_SHARE * np.minimum(size[common.row], size[common.col]), _MIN_OVERLAP_CELLS)
+    chosen = (common.row < common.col) & (common.data >= least)
+    return sorted(zip(common.row[chosen].tolist(), common.col[chosen].tolist(), strict=True))
