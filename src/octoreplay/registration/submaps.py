@@ -27,7 +27,7 @@ _MIN_CORRESPONDENCES = 60
 # A registration is refused where fewer correspondences than this share are within the distance to the plane [voxel].
 _LEAST_CLOSE_SHARE, _CLOSE = 0.9, 0.6
 # One Gauss-Newton step from a guess; directions without information stay within these deviations [voxel], [rad].
-_STEP_SHIFT, _STEP_ANGLE = 2.5, 0.05
+_STEP_SHIFT, _STEP_ANGLE = 25.0, 0.5
 _OVERLAP_CELL, _MIN_OVERLAP_CELLS, _MIN_OVERLAP_SHARE = 5.0, 8, 0.03
 
 
