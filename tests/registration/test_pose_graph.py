@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from octoreplay.registration.pose_graph import PoseGraphEdge, PosePrior, solve
 from octoreplay.registration.rigid import inverses, moved, rotation_logs
 from octoreplay.transforms import inverse

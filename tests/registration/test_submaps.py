@@ -33,8 +33,8 @@ TRUE = inverse(FIRST) @ SECOND
 
 def registered(first: Submap, second: Submap, guess: np.ndarray) -> np.ndarray | None:
     """Transform after rounds with smaller and smaller gates."""
-    for gate in (1.5, 1.2, 1.0, 0.8, 0.6, 0.5, 0.4, 0.35, 0.35):
-        found = register(first, second, guess, gate, is_final=gate < 0.4)
+    for gate in (1.5, 1.0, 0.8, 0.6, 0.6):
+        found = register(first, second, guess, gate, is_final=gate < 0.7)
         if found is None:
             return None
         guess = found.T_first_second

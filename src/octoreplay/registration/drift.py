@@ -20,9 +20,9 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Function that calls another one with each of some items: ``map``, or the ``map`` of an executor."""
 
 # Largest distances between corresponding points, one round each [voxel].
-_GATES = (7.5, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.75, 1.75)
+_GATES = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 3.0, 3.0)
 # Gate from which on registrations must fit [voxel].
-_FINAL_GATE = 2.25
+_FINAL_GATE = 3.25
 # Way after which the random part of the drift has the same variance as the systematic part [m].
 _REFERENCE_WAY = 50.0
 _SYSTEMATIC_SHARE = 0.8

@@ -26,7 +26,8 @@ _SIGMA, _CORRESPONDENCES_PER_SAMPLE = 0.75, 20.0
 _MIN_CORRESPONDENCES = 60
 # A registration is refused where fewer correspondences than this share are within the distance to the plane [voxel].
 _LEAST_CLOSE_SHARE, _CLOSE = 0.9, 0.6
-# One Gauss-Newton step from a guess; directions without information stay within these deviations [voxel], [rad].
+# Directions without information stay within these deviations of the guess in each Gauss-Newton step [voxel], [rad].
+_NUM_STEPS = 2
 _STEP_SHIFT, _STEP_ANGLE = 25.0, 0.5
 _OVERLAP_CELL, _MIN_OVERLAP_CELLS, _MIN_OVERLAP_SHARE = 5.0, 8, 0.03
 
@@ -105,7 +106,7 @@ def _normals(points: Float64Array, radius: float) -> tuple[Float64Array, BoolArr
 
 
 def _spread_samples(normals: Float64Array, is_flat: BoolArray) -> Int64Array:
-    """Flat points, up to a third of the samples for each axis that normals are nearest to, so that ground is no majority."""
+    """Flat points, a third of the samples for each axis that normals are nearest to, so that ground is no majority."""
     nearest_axis = np.abs(normals).argmax(axis=1) if len(normals) else np.empty(0, np.int64)
     chosen = []
     for axis in range(3):
@@ -122,7 +123,7 @@ def _keys(points: Float64Array, class_ids: UInt8Array, voxel: float) -> Float64A
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Measured transform between two submaps: ``T_first_second`` (4, 4), ``information`` (6, 6) as in the pose graph."""
+    """Measured transform of two submaps: ``T_first_second`` (4, 4), ``information`` (6, 6) as in the pose graph."""
 
     T_first_second: Float64Array
     information: Float64Array
@@ -131,33 +132,42 @@ class Registration:
 def register(
     first: Submap, second: Submap, T_first_second: Float64Array, gate: float, *, is_final: bool
 ) -> Registration | None:
-    """Return the transform between two submaps after one step from a guess; None where they do not fit.
+    """Return the transform between two submaps, nearer to the best one than a guess; None where they do not fit.
 
-    A Gauss-Newton step on the distances between points of one submap and planes of equal class in the other, in both
+    Two Gauss-Newton steps on the distances between points of one submap and planes of equal class in the other, in both
     directions (point-to-plane: Chen and Medioni, Image and Vision Computing 1992), weighted by Geman and McClure's
     function. Points correspond within ``gate`` [m]. Where ``is_final``, nine of ten correspondences must be close to
     their planes.
     """
+    voxel, information = first.voxel, np.zeros((6, 6))
+    near_guess = np.diag([(_STEP_SHIFT * voxel) ** -2.0] * 3 + [_STEP_ANGLE**-2.0] * 3)
+    for _ in range(_NUM_STEPS):
+        residuals, jacobian = _both_residuals(first, second, T_first_second, gate)
+        if residuals.size < _MIN_CORRESPONDENCES:
+            return None
+        if is_final and np.mean(np.abs(residuals) < _CLOSE * voxel) < _LEAST_CLOSE_SHARE:
+            return None
+        weights = 1.0 / (1.0 + np.square(residuals * (3.0 / gate))) ** 2
+        weights /= _CORRESPONDENCES_PER_SAMPLE * (_SIGMA * voxel) ** 2
+        information = (jacobian * weights[:, None]).T @ jacobian
+        step = -np.linalg.solve(information + near_guess, jacobian.T @ (weights * residuals))
+        T_first_second = moved(T_first_second[None], step[None])[0]
+    return Registration(T_first_second, information)
+
+
+def _both_residuals(
+    first: Submap, second: Submap, T_first_second: Float64Array, gate: float
+) -> tuple[Float64Array, Float64Array]:
+    """Distances (k,) to planes of either submap, and derivatives (k, 6) by a step of the transform."""
     forward = _residuals(second, first, T_first_second, gate)
     backward = _residuals(first, second, inverse(T_first_second), gate)
     # A step of T_first_second in the second's frame is the opposite step of its inverse, seen in the first's frame.
     residuals = np.concatenate([forward[0], backward[0]])
-    jacobian = np.concatenate([forward[1], -backward[1] @ _adjoint(T_first_second)])
-    voxel = first.voxel
-    if residuals.size < _MIN_CORRESPONDENCES:
-        return None
-    if is_final and np.mean(np.abs(residuals) < _CLOSE * voxel) < _LEAST_CLOSE_SHARE:
-        return None
-    weights = 1.0 / (1.0 + np.square(residuals * (3.0 / gate))) ** 2
-    weights /= _CORRESPONDENCES_PER_SAMPLE * (_SIGMA * voxel) ** 2
-    information = (jacobian * weights[:, None]).T @ jacobian
-    near_guess = np.diag([(_STEP_SHIFT * voxel) ** -2.0] * 3 + [_STEP_ANGLE**-2.0] * 3)
-    step = -np.linalg.solve(information + near_guess, jacobian.T @ (weights * residuals))
-    return Registration(moved(T_first_second[None], step[None])[0], information)
+    return residuals, np.concatenate([forward[1], -backward[1] @ _adjoint(T_first_second)])
 
 
 def _residuals(moving: Submap, fixed: Submap, T: Float64Array, gate: float) -> tuple[Float64Array, Float64Array]:
-    """Distances (k,) to planes [m] of the moving samples under T = T_fixed_moving, and derivatives (k, 6) by its step."""
+    """Distances (k,) of moving samples to planes under T = T_fixed_moving [m], and derivatives (k, 6) by its step."""
     points, class_ids = moving.points[moving.samples], moving.class_ids[moving.samples]
     rotation = T[:3, :3]
     in_fixed = points @ rotation.T + T[:3, 3]
@@ -183,7 +193,7 @@ def _adjoint(T: Float64Array) -> Float64Array:
 
 
 def overlapping_pairs(submaps: Sequence[Submap], poses: Float64Array) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of submaps that occupy common cells under the poses (n, 4, 4) of their anchors."""
+    """Return the pairs (i, j), i < j, of submaps with common occupied cells under the anchors' poses (n, 4, 4)."""
     cells, owners = [], []
     for index, (submap, pose) in enumerate(zip(submaps, poses, strict=True)):
         points = submap.points[submap.samples] @ pose[:3, :3].T + pose[:3, 3]
