@@ -150,7 +150,7 @@ def register(
         weights = 1.0 / (1.0 + np.square(residuals * (3.0 / gate))) ** 2
         weights /= _CORRESPONDENCES_PER_SAMPLE * (_SIGMA * voxel) ** 2
         information = (jacobian * weights[:, None]).T @ jacobian
-        step: Float64Array = -np.linalg.solve(information + near_guess, jacobian.T @ (weights * residuals))
+        step = np.linalg.solve(information + near_guess, -jacobian.T @ (weights * residuals)).astype(np.float64)
         T_first_second = moved(T_first_second[None], step[None])[0]
     return Registration(T_first_second, information)
 
