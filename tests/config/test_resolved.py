@@ -17,7 +17,7 @@ CLASSES = ClassTable((SemanticClass(1, "tree", (1,), ()),))
 
 def robot(name="a", *, span=(5 * SECOND, 25 * SECOND), **fields):
     known = {"depth_topic": "/depth", "pose_topic": "/odom"}
-    return ResolvedRobot(name, (Path(f"{name}.mcap"),), **{**known, **fields}, log_span_ns=span)
+    return ResolvedRobot(name, (Path(f"{name}.mcap"),), **{**known, **fields}, span_ns=span)
 
 
 @pytest.mark.parametrize(

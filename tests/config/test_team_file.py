@@ -57,7 +57,7 @@ def test_the_template_has_every_key_and_names_missing_data():
 def test_commented_defaults_of_the_template_are_the_defaults():
     config = RunConfig((PLAIN,), classes=CLASSES)
     text = team_template(config, {})
-    names = "|".join([*PARAMETERS, "clock_offset", "T_team_map", "publish_phase"])
+    names = "|".join([*PARAMETERS, "clock_offset", "publish_phase"])
     uncommented, count = re.subn(rf"^( *)# ((?:{names}): .*)$", r"\1\2", text, flags=re.MULTILINE)
     assert count > 40
     assert parse_team(uncommented, name="team.yaml", folder=Path()) == config

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from octoreplay.config.resolved import ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.robots.describe import describe
 from octoreplay.io.robots.discover import discover, resolve
+from octoreplay.io.robots.log_groups import LogGroup
+from octoreplay.io.robots.pose_frames import find_map_frame
+from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.survey import survey_log
 from octoreplay.io.robots.trajectories import read_rows, trajectory
+from support.log_factory import SECOND
 from support.recordings import RECORDINGS, needs_recordings
 from support.scan_maps import octree_of
 
@@ -70,3 +77,24 @@ def test_trajectories_of_real_robots_are_read():
     assert len(track.stamps_ns) == 19_998
     assert (np.diff(track.stamps_ns) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(track.rotations, axis=1), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("pose_topic", ["/odom", "/tf"])
+def test_the_corrected_odometry_of_a_real_robot_is_that_of_its_localisation(pose_topic):
+    path = RECORDINGS / "mcap_ros2" / "evo_nav2_turtlebot.mcap"
+    plain = RobotConfig("r", (path,), cloud_topic="/scan", pose_topic=pose_topic, sensor_frame="base_link")
+    with open_log(path) as log:
+        frame = find_map_frame(plain, LogGroup("r", (survey_log(log),), None))
+        assert (frame.name, frame.pose_frame, frame.is_corrected) == ("map", "odom", True)
+        robot = ResolvedRobot.from_config(dataclasses.replace(plain, map_frame=frame.name), None, frame)
+        source = PoseSource(robot, [log], sensor_frame="base_link", pose_gap_ns=SECOND // 2, use_log_time=False)
+        for message in log.messages(source.topics):
+            source.take(message)
+        estimates = [message.sensor_message().transforms[0] for message in log.messages(("/amcl_pose",))]
+    poses = [(source.at(estimate.stamp_ns), estimate.translation) for estimate in estimates]
+    errors = [np.hypot(*(T[:2, 3] - position[:2])) for T, position in poses if T is not None]
+    assert len(poses) == 135
+    # One estimate is in a gap of the odometry. Corrections are published up to 2.3 s apart.
+    assert len(errors) == 134
+    assert np.median(errors) < 0.05
+    assert max(errors) < 0.2

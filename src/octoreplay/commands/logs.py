@@ -10,24 +10,35 @@ import click
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import check_output, existing_path, numbers
 from octoreplay.commands.progress import progress_bar
+from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.text_files import write_whole
 
+_strict_frames = click.option(
+    "--strict-frames", is_flag=True, help=f"{PARAMETERS['strict_frames'].help}, instead of a warning"
+)
+
 
 @click.command(short_help="Show the contents of logs and what is missing for a run.")
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
-def info(logs: tuple[Path, ...]) -> int:
-    """Show the contents of logs: robots, topics, types, rates and time spans, and what is missing for a run."""
+@_strict_frames
+def info(logs: tuple[Path, ...], strict_frames: bool) -> int:
+    """Show the contents of logs: robots, topics, types, rates and time spans, and what is missing for a run.
+
+    Frames and clocks of robots that do not fit together are named as warnings.
+    """
     from octoreplay.io.robots.describe import describe
     from octoreplay.report import tables
 
-    description = describe(logs)
+    description = describe(logs, strict_frames=strict_frames)
     if any(log.error is None for log in description.logs):
         tables.show(tables.terminal(), tables.description(description))
     errors = [log.error for log in description.logs if log.error is not None]
     for error in errors:
         click.echo(f"error: {error}", err=True)
+    for sentence in description.warnings:
+        click.echo(f"warning: {sentence}", err=True)
     return EXIT_ERROR if errors else 0
 
 
@@ -35,10 +46,12 @@ def info(logs: tuple[Path, ...]) -> int:
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="TEAM.yaml", help="team file to write")
 @click.option("--force", is_flag=True, help="overwrite an existing file")
-def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
+@_strict_frames
+def init(logs: tuple[Path, ...], output: Path, force: bool, strict_frames: bool) -> int:
     """Write a team file with the robots and topics found in logs, and every other setting as a comment.
 
-    Anything that is missing for a run is named in the file and on the terminal.
+    Anything that is missing for a run is named in the file and on the terminal, and so are frames and clocks of robots
+    that do not fit together.
     """
     from octoreplay.config.team_template import team_template
     from octoreplay.io.robots.describe import describe
@@ -46,7 +59,7 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
     check_output(output, ".yaml", logs)
     if output.exists() and not force:
         raise OutputError(f"{output}: already exists; name another file, or use --force to overwrite it")
-    description = describe(logs)
+    description = describe(logs, strict_frames=strict_frames)
     for log in description.logs:
         if log.error is not None:
             raise InputError(log.error)
@@ -55,10 +68,16 @@ def init(logs: tuple[Path, ...], output: Path, force: bool) -> int:
     robots = tuple(summary.robot.with_absolute_paths() for summary in description.robots)
     missing = {summary.robot.robot_id: summary.missing for summary in description.robots}
     config = RunConfig(robots, classes=description.class_table)
-    write_whole(output, team_template(config, {"": description.missing, **missing}, output.parent.resolve()))
+    notes = {summary.robot.robot_id: summary.notes for summary in description.robots}
+    notes[""] = tuple(f"warning: {sentence}" for sentence in description.warnings)
+    write_whole(
+        output, team_template(config, {"": description.missing, **missing}, output.parent.resolve(), notes=notes)
+    )
     click.echo(f"wrote {output} ({len(robots)} robot{'s' if len(robots) > 1 else ''})")
     for sentence in (*description.missing, *(sentence for found in missing.values() for sentence in found)):
         click.echo(f"missing for a run: {sentence}", err=True)
+    for sentence in description.warnings:
+        click.echo(f"warning: {sentence}", err=True)
     return 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,10 +89,11 @@ def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, s
         yield update
 
 
-def show_warnings(err: Console, summary: RunSummary) -> None:
-    """Print a run's warnings, and the data that each robot's logs lost."""
+def show_warnings(err: Console, summary: RunSummary, shown: Sequence[str] = ()) -> None:
+    """Print a run's warnings, except those ``shown`` before, and the data that each robot's logs lost."""
     for sentence in summary.warnings:
-        warn(err, sentence)
+        if sentence not in shown:
+            warn(err, sentence)
     # Robots may share a log.
     for sentence in dict.fromkeys(s for counts in summary.frame_counts.values() for s in counts.truncated_files):
         warn(err, sentence)

@@ -9,7 +9,7 @@ import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
-from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar
+from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
 from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
@@ -64,6 +64,8 @@ def run(
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         tables.show(out, tables.class_list(config.classes))
+    for sentence in config.warnings:
+        warn(err, sentence)
     if save_team is not None:
         save_team_file(config, save_team)
         out.print(f"saved {save_team}", soft_wrap=True)
@@ -71,7 +73,7 @@ def run(
         return 0
     summary = replay_with_bar(config, output)
     tables.show(out, tables.results(summary))
-    show_warnings(err, summary)
+    show_warnings(err, summary, shown=config.warnings)
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
     return EXIT_DATA_LOST if summary.lost_data else 0
 

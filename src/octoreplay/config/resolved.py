@@ -14,15 +14,49 @@ from octoreplay.records import ClassTable
 
 
 @dataclass(frozen=True)
+class MapFrame:
+    """Map frame of a robot as its logs give it.
+
+    Attributes
+    ----------
+    name : str or None
+        The frame; None for a trajectory file without a configured ``map_frame``.
+    pose_frame : str or None
+        Frame that the poses are given in, at or below the map frame; None for a file.
+    is_corrected : bool
+        A transform between the two changes, as SLAM and localisation publish it.
+    place : tuple of 16 float or None
+        Transform by rows that the map frame's constant transforms give the frames below it; None without one.
+    tree, body : frozenset of str
+        Frames that TF joins to the map frame, and frames of the robot's body and sensor.
+    """
+
+    name: str | None
+    pose_frame: str | None = None
+    is_corrected: bool = False
+    place: tuple[float, ...] | None = None
+    tree: frozenset[str] = frozenset()
+    body: frozenset[str] = frozenset()
+
+    @property
+    def origin(self) -> str:
+        """Clause on the way of the poses to the map frame; empty where they are given in it."""
+        if self.pose_frame in (None, self.name):
+            return ""
+        return f"poses in {self.pose_frame}, {'corrected' if self.is_corrected else 'placed'} by TF"
+
+
+@dataclass(frozen=True)
 class ResolvedRobot(RobotConfig):
     """Robot configuration with a sensor topic and a pose source.
 
-    ``log_span_ns`` holds the log times of the first and the last message of any topic in the robot's logs, without the
-    clock offset; None where it is unknown or the logs hold no messages. Raises ConfigError without a sensor topic or
-    without a pose source.
+    ``span_ns`` holds the stamps of the first and the last message of any topic in the robot's logs, without the clock
+    offset; None where it is unknown or the logs hold no messages. ``frame`` is the map frame as found in the logs; None
+    where it is unknown. Raises ConfigError without a sensor topic or without a pose source.
     """
 
-    log_span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
+    span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
+    frame: MapFrame | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,9 +66,9 @@ class ResolvedRobot(RobotConfig):
             raise ConfigError(f"robot '{self.robot_id}': needs a pose_topic or pose_file")
 
     @classmethod
-    def from_config(cls, robot: RobotConfig, log_span_ns: tuple[int, int] | None) -> Self:
+    def from_config(cls, robot: RobotConfig, span_ns: tuple[int, int] | None, frame: MapFrame | None = None) -> Self:
         """Return the resolved robot of a configuration. Raises ConfigError without a sensor topic or a pose source."""
-        return cls(**_values(robot, RobotConfig), log_span_ns=log_span_ns)
+        return cls(**_values(robot, RobotConfig), span_ns=span_ns, frame=frame)
 
     def to_config(self) -> RobotConfig:
         """Return the plain configuration, which compares equal to one from a team file."""
@@ -52,26 +86,28 @@ class ResolvedRobot(RobotConfig):
 
     @property
     def start_ns(self) -> int | None:
-        """Log time of the first message of any topic, clock offset applied; None where it is unknown."""
-        return None if self.log_span_ns is None else self.log_span_ns[0] + self.clock_offset_ns
+        """Stamp of the first message of any topic, clock offset applied; None where it is unknown."""
+        return None if self.span_ns is None else self.span_ns[0] + self.clock_offset_ns
 
     @property
     def end_ns(self) -> int | None:
-        """Log time of the last message of any topic, clock offset applied; None where it is unknown."""
-        return None if self.log_span_ns is None else self.log_span_ns[1] + self.clock_offset_ns
+        """Stamp of the last message of any topic, clock offset applied; None where it is unknown."""
+        return None if self.span_ns is None else self.span_ns[1] + self.clock_offset_ns
 
 
 @dataclass(frozen=True)
 class ResolvedRun(RunConfig):
     """Run configuration whose robots are resolved and whose class table is known.
 
-    ``merge_classes`` and ``ignore_hits`` are empty: they are part of ``classes`` already. Changed parameters
-    (``with_parameters``, ``dataclasses.replace``) keep the resolution.
+    ``merge_classes`` and ``ignore_hits`` are empty: they are part of ``classes`` already. ``warnings`` are sentences on
+    frames and clocks of the robots that do not fit together. Changed parameters (``with_parameters``,
+    ``dataclasses.replace``) keep the resolution.
     """
 
     robots: tuple[ResolvedRobot, ...]
     # Without field() the class would inherit the base class's default None.
     classes: ClassTable = field()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,10 +115,12 @@ class ResolvedRun(RunConfig):
             raise ConfigError("merge_classes, ignore_hits: must be empty in a resolved run; edit its classes instead")
 
     @classmethod
-    def from_config(cls, config: RunConfig, robots: Sequence[ResolvedRobot], classes: ClassTable) -> Self:
+    def from_config(
+        cls, config: RunConfig, robots: Sequence[ResolvedRobot], classes: ClassTable, warnings: Sequence[str] = ()
+    ) -> Self:
         """Return a run configuration with its robots and classes resolved."""
         resolved = {"robots": tuple(robots), "classes": classes, "merge_classes": (), "ignore_hits": ()}
-        return cls(**{**_values(config, RunConfig), **resolved})
+        return cls(**{**_values(config, RunConfig), **resolved}, warnings=tuple(warnings))
 
     def to_config(self) -> RunConfig:
         """Return the plain configuration, which compares equal to the one that a result stores."""

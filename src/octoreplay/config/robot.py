@@ -38,9 +38,12 @@ class RobotConfig:
         (fx, fy, cx, cy) [pixels], instead of CameraInfo.
     rectified : bool or None
         True: CameraInfo's P holds. False: K and the distortion hold. None: P where the topic's name contains 'rect'.
-    T_team_map, T_body_sensor : tuple of 7 float
-        Transforms (x, y, z, qx, qy, qz, qw) [m]: from the robot's map frame to the team's frame, and from the sensor's
-        frame to the frame of the poses (None: from TF).
+    map_frame : str or None
+        Frame that TF transforms the poses to (None: the root of TF above them, else the frame that they are given in).
+        With a ``pose_file`` it only names the frame of the file's poses.
+    T_team_map, T_body_sensor : tuple of 7 float or None
+        Transforms (x, y, z, qx, qy, qz, qw) [m]: from the robot's map frame to the team's frame (None: not given, and
+        the identity is assumed), and from the sensor's frame to the frame of the poses (None: from TF).
     body_box : tuple of 6 float or None
         (xmin, ymin, zmin, xmax, ymax, zmax) of the robot's body [m] in ``body_frame``, by default the frame of the
         poses. Points inside are left out.
@@ -77,7 +80,10 @@ class RobotConfig:
     label_info_topic: str | None = field(
         default=None, metadata=help_text("topic of the LabelInfo with the classes' names")
     )
-    map_frame: str | None = field(default=None, metadata=help_text("reference frame of the poses"))
+    map_frame: str | None = field(
+        default=None,
+        metadata=help_text("frame that TF transforms the poses to; the poses' own frame leaves corrections in TF out"),
+    )
     sensor_frame: str | None = field(
         default=None, metadata=help_text("frame of the sensor (default: frame_id of its messages)")
     )
@@ -91,8 +97,8 @@ class RobotConfig:
         default=None, metadata=help_text("metres per depth value (default: that of the encoding)")
     )
     clock_offset: float = field(default=0.0, metadata=help_text("offset added to the robot's stamps [s]"))
-    T_team_map: tuple[float, ...] = field(
-        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    T_team_map: tuple[float, ...] | None = field(
+        default=None,
         metadata=help_text("transform from map_frame to the team's frame: x y z [m], quaternion x y z w"),
     )
     T_body_sensor: tuple[float, ...] | None = field(
@@ -155,6 +161,11 @@ class RobotConfig:
                 yield f"{item.name} must be finite, not {value}"
             if any(abs(number) > LARGEST for number in numbers):
                 yield f"{item.name} must not hold numbers above {LARGEST:g}"
+
+    @property
+    def T_team_map_or_identity(self) -> tuple[float, ...]:
+        """``T_team_map``, or the identity where it is not given."""
+        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) if self.T_team_map is None else self.T_team_map
 
     @property
     def files(self) -> tuple[Path, ...]:

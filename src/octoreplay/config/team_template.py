@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from octoreplay.config.parameters import PARAMETERS, SECTIONS
@@ -43,17 +44,30 @@ _EXAMPLES: Mapping[str, Mapping[str, tuple[Any, str]]] = {
 }  # fmt: skip
 """Example and comment of each key that is not a parameter, by the section that follows the key ('' for the first)."""
 
+_ROBOT_EXAMPLES: Mapping[str, Any] = {"T_team_map": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+"""Example of keys of a robot that have no default."""
 
-def team_template(config: RunConfig, missing: Mapping[str, Sequence[str]], folder: Path | None = None) -> str:
+
+def team_template(
+    config: RunConfig,
+    missing: Mapping[str, Sequence[str]],
+    folder: Path | None = None,
+    *,
+    notes: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> str:
     """Return the text of a team file with every key: those that ``config`` sets, and the others as comments.
 
-    ``missing`` are sentences that describe missing data, by robot_id ('' for the team); they become comments too.
-    ``parse_team`` returns ``config`` again. Log paths are written as by ``dump_team``.
+    ``missing`` are sentences that describe missing data, ``notes`` other sentences, both by robot_id ('' for the team);
+    they become comments too. ``parse_team`` returns ``config`` again. Log paths are written as by ``dump_team``.
     """
     content = team_to_mapping(config, folder)
-    lines = [_HEAD, "robots:"]
+    lines = [_HEAD, *(f"# {note}" for note in notes.get("", ())), "robots:"]
     for robot in config.robots:
-        lines += _robot_lines(robot, missing.get(robot.robot_id, ()), folder)
+        comments = [
+            *_missing_lines(missing.get(robot.robot_id, ())),
+            *(f"# {s}" for s in notes.get(robot.robot_id, ())),
+        ]
+        lines += _robot_lines(robot, comments, folder)
     section = ""
     lines += ["", "# Labels", *_missing_lines(missing.get("", ())), *_example_lines(content, section)]
     for name, parameter in PARAMETERS.items():
@@ -80,14 +94,14 @@ def _entry_lines(key: str, value: Any, example: Any, comment: str) -> list[str]:
     return [_line(key, value, comment, is_set=True)]
 
 
-def _robot_lines(robot: RobotConfig, missing: Sequence[str], folder: Path | None) -> list[str]:
-    """Lines of one robot."""
+def _robot_lines(robot: RobotConfig, comments: Sequence[str], folder: Path | None) -> list[str]:
+    """Lines of one robot, with comment lines after its logs."""
     entry = robot_to_mapping(robot, folder)
     lines = [f"  - id: {_flow(entry['id'])}", f"    log: {_flow(entry['log'])}"]
-    lines += (f"    {line}" for line in _missing_lines(missing))
+    lines += (f"    {comment}" for comment in comments)
     for item in dataclasses.fields(RobotConfig):
         if item.metadata:
-            value = entry.get(item.name, item.default)
+            value = entry.get(item.name, _ROBOT_EXAMPLES.get(item.name, item.default))
             lines.append(_line(item.name, value, item.metadata["help"], is_set=item.name in entry, indent=4))
     return lines
 

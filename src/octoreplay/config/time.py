@@ -18,6 +18,7 @@ class TimeConfig:
     )
     pose_gap: float = parameter(0.5, "largest gap between two poses that are interpolated [s]", above=0.0, maximum=1e6)
     strict_labels: bool = parameter(False, "stop at a raw label that the class table does not contain")
+    strict_frames: bool = parameter(False, "stop where nothing relates the map frames of two robots")
     start: float = parameter(
         0.0, "start of the replayed span, after the team's first stamp [s]", minimum=0.0, maximum=1e9
     )

@@ -24,7 +24,7 @@ from octoreplay.records import FrameCounts, RunSummary
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import MAX_TICKS, Session
-from octoreplay.replay.warnings import log_warnings, rule_warnings
+from octoreplay.replay.warnings import map_warnings, rule_warnings
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,9 @@ def replay_team(
                 raise
             counts = {log.robot_id: log.counts for log in logs}
             warnings = (
+                *config.warnings,
                 *rule_warnings(config, session.is_symmetric),
-                *log_warnings(logs, is_empty=recorder.num_known_cells == 0),
+                *map_warnings(recorder.num_known_cells),
             )
             summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
             if writer is not None:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
-from octoreplay.io.robots.robot_log import RobotLog
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -49,22 +45,8 @@ def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
     return (sentence,)
 
 
-def log_warnings(logs: Sequence[RobotLog], *, is_empty: bool) -> tuple[str, ...]:
-    """Sentences on logs that do not fit together, and on maps without a known cell (``is_empty``)."""
-    sentences = []
-    if is_empty:
-        sentences.append(
-            "the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses"
-        )
-    owners: dict[tuple[Path, str], str] = {}
-    for log in logs:
-        for key in ((path.resolve(), log.sensor_topic) for path in log.robot.logs):
-            other = owners.setdefault(key, log.robot_id)
-            if other != log.robot_id:
-                sentences.append(f"{other} and {log.robot_id} map the same messages of {key[0]}, which count twice")
-    spans = [(log.robot.start_ns, log.robot.end_ns, log.robot_id) for log in logs]
-    for start, _, robot_id in spans:
-        others = [(a, b) for a, b, other in spans if other != robot_id]
-        if start is not None and others and all(b is not None and b < start for _, b in others):
-            sentences.append(f"{robot_id} starts when all other robots have ended; check the clock_offsets")
-    return tuple(sentences)
+def map_warnings(num_known_cells: int) -> tuple[str, ...]:
+    """Sentences on the maps at the end of a run, which know a number of cells together."""
+    if num_known_cells > 0:
+        return ()
+    return ("the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses",)

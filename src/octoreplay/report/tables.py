@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -16,17 +15,15 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from octoreplay.config.resolved import MapFrame, ResolvedRun
 from octoreplay.config.robot import RobotConfig
-from octoreplay.config.run import RunConfig
+from octoreplay.io.robots.team_clocks import instant
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.io.robots.describe import LogDescription, LogSummary
     from octoreplay.result import PointQuery
-
-_YEAR_2000_NS = 946_684_800_000_000_000
-"""Earlier stamps are not dates but times since some start of a clock."""
 
 _CAUSES = {
     "no_label": "no label", "no_pose": "no pose", "late": "late",
@@ -68,13 +65,6 @@ def seconds(value: float) -> str:
     return f"{whole // 60} min {whole % 60:02d} s"
 
 
-def instant(stamp_ns: int) -> str:
-    """Format a stamp as an RFC 3339 date, or in seconds where it is not a date."""
-    if stamp_ns < _YEAR_2000_NS:
-        return f"{stamp_ns / 1e9:.3f} s"
-    return datetime.datetime.fromtimestamp(stamp_ns // 1_000_000_000, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
 def results(summary: RunSummary) -> RenderableType:
     """Return the results of a run as tables: the team, each robot, lossy links and frames that were not mapped."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
@@ -85,7 +75,7 @@ def results(summary: RunSummary) -> RenderableType:
     return _spaced(parts)
 
 
-def chosen_inputs(config: RunConfig) -> Table:
+def chosen_inputs(config: ResolvedRun) -> Table:
     """Return a table of the robots, logs and topics of a run."""
     table = styled_table("Robots and topics")
     table.add_column("robot", no_wrap=True)
@@ -93,7 +83,7 @@ def chosen_inputs(config: RunConfig) -> Table:
     table.add_column("topics and frames", overflow="fold")
     for robot in config.robots:
         logs = "\n".join(log.name or str(log) for log in robot.logs)
-        table.add_row(robot.robot_id, logs, "\n".join(_choices(robot)))
+        table.add_row(robot.robot_id, logs, "\n".join(_choices(robot, robot.frame)))
     return table
 
 
@@ -306,12 +296,13 @@ def _robot_spans(logs: LogDescription) -> Table:
     table.add_column("topics and frames", overflow="fold")
     table.add_column("start", justify="right", no_wrap=True)
     table.add_column("length", justify="right", no_wrap=True)
-    first = min((robot.start_ns for robot in logs.robots if robot.start_ns is not None), default=0)
+    first = min((robot.span_ns[0] for robot in logs.robots if robot.span_ns is not None), default=0)
     for robot in logs.robots:
         begin, length = "-", "-"
-        if robot.start_ns is not None and robot.end_ns is not None:
-            begin, length = f"+{(robot.start_ns - first) / 1e9:.1f} s", seconds((robot.end_ns - robot.start_ns) / 1e9)
-        table.add_row(robot.robot.robot_id, "\n".join(_choices(robot.robot)), begin, length)
+        if robot.span_ns is not None:
+            start, end = robot.span_ns
+            begin, length = f"+{(start - first) / 1e9:.1f} s", seconds((end - start) / 1e9)
+        table.add_row(robot.robot.robot_id, "\n".join(_choices(robot.robot, robot.frame)), begin, length)
     return table
 
 
@@ -344,11 +335,14 @@ def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
     return table
 
 
-def _choices(robot: RobotConfig) -> list[str]:
-    """Lines with the topics and frames of a robot's configuration."""
+def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
+    """Lines with the topics and frames of a robot's configuration, and how its poses reach the map frame."""
     names = {
         "depth_topic": "depth", "cloud_topic": "cloud", "label_topic": "labels", "camera_info_topic": "camera",
         "pose_topic": "pose", "label_info_topic": "names", "map_frame": "map frame", "sensor_frame": "sensor frame",
     }  # fmt: skip
     width = max(len(name) for name in names.values())
-    return [f"{name:<{width}}  {value}" for field, name in names.items() if (value := getattr(robot, field))]
+    values = {name: value for field, name in names.items() if (value := getattr(robot, field))}
+    if frame is not None and frame.origin:
+        values["map frame"] += f" ({frame.origin})"
+    return [f"{name:<{width}}  {value}" for name, value in values.items()]

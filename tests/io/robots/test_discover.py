@@ -60,7 +60,7 @@ def test_a_resolved_run_survives_a_team_file(tmp_path):
     config = resolve(run_of(*discover([path])))
     text = dump_team(config, tmp_path)
     assert parse_team(text, name="team", folder=tmp_path) == config.to_config()
-    assert config.robots[0].log_span_ns == (START, START + 5 * SECOND // 4)
+    assert config.robots[0].span_ns == (START, START + 5 * SECOND // 4)
     assert resolve(config) is config
 
 

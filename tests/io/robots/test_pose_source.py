@@ -4,11 +4,12 @@ import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.config.resolved import MapFrame, ResolvedRobot
 from octoreplay.errors import InputError
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
@@ -187,6 +188,56 @@ def test_the_poses_frame_is_joined_to_the_map(tmp_path):
     poses = Poses(tmp_path, [*correction, *odometry(frame_id="odom"), *static()], pose_topic="/odom", map_frame="map")
     assert poses.source.topics == ("/odom", "/tf")
     poses.check(lambda s: pose_matrix((0, 10 * (s - START) / SECOND, 0), TURN) @ camera(s))
+
+
+def corrections(*numbers: int) -> list[Row]:
+    """A jump of map -> odom at some of the stamps: y is the number of the stamp."""
+    return [
+        row
+        for i in numbers
+        for row in tf("/tf", ("map", "odom", lambda s, i=i: (0, i, 0), IDENTITY), stamps=[STAMPS[i]])
+    ]
+
+
+def corrected(y: float, stamp: int) -> np.ndarray:
+    return pose_matrix((0, y, 0), IDENTITY) @ camera(stamp)
+
+
+@pytest.mark.parametrize("pose_topic", ["/odom", "/tf"])
+def test_a_correction_holds_before_the_first_after_the_last_and_across_gaps(tmp_path, pose_topic):
+    """Corrections are at stamps 2, 3 and 8; two that are at most 0.2 s apart are interpolated."""
+    moving = odometry(frame_id="odom") if pose_topic == "/odom" else tf("/tf", ("odom", "base", position, TURN))
+    rows = [*moving, *corrections(2, 3, 8), *static()]
+    rows.sort(key=lambda row: row.log_time_ns)
+    frame = MapFrame("map", "odom", True)
+    poses = Poses(tmp_path, rows, pose_topic=pose_topic, map_frame="map", frame=frame, gap_ns=SECOND // 5)
+    between = STAMPS[2] + 25_000_000
+    for stamp, y in [
+        (STAMPS[0], 2), (STAMPS[2], 2), (between, 2.25), (STAMPS[3], 3), (STAMPS[7], 3), (STAMPS[8] - 1, 3),
+        (STAMPS[8], 8), (STAMPS[10], 8),
+    ]:  # fmt: skip
+        np.testing.assert_allclose(poses.source.at(stamp), corrected(y, stamp), atol=1e-9)
+    # The poses themselves do not hold.
+    assert poses.source.at(STAMPS[0] - 1) is None
+    assert poses.source.at(STAMPS[-1] + 1) is None
+
+
+def test_the_first_correction_is_known_before_it_is_read(tmp_path):
+    rows = [*odometry(frame_id="odom"), *static(), *corrections(9)]
+    path = write_rows(tmp_path / "r.mcap", rows)
+    robot = ResolvedRobot("r", (path,), depth_topic=IMAGE, pose_topic="/odom", map_frame="map")
+    with open_log(path) as log:
+        first = PoseSource(robot, [log], sensor_frame="camera", pose_gap_ns=SECOND, use_log_time=False)
+        with mock.patch.object(PoseSource, "_read_first", side_effect=AssertionError):
+            second = PoseSource(
+                robot, [log], sensor_frame="camera", pose_gap_ns=SECOND, use_log_time=False, known=first
+            )
+        for source in (first, second):
+            for message in log.messages(("/odom",)):
+                source.take(message)
+            np.testing.assert_allclose(source.at(STAMPS[1]), corrected(9, STAMPS[1]), atol=1e-9)
+    with pytest.raises(InputError, match=r"no transform from 'odom' to 'earth'.*; name another map_frame"):
+        Poses(tmp_path, rows, pose_topic="/odom", map_frame="earth")
 
 
 def test_log_time_is_the_clock_where_it_is_chosen(tmp_path):

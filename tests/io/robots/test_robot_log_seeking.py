@@ -142,6 +142,22 @@ def test_poses_around_the_start_are_known(tmp_path, poses):
     assert assert_same_frames(robot, TimeConfig(start=40, duration=10, pose_gap=2.0)) == 20
 
 
+@pytest.mark.parametrize(("period", "seeks"), [(1, True), (25, False)])
+def test_corrections_from_before_the_start_are_known(tmp_path, period, seeks):
+    """The last correction before the start applies; one that is too old for the part makes the whole log be read."""
+    entries = entries_of()
+    for entry in entries:
+        if entry.topic == "/odom":
+            entry.value.header.frame_id = "odom"
+    for second in range(0, 80, period):
+        stamp = START + second * SECOND
+        tf = ros2.tf(("map", "odom", stamp, (0, second, 0), IDENTITY))
+        entries.append(Entry("/tf", "tf2_msgs/msg/TFMessage", tf, stamp))
+    entries.sort(key=lambda e: e.log_time_ns)
+    robot = robot_of(write_mcap(tmp_path / "r.mcap", entries), map_frame="map")
+    assert assert_same_frames(robot, TimeConfig(start=45, duration=10), seeks=seeks) == 20
+
+
 @pytest.mark.parametrize("clock_offset", [0.0, 37.5, -20.25])
 def test_the_clock_offset_and_the_team_start_shift_the_part(tmp_path, clock_offset):
     # The robot's clock is 1000 s off that of the log.

@@ -337,7 +337,7 @@ def _summary_values(summary: RunSummary) -> dict[str, str]:
 
 def _static_transform(stamp_ns: int, robot: RobotConfig) -> Any:
     """Return the transform from the team's frame to ``<robot>/map``, the frame of the poses in the robot's log."""
-    x, y, z, *rotation = robot.T_team_map
+    x, y, z, *rotation = robot.T_team_map_or_identity
     quaternion = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", rotation, strict=True)))
     return _transform(stamp_ns, f"{robot.robot_id}/map", np.array([x, y, z]), quaternion)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from octoreplay.config.class_tables.edits import edited
-from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.config.resolved import MapFrame, ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.messages.sensor_messages import kind_of
@@ -16,6 +16,7 @@ from octoreplay.io.robots.classes import check_labelled, has_labels, team_class_
 from octoreplay.io.robots.log_groups import LogGroup, groups_in
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.survey import LogSurveys, Survey
+from octoreplay.io.robots.team_check import TeamMember, check_team, team_member
 from octoreplay.io.robots.topics import attempt, find_topics
 from octoreplay.records import ClassTable
 
@@ -53,12 +54,22 @@ class LogSummary:
 
 @dataclass(frozen=True)
 class RobotSummary:
-    """One robot in the logs: the topics that a run would use, its span in log time, and what a run would lack."""
+    """One robot in the logs: the topics that a run would use, and what a run would lack.
+
+    ``frame`` is its map frame and ``span_ns`` the stamps of its first and last message, None where they are unknown.
+    """
 
     robot: RobotConfig
-    start_ns: int | None
-    end_ns: int | None
+    frame: MapFrame | None
+    span_ns: tuple[int, int] | None
     missing: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on choices that the team file can change."""
+        if self.frame is None or not self.frame.origin:
+            return ()
+        return (f"map_frame: {self.frame.origin}; map_frame: {self.frame.pose_frame} leaves these transforms out",)
 
 
 @dataclass(frozen=True)
@@ -66,7 +77,7 @@ class LogDescription:
     """Contents of a set of logs.
 
     ``overlap_ns`` is the (start, end) that all robots share, None without an overlap; ``missing`` is what the team as
-    a whole lacks for a run.
+    a whole lacks for a run; ``warnings`` are sentences on frames and clocks that do not fit together.
     """
 
     logs: tuple[LogSummary, ...]
@@ -74,12 +85,14 @@ class LogDescription:
     overlap_ns: tuple[int, int] | None
     class_table: ClassTable | None
     missing: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
-def describe(logs: Sequence[Path]) -> LogDescription:
+def describe(logs: Sequence[Path], *, strict_frames: bool = False) -> LogDescription:
     """Return the contents of some logs and what they lack for a run.
 
-    A log that cannot be opened has a summary with the reason.
+    A log that cannot be opened has a summary with the reason. Raises ConfigError with ``strict_frames`` where nothing
+    relates the map frames of two robots.
     """
     with LogSurveys() as known:
         errors: dict[Path, list[str]] = {path: [] for path in logs}
@@ -87,19 +100,25 @@ def describe(logs: Sequence[Path]) -> LogDescription:
         surveys = [survey for survey in found.values() if survey is not None]
         missing: list[str] = []
         groups = (attempt(lambda: groups_in(surveys), missing) or []) if surveys else []
-        robots = [_robot_summary(group) for group in groups]
-        classes = _class_table([summary.robot for summary in robots], groups, missing)
-    spans = [(r.start_ns, r.end_ns) for r in robots if r.start_ns is not None and r.end_ns is not None]
+        problems: list[list[str]] = [[] for _ in groups]
+        members = [_member(group, lacks) for group, lacks in zip(groups, problems, strict=True)]
+        classes = _class_table([member.robot for member in members], groups, missing)
+    warnings = check_team(members, strict_frames=strict_frames)
+    spans = [member.clock.span_ns for member in members if member.clock is not None]
     start, end = max((s for s, _ in spans), default=0), min((e for _, e in spans), default=0)
     return LogDescription(
         logs=tuple(
             _log_summary(survey) if survey else LogSummary(path, None, None, 0, (), None, error=errors[path][0])
             for path, survey in found.items()
         ),
-        robots=tuple(robots),
+        robots=tuple(
+            RobotSummary(member.robot, member.frame, member.clock.span_ns if member.clock else None, tuple(lacks))
+            for member, lacks in zip(members, problems, strict=True)
+        ),
         overlap_ns=(start, end) if spans and start <= end else None,
         class_table=classes,
         missing=tuple(missing),
+        warnings=warnings,
     )
 
 
@@ -126,17 +145,17 @@ def _log_summary(survey: Survey) -> LogSummary:
     return LogSummary(survey.path, survey.start_ns, survey.end_ns, survey.num_messages, tuple(topics), survey.damage)
 
 
-def _robot_summary(group: LogGroup) -> RobotSummary:
-    """The summary of one robot, with everything that a run would lack."""
-    missing: list[str] = []
+def _member(group: LogGroup, missing: list[str]) -> TeamMember:
+    """The robot of a group; everything that a run would lack is appended to ``missing``."""
     robot = find_topics(group.blank_robot(), group, missing)
+    # An unknown frame is named by find_topics.
+    member = attempt(lambda: team_member(robot, group), []) or TeamMember(robot, None, None)
     if not missing:
-        attempt(functools.partial(_check_readable, robot, group), missing)
-    start_ns, end_ns = group.log_span_ns or (None, None)
-    return RobotSummary(robot, start_ns, end_ns, tuple(missing))
+        attempt(functools.partial(_check_readable, member, group), missing)
+    return member
 
 
-def _check_readable(robot: RobotConfig, group: LogGroup) -> None:
+def _check_readable(member: TeamMember, group: LogGroup) -> None:
     """Raise InputError where the robot's logs have no usable intrinsics, frames or poses."""
-    resolved = ResolvedRobot.from_config(robot, group.log_span_ns)
+    resolved = ResolvedRobot.from_config(member.robot, None, member.frame)
     RobotLog(resolved, TimeConfig(), None, logs=[survey.log for survey in group.surveys])

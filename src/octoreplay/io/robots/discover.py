@@ -9,11 +9,11 @@ from pathlib import Path
 
 from octoreplay.config.class_tables.edits import edited
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
-from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.classes import check_labelled, has_labels, team_class_table
-from octoreplay.io.robots.log_groups import LogGroup, group_of, groups_in
+from octoreplay.io.robots.log_groups import group_of, groups_in
 from octoreplay.io.robots.survey import LogSurveys
+from octoreplay.io.robots.team_check import TeamMember, check_team, team_member
 from octoreplay.io.robots.topics import find_topics
 
 
@@ -26,7 +26,8 @@ def discover(logs: Sequence[Path], surveys: LogSurveys | None = None) -> tuple[R
     not opened again.
     """
     with _shared(surveys) as known:
-        return tuple(_resolved(group.blank_robot(), group) for group in groups_in([known.of(path) for path in logs]))
+        groups = groups_in([known.of(path) for path in logs])
+        return tuple(_resolved(team_member(find_topics(group.blank_robot(), group), group)) for group in groups)
 
 
 def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun:
@@ -35,25 +36,31 @@ def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun
     The class table is the configured one; else that of the logs' LabelInfo, united by name over the robots, merged and
     ignored as configured; else, where no robot has labels, the single class 'occupied'. Raises InputError where a named
     topic is missing or of another type, ConfigError as ``discover`` does, and where there are labels without a class
-    table or for some robots only. A configuration that is resolved already is returned unchanged. Logs in ``surveys``
-    are not opened again.
+    table or for some robots only, and with ``strict_frames`` where nothing relates the frames of two robots. A
+    configuration that is resolved already is returned unchanged. Logs in ``surveys`` are not opened again.
     """
     if isinstance(config, ResolvedRun):
         return config
     with _shared(surveys) as known:
         groups = [group_of(robot, tuple(known.of(path) for path in robot.logs)) for robot in config.robots]
-        robots = [_resolved(robot, group) for robot, group in zip(config.robots, groups, strict=True)]
+        members = [
+            team_member(find_topics(robot, group), group, use_log_time=config.time.clock == "log")
+            for robot, group in zip(config.robots, groups, strict=True)
+        ]
+        robots = [_resolved(member) for member in members]
         labelled = [has_labels(robot, group) for robot, group in zip(robots, groups, strict=True)]
         classes = config.classes
         if classes is None:
             classes = edited(team_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
     check_labelled(classes, robots, labelled)
-    return ResolvedRun.from_config(config, robots, classes)
+    warnings = check_team(members, strict_frames=config.time.strict_frames)
+    return ResolvedRun.from_config(config, robots, classes, warnings)
 
 
-def _resolved(robot: RobotConfig, group: LogGroup) -> ResolvedRobot:
-    """The robot with its missing topics and frames and the span of its logs."""
-    return ResolvedRobot.from_config(find_topics(robot, group), group.log_span_ns)
+def _resolved(member: TeamMember) -> ResolvedRobot:
+    """The resolved configuration of a robot."""
+    span_ns = None if member.clock is None else member.clock.stamp_span_ns
+    return ResolvedRobot.from_config(member.robot, span_ns, member.frame)
 
 
 def _shared(surveys: LogSurveys | None) -> AbstractContextManager[LogSurveys]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Collection, Sequence
 from contextlib import suppress
@@ -59,8 +60,14 @@ class PoseSource:
 
     A pose is the product T_map_origin T_origin_body T_body_sensor. The middle one comes from the pose topic or file,
     the others from TF unless they are the identity or configured. Where the pose topic is TF, the whole pose comes from
-    TF. The messages of ``topics`` must be passed to ``take`` in the order of the log. ``known`` is an earlier source of
-    the same robot, whose trajectory is used again. Raises InputError where the log gives no pose at any time.
+    TF. The messages of ``topics`` must be passed to ``take`` in the order of the log.
+
+    T_map_origin is the correction of the poses. It is interpolated like every transform, but between two values that
+    are more than ``pose_gap_ns`` apart the earlier one applies, before its first value the first, and after its last
+    value the last.
+
+    ``known`` is an earlier source of the same robot, whose trajectory and first correction are used again. Raises
+    InputError where the log gives no pose at any time.
     """
 
     def __init__(
@@ -79,22 +86,32 @@ class PoseSource:
         self._pose_gap_ns = pose_gap_ns
         self._sensor_frame = frame_name(robot.sensor_frame or sensor_frame)
         infos = [topic for log in logs for topic in log.topics]
-        tf = tf_topics(infos, robot.sensor_topic)
+        self._tf = tf_topics(infos, robot.sensor_topic)
         self._tree = FrameTree(pose_gap_ns)
         self._T_given = None if robot.T_body_sensor is None else transform_of(robot.T_body_sensor)
-        load_static_transforms(self._tree, logs, tf)
+        load_static_transforms(self._tree, logs, self._tf)
         kinds = {kind_of(topic.type_name) for topic in infos if topic.name == robot.pose_topic}
         self.trajectory: Trajectory | None = known.trajectory if known else self._whole_trajectory(Kind.PATH in kinds)
         """Poses from a file or a path, known from the beginning; else None."""
         self._track = PoseTrack(pose_gap_ns) if self.trajectory is None and Kind.TF not in kinds else None
-        self._before, self._after = self._tf_link() if Kind.TF in kinds else self._links_of_poses()
+        self._whole: Link | None = None
+        self._after: Link | None = None
+        if Kind.TF in kinds:
+            self._before, self._whole = self._tf_links()
+        else:
+            self._before, self._after = self._links_of_poses()
         self._body = self._body_link()
-        self._links = [link for link in (self._before, self._after, self._body) if link is not None]
+        links = (self._before, self._whole, self._after, self._body)
+        self._links = [link for link in links if link is not None]
         self._moving_links = [link for link in self._links if not self._tree.is_fixed(*link)]
-        moving_topics = moving_tf_names(tf) if self._moving_links else ()
+        moving_topics = moving_tf_names(self._tf) if self._moving_links else ()
         self.topics = moving_topics if self._track is None else (str(robot.pose_topic), *moving_topics)
         if not moving_topics:
             self.check_connected()
+        self.first_correction: Float64Array | None = None
+        """First value of a correction that moves, (4, 4); else None."""
+        if self._before is not None and self._before in self._moving_links:
+            self.first_correction = known.first_correction if known else self._read_first(self._before)
 
     def is_known(self, stamp_ns: int) -> bool:
         """True where the poses on both sides of a stamp are known; always for a sensor that does not move."""
@@ -115,7 +132,7 @@ class PoseSource:
     def at(self, stamp_ns: int) -> Float64Array | None:
         """T_map_sensor at a stamp, (4, 4) float64; None where the poses around it are missing or too far apart."""
         result = np.eye(4)
-        for part in (self._link_at(self._before, stamp_ns), self._pose_at(stamp_ns), self._sensor_at(stamp_ns)):
+        for part in (self._correction_at(stamp_ns), self._pose_at(stamp_ns), self._sensor_at(stamp_ns)):
             if part is None:
                 return None
             result = result @ part
@@ -142,13 +159,29 @@ class PoseSource:
         """Paths of the robot's logs, as an error begins."""
         return ", ".join(str(log.path) for log in self._logs)
 
+    def is_corrected_between(self, start_ns: int, stop_ns: int, stamp_ns: int) -> bool:
+        """True where the correction, if there is one, has a value up to a stamp in [start_ns, stop_ns) of log time."""
+        if self.first_correction is None or self._before is None:
+            return True
+        first_ns = self._read_correction(self._before, start_ns, stop_ns).first_ns(*self._before)
+        return first_ns is not None and first_ns <= stamp_ns
+
     # --- the three parts of a pose ------------------------------------------------------------------------------------
 
+    def _correction_at(self, stamp_ns: int) -> Float64Array | None:
+        """T_map_origin at a stamp, as the class describes it."""
+        if self._before is None:
+            return np.eye(4)
+        if self._tree.is_connected(*self._before):
+            found = self._tree.T_a_b(*self._before, stamp_ns, hold=True)
+            return self.first_correction if found is None else found
+        return self.first_correction
+
     def _pose_at(self, stamp_ns: int) -> Float64Array | None:
-        """T_origin_body at a stamp: the identity where the whole pose comes from TF."""
+        """T_origin_body at a stamp, where the body is the sensor if the whole pose comes from TF."""
         if self.trajectory is not None:
             return self.trajectory.matrix_at(stamp_ns, self._pose_gap_ns)
-        return np.eye(4) if self._track is None else self._track.matrix_at(stamp_ns)
+        return self._link_at(self._whole, stamp_ns) if self._track is None else self._track.matrix_at(stamp_ns)
 
     def _sensor_at(self, stamp_ns: int) -> Float64Array | None:
         """T_body_sensor at a stamp."""
@@ -162,7 +195,7 @@ class PoseSource:
 
     def _remedy(self, link: Link) -> str:
         """Remedy in the team file where TF does not join a link's frames."""
-        if link == self._before:
+        if link in (self._before, self._whole):
             return "name another map_frame, sensor_frame or pose_topic"
         if link == self._body:
             return "name another body_frame"
@@ -170,11 +203,34 @@ class PoseSource:
 
     # --- links and trajectory -----------------------------------------------------------------------------------------
 
-    def _tf_link(self) -> tuple[Link | None, Link | None]:
-        """Links before and after the poses where the whole pose comes from TF."""
+    def _read_first(self, link: Link) -> Float64Array | None:
+        """First value of the correction in the logs; None without one. Raises InputError where TF never joins it."""
+        tree = self._read_correction(link)
+        if not tree.is_connected(*link):
+            raise InputError(f"{self._name}: {tree.why_not_connected(*link)}; {self._remedy(link)}")
+        return tree.T_a_b(*link, 0, hold=True)
+
+    def _read_correction(self, link: Link, start_ns: int | None = None, stop_ns: int | None = None) -> FrameTree:
+        """TF in a range of log time, up to the first value of every transform of a link."""
+        tree = FrameTree(self._pose_gap_ns)
+        load_static_transforms(tree, self._logs, self._tf)
+        streams = (log.messages(moving_tf_names(self._tf), start_ns, stop_ns) for log in self._logs)
+        for message in heapq.merge(*streams, key=lambda message: message.log_time_ns):
+            stamp = message.log_time_ns if self._use_log_time else None
+            with suppress(DamagedMessageError):
+                tree.add_transforms(_transforms(message), is_static=False, stamp_ns=stamp)
+            if tree.is_connected(*link) and tree.T_a_b(*link, 0, hold=True) is not None:
+                break
+        return tree
+
+    def _tf_links(self) -> tuple[Link | None, Link]:
+        """Links of the correction and of the poses where the whole pose comes from TF."""
         if self._robot.map_frame is None:
             raise InputError(f"{self._name}: poses from TF need a map_frame for robot '{self._robot.robot_id}'")
-        return (frame_name(self._robot.map_frame), self._sensor_frame), None
+        map_frame, frame = frame_name(self._robot.map_frame), self._robot.frame
+        if frame is None or frame.pose_frame in (None, map_frame):
+            return None, (map_frame, self._sensor_frame)
+        return (map_frame, str(frame.pose_frame)), (str(frame.pose_frame), self._sensor_frame)
 
     def _body_link(self) -> Link | None:
         """Link from the sensor to ``body_frame``; None where the box is in the frame of the poses."""

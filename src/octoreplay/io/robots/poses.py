@@ -32,6 +32,11 @@ class PoseTrack:
         return len(self._stamps)
 
     @property
+    def first_ns(self) -> int | None:
+        """Stamp of the first pose; None in an empty track."""
+        return self._stamps[0] if self._stamps else None
+
+    @property
     def last_ns(self) -> int | None:
         """Stamp of the last pose; None in an empty track."""
         return self._stamps[-1] if self._stamps else None
@@ -68,15 +73,26 @@ class PoseTrack:
             return None
         return interpolate(self._poses[index - 1], self._poses[index], (stamp_ns - before) / (after - before))
 
-    def matrix_at(self, stamp_ns: int) -> Float64Array | None:
-        """Pose at a stamp as a (4, 4) transform, or None."""
+    def matrix_at(self, stamp_ns: int, *, hold: bool = False) -> Float64Array | None:
+        """Pose at a stamp as a (4, 4) transform, or None.
+
+        With ``hold`` a pose applies until the next one where the two are too far apart to be interpolated, the first
+        one also before its stamp, and the last one from its stamp on.
+        """
         pose = self.at(stamp_ns)
+        if pose is None and hold and self._poses:
+            pose = self._poses[max(bisect_left(self._stamps, stamp_ns) - 1, 0)]
         return None if pose is None else pose_matrix(*pose)
 
     @property
-    def only_matrix(self) -> Float64Array:
-        """Pose of a track with a single pose, as a (4, 4) transform."""
+    def first_matrix(self) -> Float64Array:
+        """Earliest pose of a track that is not empty, as a (4, 4) transform."""
         return pose_matrix(*self._poses[0])
+
+    @property
+    def is_constant(self) -> bool:
+        """True where all poses are equal."""
+        return all(pose == self._poses[0] for pose in self._poses)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop poses that no stamp from ``stamp_ns`` on needs."""
@@ -136,9 +152,34 @@ class FrameTree:
         """Names of all frames, sorted."""
         return tuple(sorted({*self._parents, *self._parents.values()}))
 
+    def is_cyclic(self, frame: str) -> bool:
+        """True where the chain of a frame's parents never ends."""
+        return self.root_of(frame) in self._parents
+
+    def has_two_parents(self, frame: str) -> bool:
+        """True where TF gave transforms of a frame to two parents."""
+        return frame_name(frame) in self._other_parents
+
+    def edge_sample(self, child: str) -> tuple[Float64Array, bool] | None:
+        """Earliest T_parent_child, (4, 4), and True where it never changes; None without a usable transform."""
+        if child in self._fixed:
+            return self._fixed[child], True
+        track = self._moving.get(child)
+        return (track.first_matrix, track.is_constant) if track is not None and len(track) else None
+
+    def ancestors(self, frame: str) -> Iterator[str]:
+        """A frame and its ancestors up to the root; a cycle ends before its first repeated frame."""
+        seen = set()
+        while frame not in seen:
+            seen.add(frame)
+            yield frame
+            if frame not in self._parents:
+                return
+            frame = self._parents[frame]
+
     def root_of(self, frame: str) -> str:
         """Root of the tree that a frame is in (the frame itself where it has no parent)."""
-        *_, root = self._ancestors(frame_name(frame))
+        *_, root = self.ancestors(frame_name(frame))
         return root
 
     def is_connected(self, a: str, b: str) -> bool:
@@ -154,14 +195,19 @@ class FrameTree:
 
     def last_ns(self, a: str, b: str) -> int | None:
         """Stamp up to which every moving transform between two frames is known; None without moving transforms."""
-        up, down = self._chain(frame_name(a), frame_name(b))
-        moving = [self._moving[child] for child in (*up, *down) if child in self._moving and child not in self._fixed]
+        moving = self._moving_between(a, b)
         return min((track.last_ns for track in moving if track.last_ns is not None), default=None)
 
-    def T_a_b(self, a: str, b: str, stamp_ns: int) -> Float64Array | None:
+    def first_ns(self, a: str, b: str) -> int | None:
+        """Stamp from which on every moving transform between two frames is known; None where one has no value."""
+        firsts = [track.first_ns for track in self._moving_between(a, b)]
+        return None if None in firsts else max((first for first in firsts if first is not None), default=None)
+
+    def T_a_b(self, a: str, b: str, stamp_ns: int, *, hold: bool = False) -> Float64Array | None:
         """Transform from frame b to frame a at a stamp, (4, 4); None where a moving transform has no value there.
 
-        Raises InputError where no chain joins the frames, or a frame in it has two parents.
+        With ``hold`` moving transforms are held as ``PoseTrack.matrix_at`` does. Raises InputError where no chain joins
+        the frames, or a frame in it has two parents.
         """
         a, b = frame_name(a), frame_name(b)
         if not self.is_connected(a, b):
@@ -170,12 +216,12 @@ class FrameTree:
         up, down = self._chain(a, b)
         # Up from a to the common ancestor by inverse transforms, then down to b.
         for child in up:
-            step = self._edge(child, stamp_ns)
+            step = self._edge(child, stamp_ns, hold=hold)
             if step is None:
                 return None
             result = result @ inverse(step)
         for child in reversed(down):
-            step = self._edge(child, stamp_ns)
+            step = self._edge(child, stamp_ns, hold=hold)
             if step is None:
                 return None
             result = result @ step
@@ -200,35 +246,33 @@ class FrameTree:
         for track in self._moving.values():
             track.forget_before(stamp_ns)
 
-    def _edge(self, child: str, stamp_ns: int) -> Float64Array | None:
+    def _edge(self, child: str, stamp_ns: int, *, hold: bool) -> Float64Array | None:
         """T_parent_child at a stamp."""
         if child in self._other_parents:
             raise InputError(
-                f"frame '{child}' has two parents in TF, '{self._parents[child]}' and '{self._other_parents[child]}'"
+                f"frame '{child}' has two parents in TF, '{self._parents[child]}' and '{self._other_parents[child]}'; "
+                f"give a map_frame below it, or T_body_sensor"
             )
         if child in self._fixed:
             return self._fixed[child]
         track = self._moving.get(child)
         if track is None:
             return None
-        return track.only_matrix if child in self._holding and track.num_added == 1 else track.matrix_at(stamp_ns)
+        if child in self._holding and track.num_added == 1:
+            return track.first_matrix
+        return track.matrix_at(stamp_ns, hold=hold)
 
-    def _ancestors(self, frame: str) -> Iterator[str]:
-        """A frame and its ancestors up to the root; a cycle ends before its first repeated frame."""
-        seen = set()
-        while frame not in seen:
-            seen.add(frame)
-            yield frame
-            if frame not in self._parents:
-                return
-            frame = self._parents[frame]
+    def _moving_between(self, a: str, b: str) -> list[PoseTrack]:
+        """Tracks of the moving transforms between two frames."""
+        up, down = self._chain(frame_name(a), frame_name(b))
+        return [self._moving[child] for child in (*up, *down) if child in self._moving and child not in self._fixed]
 
     def _chain(self, a: str, b: str) -> tuple[list[str], list[str]]:
         """Frames below the first common ancestor of a and b: those above a, and those above b, each with a or b."""
-        from_a = list(self._ancestors(a))
+        from_a = list(self.ancestors(a))
         depth_of = {frame: index for index, frame in enumerate(from_a)}
         down: list[str] = []
-        for frame in self._ancestors(b):
+        for frame in self.ancestors(b):
             if frame in depth_of:
                 return from_a[: depth_of[frame]], down
             down.append(frame)

@@ -70,7 +70,7 @@ class RobotLog:
         self._use_log_time = time.clock == "log"
         self._offset_ns = robot.clock_offset_ns
         self._stamp_check = StampCheck(self._offset_ns)
-        self.T_team_map = transform_of(robot.T_team_map)
+        self.T_team_map = transform_of(robot.T_team_map_or_identity)
         is_labelled = class_table is not None and "" not in (robot.label_topic, robot.label_field)
         self._labels = LabelLookup(class_table, strict=time.strict_labels) if class_table and is_labelled else None
         self.sensor_topic = robot.sensor_topic
@@ -117,10 +117,10 @@ class RobotLog:
         ``start`` and ``duration`` count from ``team_start_ns`` (default: the robot's first stamp). With a ``start``,
         reading begins some seconds before it; late, duplicate, undecodable and damaged messages before that are not
         counted. The logs are read from their beginning where the delay between stamps and log times changes by more
-        than 10 s, and with Foxglove's transforms, which hold from their first message on. Reading ends when
-        ``is_wanted``, which is called for every message, returns false. Every call starts with new counts. Raises
-        InputError for an encoding without depth or labels, for images of different sizes, and for frames that TF does
-        not join.
+        than 10 s, where the poses have no correction within 10 s before the start, and with Foxglove's transforms,
+        which hold from their first message on. Reading ends when ``is_wanted``, which is called for every message,
+        returns false. Every call starts with new counts. Raises InputError for an encoding without depth or labels, for
+        images of different sizes, and for frames that TF does not join.
         """
         self.counts = FrameCounts(truncated_files=self._damage())
         if self._labels is not None:
@@ -225,6 +225,9 @@ class RobotLog:
         except DamagedMessageError:
             return None
         is_steady = bool(delays) and all(abs(delay - delay_ns) <= _LOG_DELAY_NS for delay in delays)
+        # A correction that applies since before this part of the log would be missing.
+        needed_log_ns = needed_from_ns + delay_ns
+        is_steady = is_steady and poses.is_corrected_between(log_start_ns, needed_log_ns, needed_from_ns)
         return log_start_ns if is_steady else None
 
     def _has_holding_transforms(self, poses: PoseSource) -> bool:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -23,7 +23,7 @@ from octoreplay.io.messages.sensor_messages import (
     kind_of,
 )
 from octoreplay.io.robots.pose_source import POSE_KINDS
-from octoreplay.io.robots.poses import frame_name
+from octoreplay.io.robots.poses import FrameTree, frame_name
 from octoreplay.io.sensors.clouds import label_field
 from octoreplay.io.sensors.images import COLOR_ENCODINGS, DEPTH_ENCODINGS, LABEL_ENCODINGS, encoding_and_size
 
@@ -106,6 +106,7 @@ class Survey:
     """Topics of one open log, and samples of its sensor topics by name.
 
     ``owners`` maps topics to robots where the log holds several robots; it is empty where it holds one.
+    ``frame_trees`` caches TF for the robots that share the log.
     """
 
     log: LogReader
@@ -116,6 +117,7 @@ class Survey:
     samples: Mapping[str, TopicSample]
     owners: Mapping[str, str]
     damage: str | None
+    frame_trees: dict[Hashable, FrameTree] = field(default_factory=dict)
 
     @property
     def path(self) -> Path:

@@ -13,7 +13,7 @@ from octoreplay.io.containers.log_reader import TopicInfo
 from octoreplay.io.messages.decoders import ENCODINGS
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
 from octoreplay.io.robots.log_groups import LogGroup
-from octoreplay.io.robots.pose_frames import first_pose_frame, root_frame
+from octoreplay.io.robots.pose_frames import find_map_frame
 from octoreplay.io.robots.pose_source import POSE_KINDS, moving_tf_names, tf_topics
 from octoreplay.io.robots.survey import CLOUDS, IMAGES
 
@@ -48,7 +48,7 @@ def find_topics(robot: RobotConfig, group: LogGroup, problems: list[str] | None 
         found = _fill(found, attempt(lambda: _find_camera_info(found, group), problems))
     found = _fill(found, attempt(lambda: _find_label_info(found, group), problems))
     found = _fill(found, attempt(lambda: _find_pose(found, group), problems))
-    if found.pose_topic is not None and (found.depth_topic or found.cloud_topic) is not None:
+    if found.pose_topic is not None:
         found = _fill(found, attempt(lambda: _find_frames(found, group), problems))
     return found
 
@@ -211,18 +211,15 @@ def _find_pose(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
 
 
 def _find_frames(robot: RobotConfig, group: LogGroup) -> dict[str, str | None]:
-    """Frame of the sensor, and frame that the poses are given in."""
+    """Frame of the sensor, and map frame."""
     sample = group.samples().get(robot.depth_topic or robot.cloud_topic or "")
     sensor_frame = robot.sensor_frame or (sample.frame_id if sample is not None and sample.frame_id else None)
-    found = {"sensor_frame": sensor_frame}
-    if robot.map_frame is not None:
-        return found
-    infos = [topic for topic in group.topics if topic.name == robot.pose_topic]
-    if any(kind_of(topic.type_name) is Kind.TF for topic in infos):
-        found["map_frame"] = root_frame(str(robot.depth_topic or robot.cloud_topic), sensor_frame, group)
-    else:
-        found["map_frame"] = first_pose_frame(str(robot.pose_topic), group)
-    return found
+    kinds = {kind_of(topic.type_name) for topic in group.topics if topic.name == robot.pose_topic}
+    # Without a sensor, which is missed elsewhere, TF has no frame to begin with.
+    if robot.map_frame is not None or (sample is None and Kind.TF in kinds):
+        return {"sensor_frame": sensor_frame}
+    frame = find_map_frame(dataclasses.replace(robot, sensor_frame=sensor_frame), group)
+    return {"sensor_frame": sensor_frame, "map_frame": frame.name}
 
 
 def _tf_of(robot: RobotConfig, group: LogGroup) -> tuple[TopicInfo, ...]:

@@ -1,0 +1,58 @@
+"""Check that the frames, clocks and logs of a team's robots fit together, for ``info``, ``init`` and ``run``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from octoreplay.config.resolved import MapFrame
+from octoreplay.config.robot import RobotConfig
+from octoreplay.errors import ConfigError
+from octoreplay.io.robots.log_groups import LogGroup
+from octoreplay.io.robots.pose_frames import find_map_frame
+from octoreplay.io.robots.team_clocks import RobotClock, clock_of, clock_warning
+from octoreplay.io.robots.team_frames import frames_warning
+
+
+@dataclass(frozen=True)
+class TeamMember:
+    """One robot of a team with its map frame and its clock, each None where the logs do not give it."""
+
+    robot: RobotConfig
+    frame: MapFrame | None
+    clock: RobotClock | None
+
+
+def team_member(robot: RobotConfig, group: LogGroup, *, use_log_time: bool = False) -> TeamMember:
+    """Return a robot with the frame and the clock that its logs give it.
+
+    Raises InputError for poses from TF where the sensor's frame is unknown or has no parent.
+    """
+    has_poses = robot.pose_file is not None or robot.pose_topic is not None
+    frame = find_map_frame(robot, group) if has_poses else None
+    return TeamMember(robot, frame, clock_of(robot, group, use_log_time=use_log_time))
+
+
+def check_team(members: Sequence[TeamMember], *, strict_frames: bool) -> tuple[str, ...]:
+    """Return a sentence for each way in which the robots of a team do not fit together.
+
+    Raises ConfigError with ``strict_frames`` where nothing relates the map frames of two robots.
+    """
+    unrelated = frames_warning([(m.robot, m.frame) for m in members if m.frame is not None])
+    if unrelated is not None and strict_frames:
+        raise ConfigError(f"strict_frames: {unrelated}")
+    clocks = clock_warning({m.robot.robot_id: m.clock for m in members if m.clock is not None})
+    found = (unrelated, clocks, *_shared_messages([member.robot for member in members]))
+    return tuple(sentence for sentence in found if sentence is not None)
+
+
+def _shared_messages(robots: Sequence[RobotConfig]) -> Iterator[str]:
+    """Sentences on robots that map the same messages."""
+    owners: dict[tuple[Path, str], str] = {}
+    for robot in robots:
+        topic = robot.depth_topic or robot.cloud_topic
+        for key in ((path.resolve(), topic) for path in robot.logs if topic):
+            other = owners.setdefault(key, robot.robot_id)
+            if other != robot.robot_id:
+                yield f"{other} and {robot.robot_id} map the same messages of {key[0]}, which count twice"
