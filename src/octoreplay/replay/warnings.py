@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
 from octoreplay.mapping.contradiction import LABEL_LIMIT, contradicting_pairs
