@@ -67,7 +67,7 @@ class RobotFrame:
         if self.covariance is None:
             return None
         deviations = np.sqrt(np.diag(self.covariance))
-        return tuple(float(value) for value in (*deviations[3:], *deviations[:3]))
+        return tuple(round(float(value), 6) for value in (*deviations[3:], *deviations[:3]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,8 @@ class Alignment:
     T_map_own : tuple of (4, 4) float64 arrays
         The identity for maps from logs; for evidence of a result, which is in the team's frame of that run, the inverse
         of its T_team_map.
+    T_team_own_before : tuple of (4, 4) float64 arrays
+        Poses of the maps before the alignment: as configured, or the identity that is assumed.
     pairs : tuple of PairAlignment
         All pairs, by position in ``robot_ids``, in the frames of ``maps``.
     teams : tuple of tuple of RobotFrame
@@ -96,6 +98,7 @@ class Alignment:
     robot_ids: tuple[str, ...]
     maps: tuple[OwnMap, ...] = field(repr=False)
     T_map_own: tuple[Float64Array, ...] = field(repr=False)
+    T_team_own_before: tuple[Float64Array, ...] = field(repr=False)
     pairs: tuple[PairAlignment, ...]
     teams: tuple[tuple[RobotFrame, ...], ...]
     problems: tuple[str, ...]
@@ -111,6 +114,11 @@ class Alignment:
     def is_whole(self) -> bool:
         """True where all robots are in one team and the maps contradict no given pose."""
         return not self.left_out and not self.problems
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on robots that are left out, and on given poses that are refused or that no overlap verifies."""
+        return (*self.reasons(), *self.problems, *self.notes)
 
     def best_refused(self, robot_id: str) -> PairAlignment:
         """Return the pair of a robot that came closest to acceptance: that with the largest L, refused or not."""
@@ -183,6 +191,7 @@ def align_robots(
         robot_ids,
         tuple(maps),
         placed,
+        tuple(T @ own for T, own in zip(_configured(config), placed, strict=True)),
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
@@ -247,6 +256,11 @@ def _given(config: RunConfig) -> dict[int, Float64Array]:
     }
 
 
+def _configured(config: RunConfig) -> list[Float64Array]:
+    """T_team_map (4, 4) of each robot, the identity where it is not configured."""
+    return [transform_of(robot.T_team_map_or_identity) for robot in config.robots]
+
+
 def _candidates(
     config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames
 ) -> dict[tuple[int, int], list[Float64Array]]:
@@ -254,7 +268,7 @@ def _candidates(
 
     Every further source of transforms between robots, such as position fixes or landmarks in the logs, belongs here.
     """
-    configured = [transform_of(robot.T_team_map_or_identity) for robot in config.robots]
+    configured = _configured(config)
     # A robot with a frame and one without are not related by the identity.
     is_known = [robot.T_team_map is not None for robot in config.robots]
     guessed = {robot_id: transform_of(numbers) for robot_id, numbers in guesses.items()}
