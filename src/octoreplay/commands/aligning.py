@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from octoreplay.config.resolved import ResolvedRun
     from octoreplay.config.run import RunConfig
     from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.mapping.octree import SemanticOctree
     from octoreplay.replay.alignment import Alignment
 
 
@@ -81,16 +82,23 @@ def align(
     return 0 if alignment.is_whole else EXIT_ERROR
 
 
-def align_with_bar(
-    config: RunConfig, resolved: ResolvedRun, guesses: Mapping[str, Sequence[float]] | None = None
-) -> Alignment:
-    """Align the robots of a configuration from their logs, with progress bars."""
-    from octoreplay.replay.alignment import align_robots
-    from octoreplay.replay.own_maps import own_maps
+def evidence_with_bar(config: ResolvedRun) -> list[SemanticOctree]:
+    """Map the robots of a team in their own frames, with a progress bar."""
+    from octoreplay.replay.own_maps import own_evidences
 
     with progress_bar("map") as update:
-        maps = own_maps(resolved, progress=lambda share: update(share, None, ""))
+        return own_evidences(config, progress=lambda share: update(share, None, ""))
+
+
+def align_with_bar(
+    config: RunConfig, evidence: Sequence[SemanticOctree], guesses: Mapping[str, Sequence[float]] | None = None
+) -> Alignment:
+    """Align the robots of a configuration from the evidence in their own frames, with a progress bar."""
+    from octoreplay.replay.alignment import align_robots
+    from octoreplay.replay.own_maps import own_map_of
+
     with progress_bar("align") as update:
+        maps = [own_map_of(config, octree) for octree in evidence]
         return align_robots(config, maps, guesses=guesses, progress=lambda share: update(share, None, ""))
 
 
@@ -105,7 +113,8 @@ def aligned_run(chosen: RunConfig, surveys: LogSurveys, out: Console) -> tuple[R
     from octoreplay.report.alignment_tables import alignment_tables
 
     # Frames that nothing relates are the reason to align them.
-    alignment = align_with_bar(chosen, discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys))
+    resolved = discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys)
+    alignment = align_with_bar(chosen, evidence_with_bar(resolved))
     tables.show(out, alignment_tables(alignment))
     check_aligned(alignment)
     config = discover.resolve(aligned_config(chosen, alignment.teams[0]), surveys)
@@ -133,7 +142,7 @@ def _aligned(
         config = base_config(inputs, None, err, surveys)
         config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
         resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)
-        alignment = align_with_bar(config, resolved, guesses)
+        alignment = align_with_bar(config, evidence_with_bar(resolved), guesses)
         return config, alignment, discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings
 
 

@@ -1,4 +1,4 @@
-"""Commands that produce logs and results: run, simulate, demo."""
+"""Commands that produce logs and results: run, simulate."""
 
 from __future__ import annotations
 
@@ -119,48 +119,6 @@ def simulate(folder: Path, robots: int, image: str, odometry_drift: str, **optio
     team_file = simulate_with_bar(folder, {**values, **options})
     click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
     return 0
-
-
-@click.command(short_help="Simulate a team, replay it and export its map.")
-@click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-demo"), required=False)
-@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
-@click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
-@click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
-def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
-    """Simulate a team, replay it, and export its map and figures into DIR (default: octoreplay-demo).
-
-    Takes less than two minutes. Lists the files written and the programs that open them.
-    """
-    from octoreplay.config.team_file import load_team_file
-    from octoreplay.io.robots import discover
-    from octoreplay.report import export, plots, tables
-    from octoreplay.result import open_result
-
-    out, err = tables.terminal(), tables.terminal(stderr=True)
-    result_path, ply, csv, figures = (folder / n for n in ("result.mcap", "map.ply", "metrics.csv", "figures"))
-    team_file = simulate_with_bar(folder / "logs", {"num_robots": robots, "duration": duration, "seed": seed})
-    summary = replay_with_bar(discover.resolve(load_team_file(team_file)), result_path)
-    with open_result(result_path) as result:
-        plots.write_metrics_csv(result.metrics, csv)
-        plots.write_figures(result.metrics, figures)
-    export.export_ply(result_path, ply, what="voxels")
-    tables.show(out, tables.results(summary))
-    show_warnings(err, summary)
-    first = summary.last.robots[0].robot_id
-    tables.show(
-        out,
-        tables.made_files(
-            {
-                folder / "logs": f"logs of {robots} robots, team file and the village as a mesh (world.ply)",
-                result_path: f"result; open it in Foxglove: 3D panel, frame 'team', topic /{first}/map",
-                ply: "final map as cubes; open it in CloudCompare, MeshLab or Open3D",
-                figures: "figures of disagreement over time and packet sizes",
-                csv: "all metrics of every tick",
-            }
-        ),
-    )
-    out.print(f"more: octoreplay metrics {result_path}", soft_wrap=True)
-    return EXIT_DATA_LOST if summary.lost_data else 0
 
 
 def _image_size(text: str) -> tuple[int, int]:

@@ -195,7 +195,7 @@ def align_robots(
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
-        (*_unverified(placement.teams, given, robot_ids), *_equal_maps(maps, robot_ids)),
+        (*_unverified(placement.teams[0], given, robot_ids), *_equal_maps(maps, robot_ids)),
     )
 
 
@@ -293,9 +293,9 @@ def _robot_frame(
     robot_id = robot_ids[robot.index]
     if robot.partner is None:
         is_given = robot.index in given
-        return RobotFrame(
-            robot_id, T, None, "given in the team file" if is_given else "frame of the team", None, is_given
-        )
+        verified = " and verified by its overlaps" if robot.is_verified else ""
+        origin = f"given in the team file{verified}" if is_given else "frame of the team"
+        return RobotFrame(robot_id, T, None, origin, None, is_given)
     turn = np.kron(np.eye(2), T_team_own[:3, :3])
     # From the origin of the map to that of the map frame.
     arm = T[:3, 3] - (T_team_own @ robot.T_team_map)[:3, 3]
@@ -328,14 +328,13 @@ def _problem(refusal: Refusal, robot_ids: Sequence[str]) -> str:
 
 
 def _unverified(
-    teams: Sequence[Sequence[PlacedRobot]], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
+    team: Sequence[PlacedRobot], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
 ) -> Iterator[str]:
-    """Sentences on robots whose given pose no overlap verifies."""
-    for team in teams:
-        for robot in team:
-            num_placed = sum(other.anchor == robot.index for other in team)
-            if robot.index in given and num_placed == 1:
-                yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
+    """Sentences on robots of the team with given poses that no overlap verifies."""
+    for robot in team:
+        is_alone = not any(other.anchor == robot.index != other.index for other in team)
+        if robot.index in given and robot.partner is None and is_alone and not robot.is_verified:
+            yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
 
 
 def _equal_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
