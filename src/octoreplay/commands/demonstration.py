@@ -96,6 +96,8 @@ def _aligned(team_file: Path, folder: Path, out: Console) -> tuple[ResolvedRun, 
 
 def _clear(pairs: tuple[PairMetrics, ...]) -> str:
     """Clear contradiction of the worst pair as a title."""
-    from octoreplay.report.tables import worst_pair
+    from octoreplay.records import ranked_pairs
+    from octoreplay.report.tables import share
 
-    return f"contradiction {worst_pair(pairs, 'clear_contradiction')}"
+    ranked = ranked_pairs(pairs, "clear_contradiction")
+    return f"{share(ranked[0].clear_contradiction)} contradiction, worst pair" if ranked else "no common space"
