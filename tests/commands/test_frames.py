@@ -11,7 +11,7 @@ import pytest
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.result import open_result
 from support.command_line import assert_fails, octoreplay
-from support.log_factory import SECOND, robot_entries, write_mcap
+from support.log_factory import IDENTITY, SECOND, Entry, robot_entries, ros2, write_mcap
 
 FRAMES = (
     "nothing relates the map frames of a ('odom') and b ('odom'), so their maps are overlaid as if these were one "
@@ -79,3 +79,27 @@ def test_clocks_that_differ_are_said_by_info_and_run(
     assert (info.returncode, run.returncode) == (0, code)
     assert warnings_in(info.stderr) == warnings_in(run.stderr)
     assert warnings_in(run.stderr)[1].startswith(sentence)
+
+
+def test_a_correction_that_applies_by_default_is_shown(tmp_path: Path) -> None:
+    path, _ = odometry_logs(tmp_path)
+    entries = robot_entries()
+    for entry in entries:
+        if entry.topic == "/odom":
+            entry.value.header.frame_id = "odom"
+    for time in range(2):
+        stamp = (100 + time) * SECOND
+        tf = ros2.tf(("map", "odom", stamp, (0, time, 0), IDENTITY))
+        entries.append(Entry("/tf", "tf2_msgs/msg/TFMessage", tf, stamp))
+    write_mcap(path, entries)
+    team, saved = tmp_path / "team.yaml", tmp_path / "saved.yaml"
+    team.write_text("robots: [{id: a, log: a.mcap}]\n")
+    shown = "map (poses in odom, corrected by TF)"
+    assert shown in octoreplay("info", path).stdout
+    assert shown in octoreplay("run", path, "--save-team", saved).stdout
+    assert f"a: map frame {shown}\n" in octoreplay("run", team, "--save-team", tmp_path / "x.yaml").stdout
+    assert load_team_file(saved).robots[0].map_frame == "map"
+    assert octoreplay("init", path, "-o", team, "--force").returncode == 0
+    note = "    # map_frame: poses in odom, corrected by TF; map_frame: odom leaves these transforms out\n"
+    assert note in team.read_text()
+    assert shown not in octoreplay("run", saved, "--save-team", tmp_path / "y.yaml").stdout

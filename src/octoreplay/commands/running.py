@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from octoreplay.commands.aligning import aligned_run
+from octoreplay.commands.aligning import aligned_run, dof_option
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
@@ -16,6 +17,10 @@ from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
+
+if TYPE_CHECKING:
+    from octoreplay.config.resolved import ResolvedRun
+    from octoreplay.config.run import RunConfig
 
 
 @with_parameters()
@@ -35,12 +40,13 @@ from octoreplay.errors import ConfigError
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
 @click.option("--align", is_flag=True,
               help="find the robots' frames first, as 'octoreplay align' does; other robots are left out")  # fmt: skip
+@dof_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: bool,
-    classes: str | None,
+    dof: str, classes: str | None,
     **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
@@ -65,12 +71,15 @@ def run(
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
         if align:
-            config, alignment = aligned_run(chosen, surveys, out)
+            config, alignment = aligned_run(chosen, int(dof), surveys, out)
         else:
             config, alignment = discover.resolve(chosen, surveys), None
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         tables.show(out, tables.class_list(config.classes))
+    else:
+        for line in _found_frames(base, config):
+            out.print(line, soft_wrap=True)
     for sentence in config.warnings:
         warn(err, sentence)
     if save_team is not None:
@@ -84,6 +93,13 @@ def run(
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
     is_whole = alignment is None or alignment.is_whole
     return EXIT_DATA_LOST if summary.lost_data or not is_whole else 0
+
+
+def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
+    """Lines on the robots whose poses TF transforms to a map frame that the configuration does not name."""
+    for robot, resolved in zip(given.robots, config.robots, strict=True):
+        if robot.map_frame is None and resolved.frame is not None and resolved.frame.origin:
+            yield f"{resolved.robot_id}: map frame {resolved.map_frame} ({resolved.frame.origin})"
 
 
 @click.command(short_help="Write the logs of a simulated team.")

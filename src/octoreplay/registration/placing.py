@@ -71,11 +71,13 @@ def place_robots(
     maps: Sequence[OwnMap],
     alignment: TeamAlignment,
     surveyed: Mapping[int, Float64Array],
+    *,
+    dof: int = 4,
     limits: AcceptLimits | None = None,
 ) -> Placement:
     """Return the place of each robot in its team.
 
-    ``surveyed`` are trusted poses T_team_map (4, 4) by robot. A component without a surveyed robot is a team in the
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``surveyed`` are trusted poses T_team_map (4, 4) by robot. A component without a surveyed robot is a team in the
     frame of its first robot. All components with one form a single team in the surveyed frame. Each is placed by the
     surveyed pose that agrees with most others of the component. Another surveyed pose of the component is kept where it
     differs from that of the maps by no more than the covariance explains (99 %), and is replaced where it differs by
@@ -95,7 +97,7 @@ def place_robots(
         anchor, refused = _anchor(alignment, known, surveyed)
         refusals += refused
         placed = _placed(alignment, _kept(alignment, anchor, {index: surveyed[index] for index in known}))
-        worst = _worst_between(maps, together, placed, limits)
+        worst = _worst_between(maps, together, placed, limits, is_upright=dof == 4)
         if worst is None:
             together += placed
         else:
@@ -156,14 +158,16 @@ def _anchor(
 
 
 def _worst_between(
-    maps: Sequence[OwnMap], team: Sequence[PlacedRobot], others: Sequence[PlacedRobot], limits: AcceptLimits
-) -> tuple[int, float] | None:
+    maps: Sequence[OwnMap], team: Sequence[PlacedRobot], others: Sequence[PlacedRobot], limits: AcceptLimits, *,
+    is_upright: bool,
+) -> tuple[int, float] | None:  # fmt: skip
     """Robot of the team that contradicts another group most, with the share q_c; None without contradiction."""
     poses = [np.eye(4) for _ in maps]
     for robot in (*team, *others):
         poses[robot.index] = robot.T_team_map
     ones = [robot.index for robot in team]
-    worst = worst_contradiction(maps, poses, ones, [robot.index for robot in others], np.eye(4), limits)
+    apart = [robot.index for robot in others]
+    worst = worst_contradiction(maps, poses, ones, apart, np.eye(4), limits, is_upright=is_upright)
     if worst is None:
         return None
     return (worst[0] if worst[0] in ones else worst[1]), worst[2]

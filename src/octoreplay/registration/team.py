@@ -47,31 +47,36 @@ class TeamAlignment:
 def align_team(
     maps: Sequence[OwnMap],
     *,
+    dof: int = 4,
     guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
     limits: AcceptLimits | None = None,
     names: Sequence[str] | None = None,
     run: Run = map,
 ) -> TeamAlignment:
-    """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
+    """Return the frames of robots from their maps in their own frames.
 
-    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are
-    the robots' names in refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the
-    result does not depend on it.
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``guesses`` are further
+    candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are the robots' names in
+    refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the result does not depend on
+    it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
 
     def align(pair: tuple[int, int]) -> PairAlignment:
-        return align_pair(maps, *pair, guesses=known.get(pair, ()), limits=limits)
+        return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
-    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits, names)
+    pairs = tuple(run(align, combinations(range(len(maps)), 2)))
+    return join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
 
 
 def join_pairs(
     maps: Sequence[OwnMap],
     pairs: Sequence[PairAlignment],
     limits: AcceptLimits,
+    *,
     names: Sequence[str] | None = None,
+    is_upright: bool = True,
 ) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
 
@@ -95,12 +100,9 @@ def join_pairs(
             # The frame of j's component in that of i's.
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
-            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits)
-            if worst is not None:
-                first, second = (names[index] for index in worst[:2])
-                refusal = f"{first} and {second} would contradict each other (q_c {worst[2]:.3f})"
-            else:
-                refusal = ""
+            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits, is_upright=is_upright)
+            refusal = "" if worst is None else _contradiction(worst, names)
+            if not refusal:
                 for index in members[old]:
                     poses[index] = T @ poses[index]
                     component[index] = new
@@ -132,6 +134,7 @@ def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
 def worst_contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
+    *, is_upright: bool = True,
 ) -> tuple[int, int, float] | None:  # fmt: skip
     """Return the two robots (first < second) of two groups that contradict each other most, with their share q_c.
 
@@ -142,10 +145,16 @@ def worst_contradiction(
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
-            obstacles = verify(maps[i], maps[j], pose).obstacles
+            obstacles = verify(maps[i], maps[j], pose, is_upright=is_upright).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
                 found.append((min(i, j), max(i, j), obstacles.share_contra))
     return max(found, key=lambda entry: entry[2], default=None)
+
+
+def _contradiction(worst: tuple[int, int, float], names: Sequence[str]) -> str:
+    """Reason not to join the groups of two robots that contradict each other."""
+    first, second, share = worst
+    return f"{names[first]} and {names[second]} would contradict each other (q_c {share:.3f})"
 
 
 def _turn_parents(parents: list[int | None], root: int) -> None:

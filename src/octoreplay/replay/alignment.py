@@ -76,6 +76,8 @@ class Alignment:
 
     Attributes
     ----------
+    dof : int
+        4 for robots whose map frames have a vertical z axis, 6 for others.
     robot_ids : tuple of str
         All robots.
     maps : tuple of OwnMap
@@ -95,6 +97,7 @@ class Alignment:
         Sentences on given poses that no overlap verifies, and on equal maps.
     """
 
+    dof: int
     robot_ids: tuple[str, ...]
     maps: tuple[OwnMap, ...] = field(repr=False)
     T_map_own: tuple[Float64Array, ...] = field(repr=False)
@@ -141,6 +144,7 @@ def align_robots(
     config: RunConfig,
     maps: Sequence[OwnMap],
     *,
+    dof: int = 4,
     T_map_own: Sequence[Float64Array] | None = None,
     guesses: Frames | None = None,
     progress: Callable[[float], None] | None = None,
@@ -149,7 +153,7 @@ def align_robots(
     """Return the frames of a team's robots from their own maps, in the order of ``config.robots``.
 
     A ``T_team_map`` of the configuration that no command computed is trusted: it places its robot unless the maps
-    contradict it. ``guesses`` are verified and refined like every other candidate, and are not used where no overlap
+    contradict it. ``dof`` is 4 for robots whose map frames have a vertical z axis, 6 for others. ``guesses`` are verified and refined like every other candidate, and are not used where no overlap
     verifies them. ``T_map_own`` (4, 4) places each map in its robot's map frame (default: it is in that frame).
     ``progress`` is called with the finished share of pairs, 0 to 1. ``num_threads`` does not change the result. Raises
     ConfigError for fewer than two robots, and for guesses of other robots.
@@ -171,23 +175,28 @@ def align_robots(
                 yield found
 
         try:
-            aligned = align_team(maps, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run)
+            aligned = align_team(
+                maps, dof=dof, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run
+            )
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
             raise
     given = _given(config)
-    placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()})
+    placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
     for refusal in placement.refusals:
         given.pop(refusal.index, None)
-    scores = {(pair.first, pair.second): pair.verification.score for pair in aligned.pairs}
+    qualities = {(pair.first, pair.second): _quality(pair, dof) for pair in aligned.pairs}
 
     def frames(team: Sequence[PlacedRobot]) -> tuple[RobotFrame, ...]:
         first = team[0].anchor
         # Without a given pose the team's frame is the map frame of the first robot.
         T_team_own = np.eye(4) if first in given else placed[first]
-        return tuple(_robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, scores) for robot in team)
+        return tuple(
+            _robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, qualities) for robot in team
+        )
 
     return Alignment(
+        dof,
         robot_ids,
         tuple(maps),
         placed,
@@ -286,7 +295,7 @@ def _candidates(
 
 def _robot_frame(
     robot: PlacedRobot, robot_ids: Sequence[str], T_team_own: Float64Array, T_map_own: Float64Array,
-    given: Mapping[int, Float64Array], scores: Mapping[tuple[int, int], float],
+    given: Mapping[int, Float64Array], qualities: Mapping[tuple[int, int], str],
 ) -> RobotFrame:  # fmt: skip
     """The frame of a placed robot; ``T_team_own`` maps the frame that it is placed in to the team's."""
     T = T_team_own @ robot.T_team_map @ inverse(T_map_own)
@@ -302,10 +311,16 @@ def _robot_frame(
     covariance = about_point(turn @ robot.covariance @ turn.T, arm)
     partner = robot_ids[robot.partner]
     first, second = sorted((robot.index, robot.partner))
-    origin = f"aligned with {partner}, L {scores[first, second]:.0f}"
+    origin = f"aligned with {partner}, {qualities[first, second]}"
     if robot.index in given:
         origin += f"; the given pose differs by {_difference(*pose_difference(T, given[robot.index]))}"
     return RobotFrame(robot_id, T, covariance, origin, partner, False)
+
+
+def _quality(pair: PairAlignment, dof: int) -> str:
+    """Number by which a pair is ranked, as text."""
+    agreement = pair.verification
+    return f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
 
 
 def _difference(shift: float, angle: float) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo, first_whole_message
-from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Kind, StampedTransform, Transforms, kind_of
 from octoreplay.io.robots.log_groups import LogGroup
 from octoreplay.io.robots.pose_source import POSE_KINDS, load_static_transforms, moving_tf_names, tf_topics
@@ -70,12 +70,10 @@ def sampled_tree(sensor_topic: str, group: LogGroup) -> FrameTree:
         for survey in group.surveys:
             load_static_transforms(tree, [survey.log], topics)
             for message in _moving_sample(survey.log, topics):
-                try:
+                with suppress(InputError):
                     found = message.sensor_message()
-                except DamagedMessageError:
-                    continue
-                if isinstance(found, Transforms):
-                    tree.add_transforms(found, is_static=False)
+                    if isinstance(found, Transforms):
+                        tree.add_transforms(found, is_static=False)
     return trees[key]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from octoreplay.config.robot import RobotConfig
-from octoreplay.io.messages.decoders import DamagedMessageError
+from octoreplay.errors import InputError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
 from octoreplay.io.robots.log_groups import LogGroup
 
@@ -94,7 +94,7 @@ def _delay(robot: RobotConfig, group: LogGroup) -> int | None:
         for message in islice(survey.log.messages((str(topic),)), _NUM_FIRST):
             if kind_of(message.type_name) not in _STAMPED_KINDS:
                 continue
-            with suppress(DamagedMessageError):
+            with suppress(InputError):
                 stamp_ns = message.header_stamp_ns()
                 # A stamp of 0 was never set.
                 if stamp_ns != 0 or message.log_time_ns == 0:
