@@ -59,8 +59,8 @@ dof_option = click.option(
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def align(
-    inputs: tuple[Path, ...], output: Path, dof: str, guess: Path | None, components: bool, csv: Path | None, json: Path | None,
-    plot: Path | None, classes: str | None, **parameters: Any,
+    inputs: tuple[Path, ...], output: Path, dof: str, guess: Path | None, components: bool, csv: Path | None,
+    json: Path | None, plot: Path | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
 

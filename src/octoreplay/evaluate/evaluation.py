@@ -178,10 +178,12 @@ class _Evaluator:
         evidence = [self._result.evidence(robot_id, tick=tick).octree for robot_id in self._result.robots]
         self._comparer.forget()
         pairs = self._comparer.compare(evidence, 0)
-        with_evidence = [
-            robot_id for robot_id, octree in zip(self._result.robots, evidence, strict=True) if octree.num_cells
-        ]
-        self.warnings = frame_warnings(pairs, with_evidence)
+        num_cells = {
+            name: octree.num_cells
+            for name, octree in zip(self._result.robots, evidence, strict=True)
+            if octree.num_cells
+        }
+        self.warnings = frame_warnings(pairs, num_cells)
         return pairs
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:

@@ -77,12 +77,16 @@ def place_robots(
 ) -> Placement:
     """Return the place of each robot in its team.
 
-    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``surveyed`` are trusted poses T_team_map (4, 4) by robot. A component without a surveyed robot is a team in the
-    frame of its first robot. All components with one form a single team in the surveyed frame. Each is placed by the
-    surveyed pose that agrees with most others of the component. Another surveyed pose of the component is kept where it
-    differs from that of the maps by no more than the covariance explains (99 %), and is replaced where it differs by
-    more. Surveyed poses that the maps contradict are refused: within a component where the aligned pose differs by more
-    than ``LARGEST_SURVEY_SHIFT`` or ``LARGEST_SURVEY_ANGLE``, between components where two maps contradict each other
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``surveyed`` are trusted poses
+    T_team_map (4, 4) by robot.
+
+    A component without a surveyed robot is a team in the frame of its first robot. All components with one form a
+    single team in the surveyed frame. Each is placed by the surveyed pose that agrees with most others of the
+    component. Another surveyed pose of the component is kept where it differs from that of the maps by no more than the
+    covariance explains (99 %), and is replaced where it differs by more.
+
+    Surveyed poses that the maps contradict are refused: within a component where the aligned pose differs by more than
+    ``LARGEST_SURVEY_SHIFT`` or ``LARGEST_SURVEY_ANGLE``, between components where two maps contradict each other
     clearly; then the smaller component is a team of its own.
     """
     limits = limits or AcceptLimits()

@@ -152,11 +152,12 @@ def align_robots(
 ) -> Alignment:
     """Return the frames of a team's robots from their own maps, in the order of ``config.robots``.
 
-    A ``T_team_map`` of the configuration that no command computed is trusted: it places its robot unless the maps
-    contradict it. ``dof`` is 4 for robots whose map frames have a vertical z axis, 6 for others. ``guesses`` are verified and refined like every other candidate, and are not used where no overlap
-    verifies them. ``T_map_own`` (4, 4) places each map in its robot's map frame (default: it is in that frame).
-    ``progress`` is called with the finished share of pairs, 0 to 1. ``num_threads`` does not change the result. Raises
-    ConfigError for fewer than two robots, and for guesses of other robots.
+    ``dof`` is 4 for robots whose map frames have a vertical z axis, 6 for others. A ``T_team_map`` of the configuration
+    that no command computed is trusted: it places its robot unless the maps contradict it. ``guesses`` are verified and
+    refined like every other candidate, and are not used where no overlap verifies them. ``T_map_own`` (4, 4) places
+    each map in its robot's map frame (default: it is in that frame). ``progress`` is called with the finished share of
+    pairs, 0 to 1. ``num_threads`` does not change the result. Raises ConfigError for fewer than two robots, and for
+    guesses of other robots.
     """
     robot_ids = tuple(robot.robot_id for robot in config.robots)
     if len(robot_ids) < 2:

@@ -82,12 +82,12 @@ class Recorder:
         self._links = LinkTotals()
 
     @property
-    def last_pairs(self) -> tuple[tuple[PairMetrics, ...], list[str]]:
-        """Pairs of robots after the last tick, and the robots with evidence; empty before the first tick."""
+    def last_pairs(self) -> tuple[tuple[PairMetrics, ...], dict[str, int]]:
+        """Pairs of robots after the last tick, and the known cells of each robot with evidence."""
         if self.last is None:
-            return (), []
+            return (), {}
         evidence = zip(self.last.graph.robot_ids, self.last.evidence, strict=True)
-        return self.last.metrics.pairs, [robot_id for robot_id, octree in evidence if octree.num_cells]
+        return self.last.metrics.pairs, {name: octree.num_cells for name, octree in evidence if octree.num_cells}
 
     def record(self, tick: Tick) -> None:
         """Record one tick."""

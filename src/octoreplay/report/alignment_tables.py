@@ -35,7 +35,7 @@ def alignment_tables(alignment: Alignment) -> RenderableType:
 def contradiction_table(pairs_by_frames: Mapping[str, Sequence[PairMetrics]]) -> Table:
     """Return a table of the contradiction of evidence, with one row for each choice of frames."""
     table = styled_table("Contradiction of evidence, worst pair")
-    for name in ("frames", "contradiction", "by more than a cell", "other label"):
+    for name in ("frames", "contradiction", "clear contradiction", "label contradiction"):
         table.add_column(name, overflow="fold")
     for frames, pairs in pairs_by_frames.items():
         table.add_row(frames, *(worst_pair(pairs, name) for name in PAIR_SHARES))
