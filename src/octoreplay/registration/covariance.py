@@ -59,7 +59,7 @@ def chained_frames(alignment: TeamAlignment, roots: Sequence[int]) -> dict[int, 
             if other not in found:
                 turn = adjoint(near.T_root_map)
                 across = _covariance(pairs[min(index, other), max(index, other)], to=index)
-                covariance = near.covariance + turn @ across @ turn.T
+                covariance: Float64Array = near.covariance + turn @ across @ turn.T
                 found[other] = ChainedFrame(near.root, index, inverse(T[near.root]) @ T[other], covariance)
                 queue.append(other)
     return {
@@ -78,10 +78,10 @@ def adjoint(T: Float64Array) -> Float64Array:
 
 def _covariance(pair: PairAlignment, *, to: int) -> Float64Array:
     """Covariance of a pair's pose, which maps to the frame of the robot ``to``."""
-    covariance: Float64Array = np.linalg.inv(pair.information + _LEAST_INFORMATION * np.eye(6))
+    covariance = np.asarray(np.linalg.inv(pair.information + _LEAST_INFORMATION * np.eye(6)), np.float64)
     if to == pair.first:
         return covariance
-    turn = np.linalg.inv(adjoint(pair.T_first_second))
+    turn = adjoint(inverse(pair.T_first_second))
     return turn @ covariance @ turn.T
 
 

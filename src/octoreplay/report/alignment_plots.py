@@ -104,7 +104,7 @@ def _draw(axes: Axes, title: str, layers: Iterable[_Layer]) -> None:
     """Draw the columns of robots."""
     style(axes, title, "x [m]", "y [m]")
     for name, columns, color in layers:
-        axes.scatter(*columns.T, s=3.0, marker="s", linewidths=0, color=color, alpha=0.6)
+        axes.scatter(columns[:, 0], columns[:, 1], s=3.0, marker="s", linewidths=0, color=color, alpha=0.6)
         # The legend's markers would be as small as the columns.
         axes.scatter([], [], s=30.0, marker="s", linewidths=0, color=color, label=name)
     axes.set_aspect("equal", adjustable="datalim")
