@@ -84,9 +84,9 @@ def align(
     tables.show(out, alignment_tables(alignment))
     written = write_alignment(alignment, csv_path=csv, json_path=json)
     written += write_alignment_figures(alignment, plot) if plot is not None else []
-    written = [*_write_teams(config, alignment, output, components=components), *written]
     for sentence in (*warnings, *alignment.warnings):
         warn(err, sentence)
+    written = [*_write_teams(config, alignment, output, components=components), *written]
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
     return 0 if alignment.is_whole else EXIT_ERROR
@@ -121,10 +121,11 @@ def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys, out: Console) 
     Raises InputError where no two robots are connected.
     """
     from octoreplay.io.robots import discover
-    from octoreplay.replay.alignment import aligned_config, check_aligned
+    from octoreplay.replay.alignment import aligned_config, check_alignable, check_aligned
     from octoreplay.report import tables
     from octoreplay.report.alignment_tables import alignment_tables
 
+    check_alignable(chosen, {})
     # Frames that nothing relates are the reason to align them.
     resolved = discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys)
     alignment = align_with_bar(chosen, evidence_with_bar(resolved), dof)
@@ -142,7 +143,7 @@ def _aligned(
     from octoreplay.io.results.result_reader import is_result
     from octoreplay.io.robots import discover
     from octoreplay.io.robots.survey import LogSurveys
-    from octoreplay.replay.alignment import aligned_config
+    from octoreplay.replay.alignment import aligned_config, check_alignable
 
     guesses = None if guess is None else load_frames_file(guess)
     if is_result(inputs[0]):
@@ -154,6 +155,7 @@ def _aligned(
     with LogSurveys() as surveys:
         config = base_config(inputs, None, err, surveys)
         config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
+        check_alignable(config, guesses or {})
         resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)
         alignment = align_with_bar(config, evidence_with_bar(resolved), dof, guesses)
         return config, alignment, discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings

@@ -94,7 +94,7 @@ class Alignment:
     problems : tuple of str
         Sentences on given poses that the maps contradict.
     notes : tuple of str
-        Sentences on given poses that no overlap verifies, and on equal maps.
+        Sentences on given poses that no overlap verifies, and on empty and equal maps.
     """
 
     dof: int
@@ -130,9 +130,9 @@ class Alignment:
         return max(own, key=lambda pair: pair.verification.score)
 
     def reasons(self) -> tuple[str, ...]:
-        """Return a sentence for each robot that is left out, with its best pair and the number that failed."""
-        sentences = []
-        for robot_id in self.left_out:
+        """Return a sentence for each robot that is left out of a team: its best pair and the number that failed."""
+        sentences: list[str] = []
+        for robot_id in self.left_out if len(self.teams[0]) > 1 else ():
             pair = self.best_refused(robot_id)
             first, second = self.robot_ids[pair.first], self.robot_ids[pair.second]
             reason = pair.refusal or "accepted, and they are a team of their own"
@@ -160,11 +160,7 @@ def align_robots(
     guesses of other robots.
     """
     robot_ids = tuple(robot.robot_id for robot in config.robots)
-    if len(robot_ids) < 2:
-        raise ConfigError(f"align: needs at least two robots; the team has one, {robot_ids[0]}")
-    for robot_id in guesses or {}:
-        if robot_id not in robot_ids:
-            raise ConfigError(f"guess: robot '{robot_id}' is not in the team: {', '.join(sorted(robot_ids))}")
+    check_alignable(config, guesses or {})
     placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
     pairs = list(combinations(range(len(maps)), 2))
     with ThreadPoolExecutor(num_threads or min(len(pairs), os.cpu_count() or 1)) as threads:
@@ -205,8 +201,18 @@ def align_robots(
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
-        (*_unverified(placement.teams[0], given, robot_ids), *_equal_maps(maps, robot_ids)),
+        (*_unverified(placement.teams[0], given, robot_ids), *_odd_maps(maps, robot_ids)),
     )
+
+
+def check_alignable(config: RunConfig, guesses: Frames) -> None:
+    """Raise ConfigError for fewer than two robots, and for guesses of robots that are not in the team."""
+    robot_ids = [robot.robot_id for robot in config.robots]
+    if len(robot_ids) < 2:
+        raise ConfigError(f"align: needs at least two robots; the team has one, {robot_ids[0]}")
+    for robot_id in guesses:
+        if robot_id not in robot_ids:
+            raise ConfigError(f"guess: robot '{robot_id}' is not in the team: {', '.join(sorted(robot_ids))}")
 
 
 def stored_maps(
@@ -353,8 +359,11 @@ def _unverified(
             yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
 
 
-def _equal_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
-    """Sentences on robots whose maps are equal."""
+def _odd_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
+    """Sentences on empty and on equal maps."""
+    for own, robot_id in zip(maps, robot_ids, strict=True):
+        if not own.states.any():
+            yield f"the map of {robot_id} is empty: check max_range, body_box and the poses"
     for i, j in combinations(range(len(maps)), 2):
         is_equal = np.array_equal(maps[i].low, maps[j].low) and np.array_equal(maps[i].states, maps[j].states)
         if is_equal and maps[i].states.any():
