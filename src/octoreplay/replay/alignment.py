@@ -17,13 +17,14 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.subteam import subteam
 from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.robots.discover import resolve
 from octoreplay.records import Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots, pose_difference
 from octoreplay.registration.team import align_team
-from octoreplay.replay.own_maps import own_map_of
+from octoreplay.replay.own_maps import own_map_of, own_maps
 from octoreplay.result import Result
 from octoreplay.transforms import inverse, numbers_of, transform_of
 
@@ -138,6 +139,32 @@ class Alignment:
             reason = pair.refusal or "accepted, and they are a team of their own"
             sentences.append(f"{robot_id} is not connected; its best pair is {first} and {second}: {reason}")
         return tuple(sentences)
+
+
+def align_logs(
+    config: RunConfig,
+    *,
+    dof: int = 4,
+    guesses: Frames | None = None,
+    progress: Callable[[float], None] | None = None,
+    num_threads: int | None = None,
+) -> Alignment:
+    """Return the frames of a team's robots from the maps that each one's own logs give.
+
+    The parameters are those of ``align_robots``; ``progress`` counts maps and pairs as one half each. A configuration
+    that is not resolved is resolved first. Raises InputError and ConfigError as ``resolve`` and ``align_robots`` do.
+    """
+    check_alignable(config, guesses or {})
+
+    def show(share: float) -> None:
+        if progress is not None:
+            progress(share)
+
+    resolved = resolve(config.with_parameters({"strict_frames": False}))
+    maps = own_maps(resolved, progress=lambda share: show(share / 2), num_threads=num_threads)
+    return align_robots(
+        config, maps, dof=dof, guesses=guesses, progress=lambda share: show((1 + share) / 2), num_threads=num_threads
+    )
 
 
 def align_robots(
