@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 dof_option = click.option(
     "--dof",
     type=click.Choice(("4", "6")),
-    default="4",
-    show_default=True,
-    help="unknowns of a frame: 4 if the z axes of all map frames are vertical; 6 if not, as for hand-held cameras",
+    default=None,
+    help="unknowns of a frame: 4 if the z axes of all map frames are vertical; 6 if not, as for hand-held cameras"
+    "  [default: 4]",
 )
 
 
@@ -59,7 +59,7 @@ dof_option = click.option(
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def align(
-    inputs: tuple[Path, ...], output: Path, dof: str, guess: Path | None, components: bool, csv: Path | None,
+    inputs: tuple[Path, ...], output: Path, dof: str | None, guess: Path | None, components: bool, csv: Path | None,
     json: Path | None, plot: Path | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
@@ -80,7 +80,7 @@ def align(
         check_folder(plot)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config, alignment, warnings = _aligned(inputs, int(dof), guess, classes, given, err)
+    config, alignment, warnings = _aligned(inputs, int(dof or 4), guess, classes, given, err)
     tables.show(out, alignment_tables(alignment))
     written = write_alignment(alignment, csv_path=csv, json_path=json)
     written += write_alignment_figures(alignment, plot) if plot is not None else []

@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 @click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")
 @click.option("--schedule", type=existing_path, metavar="FILE.yaml",
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
-@click.option("--align", is_flag=True,
+@click.option("--align", is_flag=True, default=None,
               help="find the robots' frames first, as 'octoreplay align' does; other robots are left out")  # fmt: skip
 @dof_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
-    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: bool,
-    dof: str, classes: str | None,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: bool | None,
+    dof: str | None, classes: str | None,
     **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
@@ -71,7 +71,7 @@ def run(
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
         if align:
-            config, alignment = aligned_run(chosen, int(dof), surveys, out)
+            config, alignment = aligned_run(chosen, int(dof or 4), surveys, out)
         else:
             config, alignment = discover.resolve(chosen, surveys), None
     if config_from is None and not is_team_file(inputs):
