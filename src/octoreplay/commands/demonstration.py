@@ -100,4 +100,4 @@ def _clear(pairs: tuple[PairMetrics, ...]) -> str:
     from octoreplay.report.tables import share
 
     ranked = ranked_pairs(pairs, "clear_contradiction")
-    return f"{share(ranked[0].clear_contradiction)} contradiction, worst pair" if ranked else "no common space"
+    return f"{share(ranked[0].clear_contradiction)} clear contradiction, worst pair" if ranked else "no common space"
