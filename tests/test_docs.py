@@ -64,7 +64,7 @@ def test_every_command_and_option_is_explained() -> None:
         parts = command.commands if isinstance(command, click.Group) else {}
         assert all(f"octoreplay {name} {part}" in section for part in parts)
         for parameter in (*command.params, *(option for part in parts.values() for option in part.params)):
-            if parameter.name not in ("output", "result", "folder", "logs", "teams", *PARAMETERS):
+            if parameter.name not in ("output", "inputs", "result", "folder", "logs", "teams", *PARAMETERS):
                 assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
 
 

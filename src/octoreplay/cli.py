@@ -15,7 +15,18 @@ from collections.abc import Sequence
 import click
 
 from octoreplay._version import __version__
-from octoreplay.commands import evaluation, experiments, logs, refining, results, running, studies, verdicts
+from octoreplay.commands import (
+    aligning,
+    demonstration,
+    evaluation,
+    experiments,
+    logs,
+    refining,
+    results,
+    running,
+    studies,
+    verdicts,
+)
 from octoreplay.commands.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.errors import ConfigError, OctoreplayError
 
@@ -31,9 +42,9 @@ def cli() -> None:
 
 
 for _command in (
-    running.run, running.simulate, running.demo, refining.refine, logs.info, logs.init, logs.import_rgbd,
-    logs.import_clouds, results.metrics, results.export, results.query, evaluation.evaluate, verdicts.check,
-    verdicts.compare, studies.sweep, experiments.experiment,
+    running.run, running.simulate, demonstration.demo, aligning.align, refining.refine, logs.info, logs.init,
+    logs.import_rgbd, logs.import_clouds, results.metrics, results.export, results.query, evaluation.evaluate,
+    verdicts.check, verdicts.compare, studies.sweep, experiments.experiment,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -411,7 +411,11 @@ class RobotPose:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Summary of a run. ``links`` are the directed links over all ticks; the wall time is not stored in the result."""
+    """Summary of a run.
+
+    ``links`` are the directed links over all ticks. ``frame_origins`` are phrases on the origin of each robot's place
+    in the team's frame, by robot_id; empty in results without them. The wall time is not stored in the result.
+    """
 
     num_ticks: int
     num_settling_ticks: int
@@ -428,6 +432,7 @@ class RunSummary:
     links: tuple[LinkMetrics, ...]
     frame_counts: Mapping[str, FrameCounts]
     warnings: tuple[str, ...]
+    frame_origins: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def lost_data(self) -> bool:

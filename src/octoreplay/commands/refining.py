@@ -130,4 +130,6 @@ def _with_trajectory(robot: RobotConfig, trajectory: RobotTrajectory, folder: Pa
         pose_file=folder / f"{robot.robot_id}.tum",
         T_body_sensor=trajectory.T_body_sensor,
         T_team_map=trajectory.T_team_map,
+        T_team_map_sigma=None,
+        T_team_map_from="refined",
     )

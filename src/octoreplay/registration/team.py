@@ -50,13 +50,15 @@ def align_team(
     dof: int = 4,
     guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
     limits: AcceptLimits | None = None,
+    names: Sequence[str] | None = None,
     run: Run = map,
 ) -> TeamAlignment:
     """Return the frames of robots from their maps in their own frames.
 
     ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``guesses`` are further
-    candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run`` aligns the pairs, one call
-    for each; the result does not depend on it.
+    candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are the robots' names in
+    refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the result does not depend on
+    it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
@@ -64,11 +66,17 @@ def align_team(
     def align(pair: tuple[int, int]) -> PairAlignment:
         return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
-    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits, is_upright=dof == 4)
+    pairs = tuple(run(align, combinations(range(len(maps)), 2)))
+    return join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
 
 
 def join_pairs(
-    maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: AcceptLimits, *, is_upright: bool = True
+    maps: Sequence[OwnMap],
+    pairs: Sequence[PairAlignment],
+    limits: AcceptLimits,
+    *,
+    names: Sequence[str] | None = None,
+    is_upright: bool = True,
 ) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
 
@@ -76,6 +84,7 @@ def join_pairs(
     a component is refused where its pose differs from the component's.
     """
     num = len(maps)
+    names = names or [f"robot {index + 1}" for index in range(num)]
     component = list(range(num))
     members = {index: [index] for index in range(num)}
     poses: list[Float64Array] = [np.eye(4) for _ in range(num)]
@@ -91,7 +100,8 @@ def join_pairs(
             # The frame of j's component in that of i's.
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
-            refusal = _contradiction(maps, poses, members[new], members[old], T, limits, is_upright)
+            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits, is_upright=is_upright)
+            refusal = "" if worst is None else _contradiction(worst, names)
             if not refusal:
                 for index in members[old]:
                     poses[index] = T @ poses[index]
@@ -121,21 +131,30 @@ def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
     return f"differs from the chain of better pairs by {shift:.1f} m and {angle:.1f} degrees"
 
 
-def _contradiction(
+def worst_contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
-    is_upright: bool,
-) -> str:  # fmt: skip
-    """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty without contradiction."""
+    *, is_upright: bool = True,
+) -> tuple[int, int, float] | None:  # fmt: skip
+    """Return the two robots (first < second) of two groups that contradict each other most, with their share q_c.
+
+    ``poses`` (4, 4) are those of each robot's map in its group's frame; ``T`` (4, 4) maps the frame of ``others`` to
+    that of ``ones``. Returns None where no two maps contradict each other clearly.
+    """
+    found: list[tuple[int, int, float]] = []
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
             obstacles = verify(maps[i], maps[j], pose, is_upright=is_upright).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
-                first, second = sorted((i, j))
-                share = obstacles.share_contra
-                return f"robots {first + 1} and {second + 1} would contradict each other (q_c {share:.3f})"
-    return ""
+                found.append((min(i, j), max(i, j), obstacles.share_contra))
+    return max(found, key=lambda entry: entry[2], default=None)
+
+
+def _contradiction(worst: tuple[int, int, float], names: Sequence[str]) -> str:
+    """Reason not to join the groups of two robots that contradict each other."""
+    first, second, share = worst
+    return f"{names[first]} and {names[second]} would contradict each other (q_c {share:.3f})"
 
 
 def _turn_parents(parents: list[int | None], root: int) -> None:

@@ -144,6 +144,7 @@ class Recorder:
             links=self._links.totals(),
             frame_counts=counts,
             warnings=warnings,
+            frame_origins={robot.robot_id: robot.frame_origin for robot in self._config.robots},
         )
 
     def _add_up(self, metrics: TickMetrics) -> None:

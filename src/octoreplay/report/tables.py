@@ -15,7 +15,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.config.resolved import MapFrame, ResolvedRun
+from octoreplay.config.resolved import MapFrame, ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.team_clocks import instant
 from octoreplay.log_odds import best_labels, label_probabilities
@@ -263,6 +263,8 @@ def _team_table(summary: RunSummary) -> Table:
         table.add_row("contradiction, worst pair", worst_pair(last.pairs, "contradiction"))
         table.add_row("clear contradiction", worst_pair(last.pairs, "clear_contradiction"))
         table.add_row("label contradiction", worst_pair(last.pairs, "label_contradiction"))
+        if summary.frame_origins:
+            table.add_row("frames", _frame_origins(summary.frame_origins))
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
     grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
@@ -275,6 +277,13 @@ def _team_table(summary: RunSummary) -> Table:
         delivered = sum(link.num_delivered for link in summary.links) / num_sent
         table.add_row("packets", f"{num_sent:,} over {len(summary.links)} links, {share(delivered)} delivered")
     return table
+
+
+def _frame_origins(origins: Mapping[str, str]) -> str:
+    """Lines on the origins of the robots' frames: one for all robots, or one each."""
+    if len(set(origins.values())) == 1:
+        return next(iter(origins.values()))
+    return "\n".join(f"{robot_id}: {origin}" for robot_id, origin in origins.items())
 
 
 _AGREEMENTS = ("agreement", "agreement_occupied")
@@ -392,4 +401,6 @@ def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
     values = {name: value for field, name in names.items() if (value := getattr(robot, field))}
     if frame is not None and frame.origin:
         values["map frame"] += f" ({frame.origin})"
+    if isinstance(robot, ResolvedRobot) and robot.frame_origin:
+        values["team frame"] = robot.frame_origin
     return [f"{name:<{width}}  {value}" for name, value in values.items()]

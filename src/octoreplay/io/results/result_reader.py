@@ -268,6 +268,20 @@ class ResultReader:
 
 _DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
 """Exceptions raised by reading a damaged file."""
+
+
+def is_result(path: Path) -> bool:
+    """Return True for the file of a result, of any format version; False for other files and folders."""
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            names = {record.name for record in SeekingReader(file).iter_metadata()}
+    except (OSError, *_DAMAGE):
+        return False
+    return {"octoreplay", "config"} <= names
+
+
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
 
 
