@@ -14,7 +14,6 @@ from octoreplay.registration.icp import Surface, icp
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.search import planar_candidates
 from octoreplay.registration.verify import Verification, verify
-from octoreplay.transforms import inverse
 
 TILT_SIGMA = math.radians(1.0)
 """Standard deviation of the angle between the vertical axes of two gravity-aligned robots [rad]."""
