@@ -79,6 +79,10 @@ class Surface:
         """Search tree over the points; the fourth coordinate separates the codes."""
         return cKDTree(_keys(self.points, self.codes))
 
+    def distances(self, points: Float64Array, codes: Int64Array, limit: float) -> Float64Array:
+        """Return the distance (m,) from points (m, 3) to the nearest point of the same code; inf beyond ``limit``."""
+        return np.asarray(self.tree.query(_keys(points, codes), distance_upper_bound=limit)[0], np.float64)
+
     def subset(self, chosen: BoolArray) -> Surface:
         """Return the points where ``chosen`` (n,) is True."""
         return Surface(self.points[chosen], self.codes[chosen], self.covariances[chosen], self.weights[chosen])

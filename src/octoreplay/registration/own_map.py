@@ -35,6 +35,9 @@ from octoreplay.registration.icp import Surface
 MAX_CELLS = 1 << 27
 """Largest number of cells in a map's bounding box; a larger map is halved in resolution until it fits."""
 
+FIRST_GROUND_CODE = 255
+"""Code of ground of class 0 in the surface of a map with a vertical axis; obstacles have their class as code."""
+
 # Radius of the neighbourhood that shapes the local surface [cell].
 _SURFACE_RADIUS = 3.5
 # Total weight of ground and of edges between ground classes, relative to that of the obstacles.
@@ -174,7 +177,9 @@ class OwnMap:
         weights = np.array([1.0, _GROUND_WEIGHT, _EDGE_WEIGHT]) * max(num[0], 1) / np.maximum(num, 1)
         return Surface.of_points(
             np.concatenate([obstacles.points, ground.points, ground.points[is_edge]]),
-            np.concatenate([obstacles.class_ids.astype(np.int64), ground.class_ids + np.int64(UNDECIDED), edge_codes]),
+            np.concatenate(
+                [obstacles.class_ids.astype(np.int64), ground.class_ids + np.int64(FIRST_GROUND_CODE), edge_codes]
+            ),
             np.repeat(weights, num),
             spacing=self.resolution,
             radius=_SURFACE_RADIUS * self.resolution,

@@ -13,7 +13,7 @@ from octoreplay.registration.features import feature_candidates
 from octoreplay.registration.icp import Surface, icp
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.search import planar_candidates
-from octoreplay.registration.verify import Verification, verify
+from octoreplay.registration.verify import Verification, candidate_score, spread_of_normals, verify
 
 TILT_SIGMA = math.radians(1.0)
 """Standard deviation of the angle between the vertical axes of two gravity-aligned robots [rad]."""
@@ -53,15 +53,18 @@ class AcceptLimits:
         Least number of cells of each map that count, without a vertical axis.
     min_shape_same : float
         Least share q of each map's cells that are the same, without a vertical axis.
+    min_shape_spread : float
+        Least spread of the normals of these cells (``verify.spread_of_normals``): parallel planes fix no pose.
     """
 
-    min_score: float = 280.0
+    min_score: float = 200.0
     min_cells: int = 150
     max_contra: float = 0.05
     max_tilt: float = math.radians(2.5)
     max_rival: float = 0.5
     min_shape_cells: int = 800
     min_shape_same: float = 0.96
+    min_shape_spread: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +163,7 @@ class _Matcher:
     ) -> list[tuple[Float64Array, Float64Array, Verification]]:
         """Poses with their information and verification: the best candidates after refinement."""
         candidates = [*self._candidates(), *guesses]
-        ranked = sorted(candidates, key=lambda T: -self.evidence(self.verify(T)))
+        ranked = sorted(candidates, key=lambda T: -self._rank(T))
         thin = [_thinned(surface) for surface in self._surfaces]
         refined = []
         for candidate in ranked[:_NUM_REFINED]:
@@ -181,12 +184,22 @@ class _Matcher:
         if obstacles.share_contra > limits.max_contra:
             return f"q_c {obstacles.share_contra:.3f} above {limits.max_contra:g}"
         if not self._is_upright:
-            is_same = agreement.least_same >= limits.min_shape_same
-            return "" if is_same else f"q {agreement.least_same:.3f} below {limits.min_shape_same:g}"
+            return self._shape_refusal(agreement, T)
         if tilt(T) > limits.max_tilt:
             return f"tilt {math.degrees(tilt(T)):.1f} degrees, above {math.degrees(limits.max_tilt):.1f}"
         min_score = limits.min_score * (_SCORE_RESOLUTION / self._first.resolution) ** 2
         return "" if agreement.score >= min_score else f"L {agreement.score:.0f} below {min_score:.0f}"
+
+    def _shape_refusal(self, agreement: Verification, T: Float64Array) -> str:
+        """The number for which a pose without a vertical axis is refused; empty where it is accepted."""
+        limits = self._limits
+        if agreement.least_same < limits.min_shape_same:
+            return f"q {agreement.least_same:.3f} below {limits.min_shape_same:g}"
+        spread = spread_of_normals(self._first, self._second, T)
+        is_fixed = spread >= limits.min_shape_spread
+        return (
+            "" if is_fixed else f"shared surfaces are parallel: spread {spread:.3f} below {limits.min_shape_spread:g}"
+        )
 
     def is_distinct(self, one: Float64Array, other: Float64Array) -> bool:
         """True where two poses of the second map's centre differ by more than four cells, or 8 degrees."""
@@ -194,6 +207,10 @@ class _Matcher:
         shift = float(np.linalg.norm((one - other) @ centre))
         turn = float(np.trace(one[:3, :3].T @ other[:3, :3]))
         return shift > 4 * self._first.resolution or turn < 1 + 2 * math.cos(math.radians(8))
+
+    def _rank(self, T: Float64Array) -> float:
+        """Number by which candidates are ranked before their refinement."""
+        return candidate_score(self._first, self._second, T) if self._is_upright else self.evidence(self.verify(T))
 
     def _candidates(self) -> list[Float64Array]:
         """Candidate poses (4, 4)."""
@@ -206,7 +223,7 @@ class _Matcher:
         """The candidate at its height or one cell above or below, whichever verifies best."""
         shifts = (0.0, -self._first.resolution, self._first.resolution)
         poses = [candidate + shift * _UPWARDS for shift in shifts]
-        return max(poses, key=lambda T: self.verify(T).score)
+        return max(poses, key=self._rank)
 
     def _refine(
         self, surfaces: Sequence[Surface], T: Float64Array, gates: Sequence[float]
