@@ -71,7 +71,7 @@ def trajectory_error(team: Path, poses: Path, T_team_map: dict[str, np.ndarray])
 
 def frames_of(team: Path) -> dict[str, np.ndarray]:
     """T_team_map (4, 4) of each robot."""
-    return {robot.robot_id: transform_of(robot.T_team_map) for robot in load_team_file(team).robots}
+    return {robot.robot_id: transform_of(robot.T_team_map_or_identity) for robot in load_team_file(team).robots}
 
 
 def recorded_poses(team: Path, folder: Path) -> Path:
@@ -112,8 +112,8 @@ def test_the_refined_team_gives_sensor_poses_of_the_corrected_trajectory(team: P
         assert new_log.counts.no_pose == 0
         np.testing.assert_allclose(transform_of(new.T_body_sensor), mount, atol=1e-9)
         # The first recorded pose begins the corrected trajectory in the map frame.
-        T_map_sensor = np.linalg.inv(transform_of(new.T_team_map)) @ frames[0][1].T_team_sensor
-        recorded = np.linalg.inv(transform_of(old.T_team_map)) @ frames[0][0].T_team_sensor
+        T_map_sensor = np.linalg.inv(transform_of(new.T_team_map_or_identity)) @ frames[0][1].T_team_sensor
+        recorded = np.linalg.inv(transform_of(old.T_team_map_or_identity)) @ frames[0][0].T_team_sensor
         np.testing.assert_allclose(T_map_sensor, recorded, atol=0.02)
         truth = read_tum_track(team.parent / "truth" / f"{new.robot_id}.tum")
         true = np.array([truth.matrix_at(a.stamp_ns, 10**9)[:3, 3] for a, _ in frames])

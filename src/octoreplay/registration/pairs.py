@@ -25,6 +25,10 @@ _NUM_REFINED = 4
 _THINNING = 3
 _UPWARDS = np.zeros((4, 4))
 _UPWARDS[2, 3] = 1.0
+# Shares of the same cells under a right pose, and the score that a pose needs more for each share less, for each share
+# of contradicting obstacles, and for each squared standard deviation of tilt.
+_USUAL_SAME, _USUAL_GROUND_SAME = 0.97, 0.985
+_PER_UNLIKE_OBSTACLE, _PER_UNLIKE_GROUND, _PER_CONTRA, _PER_TILT = 3000.0, 5000.0, 2500.0, 25.0
 # Edge of the cells for which the least score holds [m].
 _SCORE_RESOLUTION = 0.3
 # A refined candidate with more contradicting obstacles than this is wrong.
@@ -38,8 +42,8 @@ class AcceptLimits:
     Attributes
     ----------
     min_score : float
-        Least log-likelihood ratio L of maps with a vertical axis, at cells of 0.3 m. It grows with the number of cells
-        on the same surface.
+        Least log-likelihood ratio L of maps with a vertical axis, at cells of 0.3 m, where all cells agree. It grows
+        with the number of cells on the same surface, with the shares that disagree, and with the tilt.
     min_cells : int
         Least number of obstacle cells that count, both maps together.
     max_contra : float
@@ -59,7 +63,7 @@ class AcceptLimits:
 
     min_score: float = 200.0
     min_cells: int = 150
-    max_contra: float = 0.05
+    max_contra: float = 0.1
     max_tilt: float = math.radians(2.5)
     max_rival: float = 0.5
     min_shape_cells: int = 800
@@ -187,8 +191,16 @@ class _Matcher:
             return self._shape_refusal(agreement, T)
         if tilt(T) > limits.max_tilt:
             return f"tilt {math.degrees(tilt(T)):.1f} degrees, above {math.degrees(limits.max_tilt):.1f}"
-        min_score = limits.min_score * (_SCORE_RESOLUTION / self._first.resolution) ** 2
+        min_score = self._min_score(agreement, T)
         return "" if agreement.score >= min_score else f"L {agreement.score:.0f} below {min_score:.0f}"
+
+    def _min_score(self, agreement: Verification, T: Float64Array) -> float:
+        """Least score of a pose: the more cells disagree and the more it tilts, the more evidence it needs."""
+        obstacles, ground = agreement.obstacles, agreement.ground
+        doubt = _PER_UNLIKE_OBSTACLE * max(0.0, _USUAL_SAME - obstacles.share_same)
+        doubt += _PER_UNLIKE_GROUND * max(0.0, _USUAL_GROUND_SAME - ground.share_same)
+        doubt += _PER_CONTRA * obstacles.share_contra + (tilt(T) / TILT_SIGMA) ** 2 * _PER_TILT
+        return (self._limits.min_score + doubt) * (_SCORE_RESOLUTION / self._first.resolution) ** 2
 
     def _shape_refusal(self, agreement: Verification, T: Float64Array) -> str:
         """The number for which a pose without a vertical axis is refused; empty where it is accepted."""

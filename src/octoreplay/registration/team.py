@@ -146,7 +146,7 @@ def worst_contradiction(
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
             obstacles = verify(maps[i], maps[j], pose, is_upright=is_upright).obstacles
-            if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
+            if obstacles.total >= limits.min_cells and obstacles.share_contra > limits.max_contra:
                 found.append((min(i, j), max(i, j), obstacles.share_contra))
     return max(found, key=lambda entry: entry[2], default=None)
 
