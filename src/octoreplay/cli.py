@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import click
 
 from octoreplay._version import __version__
-from octoreplay.commands import evaluation, experiments, logs, results, running, studies, verdicts
+from octoreplay.commands import aligning, evaluation, experiments, logs, results, running, studies, verdicts
 from octoreplay.commands.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.errors import ConfigError, OctoreplayError
 
@@ -32,6 +32,7 @@ def cli() -> None:
 
 for _command in (
     running.run, running.simulate, running.demo, logs.info, logs.init, logs.import_rgbd, logs.import_clouds,
+    aligning.align,
     results.metrics, results.export, results.query, evaluation.evaluate, verdicts.check, verdicts.compare,
     studies.sweep, experiments.experiment,
 ):  # fmt: skip

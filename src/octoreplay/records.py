@@ -5,6 +5,7 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, field, fields
 from typing import Any, TypeAlias, TypeVar, cast
@@ -249,9 +250,93 @@ class LinkMetrics:
     bytes_per_second: float
 
 
+MIN_COMPARED_CELLS = 500
+"""Number of compared cells from which the contradiction of a pair of robots counts as the team's."""
+
+
 @dataclass(frozen=True)
-class TickMetrics:
-    """Metrics of the team after one tick; docs/metrics.md defines them."""
+class PairMetrics:
+    """Contradiction of the evidence of two robots that share known cells; docs/metrics.md defines it.
+
+    Attributes
+    ----------
+    first, second : str
+        The robots, in the team's order.
+    overlap_cells : int
+        Cells that both know.
+    occupied_cells : int
+        Of these, cells that one calls occupied and the other occupied or free.
+    contradiction : float
+        Share of the occupied cells that the other robot calls free; NaN without occupied cells.
+    clear_contradiction : float
+        Share of the occupied cells that the other robot calls free and around which it has no occupied cell, among the
+        26 neighbours; NaN without occupied cells.
+    contradiction_of_first, contradiction_of_second : float
+        The same over the cells that this robot calls occupied and the other one occupied or free.
+    both_occupied_cells : int
+        Cells that both call occupied.
+    label_contradiction : float
+        Share of these with different labels; NaN without such cells.
+    """
+
+    first: str
+    second: str
+    overlap_cells: int
+    occupied_cells: int
+    contradiction: float
+    clear_contradiction: float
+    contradiction_of_first: float
+    contradiction_of_second: float
+    both_occupied_cells: int
+    label_contradiction: float
+
+
+PAIR_SHARES = {
+    "contradiction": "occupied_cells",
+    "clear_contradiction": "occupied_cells",
+    "label_contradiction": "both_occupied_cells",
+}
+"""Shares of a pair that have a number for the team, and the number of cells that each is a share of."""
+
+
+def ranked_pairs(pairs: Iterable[PairMetrics], name: str) -> list[PairMetrics]:
+    """Return the pairs with at least MIN_COMPARED_CELLS cells for the share ``name``, the largest share first."""
+    counted = [pair for pair in pairs if getattr(pair, PAIR_SHARES[name]) >= MIN_COMPARED_CELLS]
+    return sorted(counted, key=lambda pair: -float(getattr(pair, name)))
+
+
+class PairTotals:
+    """Team numbers of the pairs of robots: properties of every record with a field ``pairs``."""
+
+    pairs: tuple[PairMetrics, ...]
+
+    @property
+    def contradiction(self) -> float:
+        """Largest contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("contradiction")
+
+    @property
+    def clear_contradiction(self) -> float:
+        """Largest clear contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("clear_contradiction")
+
+    @property
+    def label_contradiction(self) -> float:
+        """Largest label contradiction of a pair; NaN where no pair has enough cells."""
+        return self._largest("label_contradiction")
+
+    def _largest(self, name: str) -> float:
+        """Largest value of a share over the pairs with enough cells."""
+        return max((getattr(pair, name) for pair in ranked_pairs(self.pairs, name)), default=math.nan)
+
+
+@dataclass(frozen=True)
+class TickMetrics(PairTotals):
+    """Metrics of the team after one tick; docs/metrics.md defines them.
+
+    ``pairs`` are the pairs of robots that share known cells, in the robots' order. They are empty in results that were
+    written before the contradiction of evidence was measured.
+    """
 
     tick: int
     stamp_ns: int
@@ -265,6 +350,7 @@ class TickMetrics:
     max_change: float
     robots: tuple[RobotMetrics, ...]
     links: tuple[LinkMetrics, ...]
+    pairs: tuple[PairMetrics, ...] = ()
 
     @property
     def counted_robots(self) -> tuple[RobotMetrics, ...]:
@@ -301,7 +387,7 @@ class LinkTotals:
 
 @dataclass(frozen=True)
 class MapState:
-    """Map of one robot as stored in a result: a packet of the map codec, either a key frame or a delta.
+    """Map or evidence of one robot as stored in a result: a packet of the map codec, a key frame or a delta.
 
     A delta holds the bricks that changed since the state ``base_sequence`` of the same robot.
     """
@@ -325,7 +411,11 @@ class RobotPose:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Summary of a run. ``links`` are the directed links over all ticks; the wall time is not stored in the result."""
+    """Summary of a run.
+
+    ``links`` are the directed links over all ticks. ``frame_origins`` are phrases on the origin of each robot's place
+    in the team's frame, by robot_id; empty in results without them. The wall time is not stored in the result.
+    """
 
     num_ticks: int
     num_settling_ticks: int
@@ -342,6 +432,7 @@ class RunSummary:
     links: tuple[LinkMetrics, ...]
     frame_counts: Mapping[str, FrameCounts]
     warnings: tuple[str, ...]
+    frame_origins: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def lost_data(self) -> bool:

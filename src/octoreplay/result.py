@@ -200,6 +200,10 @@ class Result:
         """Return the ticks at which a robot's map is stored. Raises InputError for an unknown robot."""
         return [tick for tick, _ in self._reader.state_times(robot_id)]
 
+    def evidence_ticks(self, robot_id: str) -> list[int]:
+        """Return the ticks at which a robot's evidence is stored. Raises InputError for an unknown robot."""
+        return [tick for tick, _ in self._reader.state_times(robot_id, evidence=True)]
+
     def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
         """Return a robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
@@ -209,17 +213,38 @@ class Result:
         Raises PacketError where a stored map is damaged or has another format version.
         Raises ValueError for both ``at_ns`` and ``tick``.
         """
+        return self._last_state(robot_id, at_ns, tick, evidence=False)
+
+    def evidence(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
+        """Return a robot's evidence s_i: the sum of its own scans' log-odds, without anything that others sent.
+
+        ``at_ns`` and ``tick`` are as in ``map``. The evidence at the end of a run is always stored, earlier one every
+        ``evidence_every`` seconds. It is that of the robot's current restart epoch, clamped to ``clamp_min`` and
+        ``clamp_max`` with ``evidence: sum``, else unclamped.
+
+        The octree of the returned map (``octree``) has the values s_i [log-odds], (C,) in each cell, in the team's
+        frame; ``leaves`` and ``query`` return h_0 + s_i, the posterior of the robot's own scans.
+        ``config.robots[i].T_team_map`` is the robot's map frame in the team's frame, as the run used it.
+
+        Raises InputError as ``map`` does, and where the result holds no evidence of the robot, which is the case for an
+        interrupted run and for results of octoreplay before evidence was stored. Raises PacketError and ValueError as
+        ``map`` does.
+        """
+        return self._last_state(robot_id, at_ns, tick, evidence=True)
+
+    def _last_state(self, robot_id: str, at_ns: int | None, tick: int | None, *, evidence: bool) -> StoredMap:
+        """Last map or evidence stored at or before ``at_ns``, or exactly at ``tick``."""
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
-        until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick)
-        states = self._reader.states(robot_id, until_ns)
+        until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
+        states = self._reader.states(robot_id, until_ns, evidence=evidence)
         try:
             octree = decode_packet(states[0].data)
             for state in states[1:]:
                 apply_delta(octree, state.data)
         except PacketError as error:
             raise PacketError(f"{self.path}: robot '{robot_id}': {error}; replay the logs again") from error
-        return self._stored_map(octree, states[-1])
+        return self._stored_map(octree, states[-1], is_posterior=evidence)
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
@@ -246,19 +271,20 @@ class Result:
         if maps:
             yield maps
 
-    def _stored_map(self, octree: SemanticOctree, state: MapState) -> StoredMap:
-        """Map after a stored state; the centralised one already is the posterior of all evidence, so its N is 1."""
-        num_robots = 1 if state.robot_id == CENTRAL else len(self.robots)
+    def _stored_map(self, octree: SemanticOctree, state: MapState, *, is_posterior: bool = False) -> StoredMap:
+        """Map after a stored state; N is 1 for a posterior: a robot's evidence, and the centralised map."""
+        num_robots = 1 if is_posterior or state.robot_id == CENTRAL else len(self.robots)
         return StoredMap(octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots)
 
-    def _stamp_of(self, robot_id: str, tick: int) -> int:
-        """Stamp of a robot's map stored at a tick."""
-        stamp_ns = self._reader.state_stamp(robot_id, tick)
+    def _stamp_of(self, robot_id: str, tick: int, *, evidence: bool) -> int:
+        """Stamp of a robot's map or evidence stored at a tick."""
+        stamp_ns = self._reader.state_stamp(robot_id, tick, evidence=evidence)
         if stamp_ns is None:
-            near = sorted(sorted(self.stored_ticks(robot_id), key=lambda stored: abs(stored - tick))[:6])
+            ticks = self.evidence_ticks(robot_id) if evidence else self.stored_ticks(robot_id)
+            near = sorted(sorted(ticks, key=lambda stored: abs(stored - tick))[:6])
             raise InputError(
-                f"{self.path}: no map of robot '{robot_id}' is stored at tick {tick}; stored nearby:"
-                f" {', '.join(map(str, near)) or 'none'}"
+                f"{self.path}: no {'evidence' if evidence else 'map'} of robot '{robot_id}' is stored at tick {tick};"
+                f" stored nearby: {', '.join(map(str, near)) or 'none'}"
             )
         return stamp_ns
 

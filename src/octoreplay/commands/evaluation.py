@@ -30,7 +30,7 @@ def evaluate(
 
     With --truth: IoU per class, occupied and free cells found, coverage of the surface, calibration of the
     probabilities. Without it only scores that need no ground truth: entropy, agreement with the centralised map,
-    disputed labels.
+    disputed labels, contradiction of the robots' evidence.
     """
     from octoreplay.evaluate.evaluation import evaluate_result, truth_beside_logs
     from octoreplay.report import tables
@@ -54,6 +54,8 @@ def evaluate(
             result, truth=truth, against=against, over_time=not last, progress=lambda share: update(share, None, "")
         )
     tables.show(out, evaluation_tables(evaluation))
+    for sentence in evaluation.warnings:
+        warn(err, sentence)
     if truth is None:
         beside = truth_beside_logs(result)
         found = "" if beside is None else f"; found beside the logs: {beside}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +64,15 @@ def _option(parameter: Parameter) -> _ParameterOption:
     return option
 
 
-def with_parameters(command: click.Command) -> click.Command:
-    """Add an option for every configuration parameter to a command."""
-    command.params.extend(_option(parameter) for parameter in PARAMETERS.values())
-    return command
+def with_parameters(*sections: str) -> Callable[[click.Command], click.Command]:
+    """Decorator that adds an option for every configuration parameter of some sections (default: all) to a command."""
+
+    def add(command: click.Command) -> click.Command:
+        chosen = (parameter for parameter in PARAMETERS.values() if not sections or parameter.section in sections)
+        command.params.extend(_option(parameter) for parameter in chosen)
+        return command
+
+    return add
 
 
 def numbers(name: str, text: str, count: int) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from octoreplay.commands.aligning import aligned_run
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from octoreplay.config.run import RunConfig
 
 
-@with_parameters
+@with_parameters()
 @click.command(cls=SectionedCommand, short_help="Replay logs into maps and run a distributed consensus on them.")
 @click.argument("inputs", nargs=-1, type=existing_path, metavar="TEAM.yaml | LOG...")
 @click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="result to write")
@@ -37,11 +38,14 @@ if TYPE_CHECKING:
 @click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")
 @click.option("--schedule", type=existing_path, metavar="FILE.yaml",
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
+@click.option("--align", is_flag=True,
+              help="find the robots' frames first, as 'octoreplay align' does; other robots are left out")  # fmt: skip
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
-    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, classes: str | None,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: bool,
+    classes: str | None,
     **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
@@ -65,7 +69,10 @@ def run(
         base = base_config(inputs, config_from, err, surveys)
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
-        config = discover.resolve(chosen, surveys)
+        if align:
+            config, alignment = aligned_run(chosen, surveys, out)
+        else:
+            config, alignment = discover.resolve(chosen, surveys), None
     if config_from is None and not is_team_file(inputs):
         tables.show(out, tables.chosen_inputs(config))
         tables.show(out, tables.class_list(config.classes))
@@ -83,7 +90,8 @@ def run(
     tables.show(out, tables.results(summary))
     show_warnings(err, summary, shown=config.warnings)
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
-    return EXIT_DATA_LOST if summary.lost_data else 0
+    is_whole = alignment is None or alignment.is_whole
+    return EXIT_DATA_LOST if summary.lost_data or not is_whole else 0
 
 
 def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from octoreplay.study.sweep import Sweep, SweepProgress
 
 
-@with_parameters
+@with_parameters()
 @click.command(cls=SectionedCommand, short_help="Run every combination of settings and write one table.")
 @click.argument("teams", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml...")
 @click.option(

@@ -17,6 +17,9 @@ class OutputConfig:
     view_every: float = parameter(
         10.0, "period between stored fused maps for viewers; the last one is stored too [s]", above=0.0
     )
+    evidence_every: float | None = parameter(
+        None, "period between stored evidence of each robot [s] (default: stored at the end of the run only)", above=0.0
+    )
     keep_packets: bool = parameter(False, "store the exchanged packets")
     hash: bool = parameter(False, "identify input files by the SHA-256 of the whole file instead of samples")
 

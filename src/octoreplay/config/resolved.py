@@ -52,11 +52,13 @@ class ResolvedRobot(RobotConfig):
 
     ``span_ns`` holds the stamps of the first and the last message of any topic in the robot's logs, without the clock
     offset; None where it is unknown or the logs hold no messages. ``frame`` is the map frame as found in the logs; None
-    where it is unknown. Raises ConfigError without a sensor topic or without a pose source.
+    where it is unknown. ``frame_origin`` is a phrase on the origin of the robot's place in the team's
+    frame. Raises ConfigError without a sensor topic or without a pose source.
     """
 
     span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
     frame: MapFrame | None = field(default=None, kw_only=True)
+    frame_origin: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -44,6 +44,11 @@ class RobotConfig:
     T_team_map, T_body_sensor : tuple of 7 float or None
         Transforms (x, y, z, qx, qy, qz, qw) [m]: from the robot's map frame to the team's frame (None: not given, and
         the identity is assumed), and from the sensor's frame to the frame of the poses (None: from TF).
+    T_team_map_sigma : tuple of 6 float or None
+        Standard deviations of T_team_map: position along the team's axes [m], rotation about them [rad].
+    T_team_map_from : str or None
+        Origin of T_team_map where it was computed, such as 'aligned with robot_1, L 812'. ``align`` does not rely on
+        such a T_team_map and computes it again.
     body_box : tuple of 6 float or None
         (xmin, ymin, zmin, xmax, ymax, zmax) of the robot's body [m] in ``body_frame``, by default the frame of the
         poses. Points inside are left out.
@@ -101,6 +106,13 @@ class RobotConfig:
         default=None,
         metadata=help_text("transform from map_frame to the team's frame: x y z [m], quaternion x y z w"),
     )
+    T_team_map_sigma: tuple[float, ...] | None = field(
+        default=None,
+        metadata=help_text("standard deviations of T_team_map: x y z [m], rotations about x y z [rad]"),
+    )
+    T_team_map_from: str | None = field(
+        default=None, metadata=help_text("origin of T_team_map where a command computed it")
+    )
     T_body_sensor: tuple[float, ...] | None = field(
         default=None,
         metadata=help_text("transform from the sensor to the frame that the poses describe, instead of TF"),
@@ -140,6 +152,12 @@ class RobotConfig:
             problem = None if value is None else transform_problem(name, value)
             if problem is not None:
                 yield problem
+        sigma = self.T_team_map_sigma
+        if sigma is not None and (len(sigma) != 6 or min(sigma) < 0):
+            yield "T_team_map_sigma expects 6 standard deviations, none below 0"
+        for name in ("T_team_map_sigma", "T_team_map_from"):
+            if getattr(self, name) is not None and self.T_team_map is None:
+                yield f"{name} goes with T_team_map"
         if self.intrinsics is not None and (len(self.intrinsics) != 4 or min(self.intrinsics[:2]) <= 0):
             yield "intrinsics expects 4 numbers fx, fy, cx, cy"
         box = self.body_box

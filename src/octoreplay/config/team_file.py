@@ -86,7 +86,7 @@ def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
         if key in ("id", "log") or value is None:
             continue
         try:
-            if key in ("intrinsics", "T_team_map", "T_body_sensor", "body_box"):
+            if key in ("intrinsics", "T_team_map", "T_team_map_sigma", "T_body_sensor", "body_box"):
                 fields[key] = tuple(as_number(number) for number in value)
             elif key == "rectified":
                 if not isinstance(value, bool):

@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.records import CONVERGED, RobotMetrics, RunSummary, TickMetrics
+from octoreplay.records import (
+    CONVERGED,
+    MIN_COMPARED_CELLS,
+    RobotMetrics,
+    RunSummary,
+    TickMetrics,
+    ranked_pairs,
+)
 
 if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation
@@ -41,6 +48,8 @@ class CheckRow:
         True where the limit holds.
     detail : str
         Explanation where the numbers need one.
+    pair : str, optional
+        Pair of robots ('a and b') of that value.
     """
 
     name: str
@@ -51,6 +60,7 @@ class CheckRow:
     seconds: float | None
     passed: bool
     detail: str = ""
+    pair: str | None = None
 
     @property
     def is_flag(self) -> bool:
@@ -65,12 +75,13 @@ class CheckRow:
 
 @dataclass(frozen=True)
 class Measurement:
-    """One value of a quantity, with its robot or link and its time where it has them."""
+    """One value of a quantity, with its robot, link or pair of robots and its time where it has them."""
 
     value: float
     robot: str | None = None
     link: str | None = None
     seconds: float | None = None
+    pair: str | None = None
 
 
 @dataclass(frozen=True)
@@ -217,7 +228,7 @@ def _row(name: str, limit: float, checked: _CheckedResult) -> CheckRow:
     worst = _worst(LIMITS[name].measure(checked), is_upper)
     passed = worst.value <= limit if is_upper else worst.value >= limit
     detail = LIMITS[name].absent if math.isnan(worst.value) else ""
-    return CheckRow(name, float(limit), worst.value, worst.robot, worst.link, worst.seconds, passed, detail)
+    return CheckRow(name, float(limit), worst.value, worst.robot, worst.link, worst.seconds, passed, detail, worst.pair)
 
 
 def _worst(found: Iterable[Measurement], is_upper: bool) -> Measurement:
@@ -233,6 +244,16 @@ def _worst(found: Iterable[Measurement], is_upper: bool) -> Measurement:
 def _team_value(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
     """Return a measure of a field of TickMetrics in the last tick."""
     return lambda checked: [Measurement(getattr(checked.summary.last, name), seconds=checked.end)]
+
+
+def _pair_values(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
+    """Return a measure of a field of PairMetrics in the last tick, of the pairs with enough cells."""
+
+    def measure(checked: _CheckedResult) -> Iterable[Measurement]:
+        for pair in ranked_pairs(checked.summary.last.pairs, name):
+            yield Measurement(getattr(pair, name), seconds=checked.end, pair=f"{pair.first} and {pair.second}")
+
+    return measure
 
 
 def _robot_values(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]]:
@@ -307,6 +328,8 @@ def _truth_scores(name: str) -> Callable[[_CheckedResult], Iterable[Measurement]
     return measure
 
 
+_NO_PAIR = f"no two robots share {MIN_COMPARED_CELLS} occupied cells, or the result is too old to hold their evidence"
+
 QUANTITIES = (
     Quantity("label_disagreement", ("max",), "share of known cells with different labels at the end",
              _team_value("label_disagreement"), is_share=True),
@@ -320,6 +343,16 @@ QUANTITIES = (
              _robot_values("agreement"), is_share=True),
     Quantity("agreement_occupied", ("min",), "the same over the cells that the centralised map calls occupied",
              _robot_values("agreement_occupied"), is_share=True),
+    Quantity("contradiction", ("max",),
+             f"share of the cells that one robot calls occupied and the other free, of the pair with the largest share"
+             f" at the end; pairs with at least {MIN_COMPARED_CELLS} such cells",
+             _pair_values("contradiction"), is_share=True, absent=_NO_PAIR),
+    Quantity("clear_contradiction", ("max",),
+             "the same without the free cells that have an occupied cell of the same robot beside them",
+             _pair_values("clear_contradiction"), is_share=True, absent=_NO_PAIR),
+    Quantity("label_contradiction", ("max",),
+             "share with different labels of the cells that two robots call occupied, likewise",
+             _pair_values("label_contradiction"), is_share=True, absent=_NO_PAIR),
     Quantity("entropy_bits", ("max",), "mean entropy of a known cell [bits], worst robot at the end",
              _robot_values("entropy_bits")),
     Quantity("num_leaves", ("max", "min"), "leaves of the largest (max) or the smallest (min) map at the end",

@@ -15,9 +15,11 @@ from octoreplay.evaluate.morton_intervals import Region
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import WORLD_FILE, Truth, load_truth
+from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
-from octoreplay.records import CENTRAL, BoolArray, TickMetrics
+from octoreplay.records import CENTRAL, BoolArray, PairMetrics, TickMetrics
+from octoreplay.replay.warnings import frame_warnings
 from octoreplay.result import Result, StoredMap, open_result
 
 
@@ -66,8 +68,9 @@ def evaluate_result(
             if progress is not None:
                 progress(min(1.0, (ticks[-1].tick + 1) / (result.metrics[-1].tick + 1)))
         return Evaluation(
-            str(path), None if truth is None else str(truth), str(against), result.class_table.names, tuple(ticks)
-        )
+            str(path), None if truth is None else str(truth), str(against), result.class_table.names, tuple(ticks),
+            evaluator.warnings,
+        )  # fmt: skip
 
 
 def truth_beside_logs(path: str | Path) -> Path | None:
@@ -123,6 +126,11 @@ class _Evaluator:
         self._metrics = {metrics.tick: metrics for metrics in result.metrics}
         self.last_maps = _last_maps(result)
         self._prior = next(iter(self.last_maps.values())).prior
+        self._comparer = EvidenceComparer(
+            result.robots, result.class_table.num_classes, state_limits(result.config.sensor)
+        )
+        self._evidence_ticks = set(result.evidence_ticks(result.robots[0]))
+        self.warnings: tuple[str, ...] = ()
         self._is_observed = np.empty(0, np.bool_) if truth is None else self._observed(truth)
 
     def evaluate(self, maps: Mapping[str, StoredMap]) -> EvaluatedTick:
@@ -160,7 +168,21 @@ class _Evaluator:
                 )
                 for name, count, leaves in zip(names, counts, spans, strict=True)
             ),
+            self._pairs(tick),
         )
+
+    def _pairs(self, tick: int) -> tuple[PairMetrics, ...]:
+        """Contradiction of the evidence stored at a tick, none where it is not stored; keeps the tick's warnings."""
+        if tick not in self._evidence_ticks:
+            return ()
+        evidence = [self._result.evidence(robot_id, tick=tick).octree for robot_id in self._result.robots]
+        self._comparer.forget()
+        pairs = self._comparer.compare(evidence, 0)
+        with_evidence = [
+            robot_id for robot_id, octree in zip(self._result.robots, evidence, strict=True) if octree.num_cells
+        ]
+        self.warnings = frame_warnings(pairs, with_evidence)
+        return pairs
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:
         """Octree of a map, an empty one before its first stored state."""

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, PairMetrics, PairTotals
 
 
 @dataclass(frozen=True)
@@ -77,16 +77,18 @@ SCORES = (*MAP_SCORES, *(item.name for item in dataclasses.fields(TruthScores) i
 
 
 @dataclass(frozen=True)
-class EvaluatedTick:
+class EvaluatedTick(PairTotals):
     """Scores of all maps at one stored tick.
 
     ``seconds`` counts from the run's start. ``label_disagreement`` is between the robots, NaN where all maps are empty.
+    ``pairs`` compare the robots' evidence, and are empty where the tick's evidence is not stored.
     """
 
     tick: int
     seconds: float
     label_disagreement: float
     maps: tuple[MapScores, ...]
+    pairs: tuple[PairMetrics, ...] = ()
 
     @property
     def robots(self) -> tuple[MapScores, ...]:
@@ -112,13 +114,17 @@ class EvaluatedTick:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of a result's maps over time; the last of ``ticks`` is the end. ``class_names`` (C,) without free."""
+    """Scores of a result's maps over time; the last of ``ticks`` is the end. ``class_names`` (C,) without free.
+
+    ``warnings`` are sentences on the robots' frames (docs/metrics.md).
+    """
 
     result: str
     truth: str | None
     against: str
     class_names: tuple[str, ...]
     ticks: tuple[EvaluatedTick, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def final(self) -> EvaluatedTick:

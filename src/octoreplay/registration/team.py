@@ -49,12 +49,14 @@ def align_team(
     *,
     guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
     limits: AcceptLimits | None = None,
+    names: Sequence[str] | None = None,
     run: Run = map,
 ) -> TeamAlignment:
     """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
 
-    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``run``
-    aligns the pairs, one call for each; the result does not depend on it.
+    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are
+    the robots' names in refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the
+    result does not depend on it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
@@ -62,16 +64,22 @@ def align_team(
     def align(pair: tuple[int, int]) -> PairAlignment:
         return align_pair(maps, *pair, guesses=known.get(pair, ()), limits=limits)
 
-    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits)
+    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits, names)
 
 
-def join_pairs(maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: AcceptLimits) -> TeamAlignment:
+def join_pairs(
+    maps: Sequence[OwnMap],
+    pairs: Sequence[PairAlignment],
+    limits: AcceptLimits,
+    names: Sequence[str] | None = None,
+) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
 
     A pair that joins two components is refused where any two maps of both contradict each other under it; a pair within
     a component is refused where its pose differs from the component's.
     """
     num = len(maps)
+    names = names or [f"robot {index + 1}" for index in range(num)]
     component = list(range(num))
     members = {index: [index] for index in range(num)}
     poses: list[Float64Array] = [np.eye(4) for _ in range(num)]
@@ -87,8 +95,12 @@ def join_pairs(maps: Sequence[OwnMap], pairs: Sequence[PairAlignment], limits: A
             # The frame of j's component in that of i's.
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
-            refusal = _contradiction(maps, poses, members[new], members[old], T, limits)
-            if not refusal:
+            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits)
+            if worst is not None:
+                first, second = (names[index] for index in worst[:2])
+                refusal = f"{first} and {second} would contradict each other (q_c {worst[2]:.3f})"
+            else:
+                refusal = ""
                 for index in members[old]:
                     poses[index] = T @ poses[index]
                     component[index] = new
@@ -117,20 +129,23 @@ def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
     return f"differs from the chain of better pairs by {shift:.1f} m and {angle:.1f} degrees"
 
 
-def _contradiction(
+def worst_contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
-) -> str:  # fmt: skip
-    """Reason not to join two components by ``T`` (4, 4), from the second to the first; empty without contradiction."""
+) -> tuple[int, int, float] | None:  # fmt: skip
+    """Return the two robots (first < second) of two groups that contradict each other most, with their share q_c.
+
+    ``poses`` (4, 4) are those of each robot's map in its group's frame; ``T`` (4, 4) maps the frame of ``others`` to
+    that of ``ones``. Returns None where no two maps contradict each other clearly.
+    """
+    found: list[tuple[int, int, float]] = []
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
             obstacles = verify(maps[i], maps[j], pose).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
-                first, second = sorted((i, j))
-                share = obstacles.share_contra
-                return f"robots {first + 1} and {second + 1} would contradict each other (q_c {share:.3f})"
-    return ""
+                found.append((min(i, j), max(i, j), obstacles.share_contra))
+    return max(found, key=lambda entry: entry[2], default=None)
 
 
 def _turn_parents(parents: list[int | None], root: int) -> None:

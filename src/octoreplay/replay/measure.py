@@ -1,4 +1,4 @@
-"""Metrics of a tick: the team's maps compared with each other and with the centralised map, and the radio's counts."""
+"""Metrics of a tick: comparisons of the team's maps and of the robots' evidence, and the radio's counts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import sum_of_evidence
+from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
@@ -42,11 +43,13 @@ class TickMeasurer:
         self._threads = threads
         self._robot_ids = tuple(robot.robot_id for robot in config.robots)
         self._comparer = MapComparer(len(self._robot_ids), config.map.prior(num_classes))
+        self._evidence_comparer = EvidenceComparer(self._robot_ids, num_classes, state_limits(config.sensor))
         self._period_ns = round(config.network.publish_period * 1e9)
 
     def forget(self) -> None:
-        """Compare all bricks anew in the next tick: a robot's map was replaced."""
+        """Compare all bricks anew in the next tick: a robot's map and evidence were replaced."""
         self._comparer.forget()
+        self._evidence_comparer.forget()
 
     def measure(
         self,
@@ -67,6 +70,8 @@ class TickMeasurer:
         sum_of_evidence(self.oracle, team.evidence(), changed, number)
         maps = [robot.map for robot in team.robots]
         comparison = self._comparer.compare(maps, self.oracle, graph.pairs, number, self._threads)
+        evidence = [robot.evidence.octree for robot in team.robots]
+        pairs = self._evidence_comparer.compare(evidence, number, self._threads)
         links = self._link_metrics(graph, traffic)
         robots = tuple(
             self._robot_metrics(robot, robot.index in graph.active, traffic.published[robot.index], links, comparison)
@@ -86,6 +91,7 @@ class TickMeasurer:
             max_change=max_change,
             robots=robots,
             links=links,
+            pairs=pairs,
         )
 
     def _robot_metrics(

@@ -1,4 +1,4 @@
-"""Maps of robots, each from its own scans alone and in its own frame: the input of the alignment."""
+"""Evidence of robots, each from its own scans alone: the input of the alignment."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
+from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
@@ -19,35 +20,50 @@ _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 def own_maps(
     config: ResolvedRun, *, progress: Callable[[float], None] | None = None, num_threads: int | None = None
 ) -> list[OwnMap]:
-    """Return the map of each robot in its own map frame, in the order of ``config.robots``.
+    """Return the map of each robot in its own map frame, in the order of ``config.robots``; as ``own_evidences``."""
+    return [
+        own_map_of(config, evidence) for evidence in own_evidences(config, progress=progress, num_threads=num_threads)
+    ]
 
-    ``progress`` is called with the finished share, 0 to 1. A robot without usable frames has an empty map. Raises
+
+def own_evidences(
+    config: ResolvedRun, *, progress: Callable[[float], None] | None = None, num_threads: int | None = None
+) -> list[SemanticOctree]:
+    """Return the evidence of each robot's scans in its own map frame, in the order of ``config.robots``.
+
+    ``progress`` is called with the finished share, 0 to 1. A robot without usable frames has empty evidence. Raises
     InputError as ``RobotLog`` does.
     """
     num_threads = num_threads or min(len(config.robots), os.cpu_count() or 1)
     with ThreadPoolExecutor(num_threads) as threads:
-        maps = []
-        for octree in threads.map(lambda robot: own_evidence(config, robot), config.robots):
-            maps.append(own_map_of(config, octree))
-            if progress is not None:
-                progress(len(maps) / len(config.robots))
-    return maps
+        evidence = []
+        try:
+            for octree in threads.map(lambda robot: own_evidence(config, robot), config.robots):
+                evidence.append(octree)
+                if progress is not None:
+                    progress(len(evidence) / len(config.robots))
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    return evidence
 
 
 def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> SemanticOctree:
-    """Return the evidence of one robot's scans in the robot's own map frame."""
+    """Return the evidence of one robot's scans in the robot's own map frame, without ``bounds``."""
     num_classes = config.classes.num_classes
     octree = SemanticOctree(config.map.resolution, num_classes)
-    caster = ScanCaster(config.sensor, config.map, num_classes)
+    # The bounds are in the team's frame, which is not known yet.
+    region = dataclasses.replace(config.map, bounds=())
+    caster = ScanCaster(config.sensor, region, num_classes)
     increments = clamped_increments(config.sensor)
-    alone = dataclasses.replace(robot, T_team_map=_OWN_FRAME)
-    reach = sensor_reach(config.sensor, config.map)
+    alone = dataclasses.replace(robot, T_team_map=_OWN_FRAME, T_team_map_sigma=None, T_team_map_from=None)
+    reach = sensor_reach(config.sensor, region)
     with RobotLog(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
     return octree
 
 
-def own_map_of(config: ResolvedRun, evidence: SemanticOctree) -> OwnMap:
+def own_map_of(config: RunConfig, evidence: SemanticOctree) -> OwnMap:
     """Return the map for registration of a robot's evidence."""
     return OwnMap.of_evidence(evidence, hit=config.sensor.hit, miss=config.sensor.miss)

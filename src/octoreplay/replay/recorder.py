@@ -1,8 +1,8 @@
-"""Recording of a run: metrics and poses in every tick, maps every few seconds, the summary at the end."""
+"""Recording of a run: metrics and poses in every tick, maps every few seconds, evidence and summary at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
@@ -11,11 +11,52 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import CENTRAL, FrameCounts, LeafTable, LinkTotals, MapState, RunSummary, TickMetrics
+from octoreplay.records import (
+    CENTRAL,
+    FrameCounts,
+    LeafTable,
+    LinkTotals,
+    MapState,
+    PairMetrics,
+    RunSummary,
+    TickMetrics,
+)
 from octoreplay.replay.tick import Tick, falls_due
 
 STATES_PER_KEY_FRAME = 12
 """Number of stored states of a robot from one key frame to the next."""
+
+
+class _StateSeries:
+    """Stored states of some octrees over time: key frames, and deltas with the bricks that changed between them."""
+
+    def __init__(self, write: Callable[[MapState], None], threads: Executor) -> None:
+        self.last_tick = -1
+        self._write = write
+        self._threads = threads
+        self._num_stored = 0
+        self._octrees: Sequence[SemanticOctree] = ()
+
+    def store(self, tick: Tick, names: Sequence[str], octrees: Sequence[SemanticOctree]) -> None:
+        """Store the octrees of one tick; ``names`` are the same in all ticks."""
+        sequence = self._num_stored
+
+        def encode(index: int) -> MapState:
+            octree = octrees[index]
+            # A robot that restarted has another octree, and a delta cannot remove bricks.
+            is_key_frame = sequence % STATES_PER_KEY_FRAME == 0 or self._octrees[index] is not octree
+            if is_key_frame:
+                data = codec.encode_packet(octree)
+            else:
+                data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self.last_tick))
+            base = sequence if is_key_frame else sequence - 1
+            return MapState(names[index], tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
+
+        for state in self._threads.map(encode, range(len(names))):
+            self._write(state)
+        self._num_stored += 1
+        self._octrees = tuple(octrees)
+        self.last_tick = tick.number
 
 
 class Recorder:
@@ -28,9 +69,9 @@ class Recorder:
         self._config = config
         self._writer = writer
         self._threads = threads
-        self._num_states = {**{robot.robot_id: 0 for robot in config.robots}, CENTRAL: 0}
-        self._stored: dict[str, SemanticOctree] = {}
-        self._state_tick = -1
+        if writer is not None:
+            self._maps = _StateSeries(writer.write_state, threads)
+            self._evidence = _StateSeries(writer.write_evidence, threads)
         self._view_tick = -1
         self._num_settling = 0
         self._peak = 0.0
@@ -39,6 +80,14 @@ class Recorder:
         self._num_published = 0
         self._sent_bytes = 0
         self._links = LinkTotals()
+
+    @property
+    def last_pairs(self) -> tuple[tuple[PairMetrics, ...], list[str]]:
+        """Pairs of robots after the last tick, and the robots with evidence; empty before the first tick."""
+        if self.last is None:
+            return (), []
+        evidence = zip(self.last.graph.robot_ids, self.last.evidence, strict=True)
+        return self.last.metrics.pairs, [robot_id for robot_id, octree in evidence if octree.num_cells]
 
     def record(self, tick: Tick) -> None:
         """Record one tick."""
@@ -58,19 +107,23 @@ class Recorder:
                     data = b"".join(part.data for part in message.parts)
                     self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, data)
         if self._is_due(tick, self._config.output.state_every):
-            self._write_states(tick)
+            self._store_maps(tick)
+        if self._config.output.evidence_every and self._is_due(tick, self._config.output.evidence_every):
+            self._store_evidence(tick)
         if self._is_due(tick, self._config.output.view_every):
             self._write_views(tick)
 
     def finish(
         self, stop_reason: str, counts: Mapping[str, FrameCounts], warnings: tuple[str, ...], wall_seconds: float
     ) -> RunSummary:
-        """Store the last maps and return the summary; at least one tick was recorded."""
+        """Store the last maps and evidence and return the summary; at least one tick was recorded."""
         tick = self.last
         assert tick is not None
         if self._writer is not None:
-            if self._state_tick < tick.number:
-                self._write_states(tick)
+            if self._maps.last_tick < tick.number:
+                self._store_maps(tick)
+            if self._evidence.last_tick < tick.number:
+                self._store_evidence(tick)
             if self._view_tick < tick.number:
                 self._write_views(tick)
         means = self._bytes / max(self._num_published, 1)
@@ -91,6 +144,7 @@ class Recorder:
             links=self._links.totals(),
             frame_counts=counts,
             warnings=warnings,
+            frame_origins={robot.robot_id: robot.frame_origin for robot in self._config.robots},
         )
 
     def _add_up(self, metrics: TickMetrics) -> None:
@@ -111,28 +165,13 @@ class Recorder:
         period_ns = round(self._config.network.publish_period * 1e9)
         return falls_due(tick.stamp_ns - self.start_ns, period_ns, every)
 
-    def _write_states(self, tick: Tick) -> None:
-        """Store all maps, the centralised map included, as key frames or as the bricks that changed."""
-        if self._writer is None:
-            return
-        names, maps = (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle)
+    def _store_maps(self, tick: Tick) -> None:
+        """Store all maps, the centralised map included."""
+        self._maps.store(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle))
 
-        def encode(robot_id: str, octree: SemanticOctree) -> MapState:
-            sequence = self._num_states[robot_id]
-            # A robot that restarted has another octree, and a delta cannot remove bricks.
-            is_key_frame = sequence % STATES_PER_KEY_FRAME == 0 or self._stored.get(robot_id) is not octree
-            if is_key_frame:
-                data = codec.encode_packet(octree)
-            else:
-                data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self._state_tick))
-            base = sequence if is_key_frame else sequence - 1
-            return MapState(robot_id, tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
-
-        for state in self._threads.map(encode, names, maps):
-            self._writer.write_state(state)
-            self._num_states[state.robot_id] += 1
-        self._stored = dict(zip(names, maps, strict=True))
-        self._state_tick = tick.number
+    def _store_evidence(self, tick: Tick) -> None:
+        """Store every robot's evidence."""
+        self._evidence.store(tick, tick.graph.robot_ids, tick.evidence)
 
     def _write_views(self, tick: Tick) -> None:
         """Store every robot's map for viewing."""

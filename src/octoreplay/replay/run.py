@@ -24,7 +24,7 @@ from octoreplay.records import FrameCounts, RunSummary
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import MAX_TICKS, Session
-from octoreplay.replay.warnings import map_warnings, rule_warnings
+from octoreplay.replay.warnings import frame_warnings, map_warnings, rule_warnings
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ def replay_team(
                 *config.warnings,
                 *rule_warnings(config, session.is_symmetric),
                 *map_warnings(recorder.num_known_cells),
+                *frame_warnings(*recorder.last_pairs),
             )
             summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
             if writer is not None:

@@ -124,7 +124,8 @@ class Session:
         metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
         self._packet_codec.end_tick()
         return Tick(
-            number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots), self._measurer.oracle,
+            number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots),
+            tuple(robot.evidence.octree for robot in robots), self._measurer.oracle,
             tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in robots if r.T_team_sensor is not None), metrics,
         )  # fmt: skip
 

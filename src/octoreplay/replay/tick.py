@@ -12,7 +12,10 @@ from octoreplay.replay.robots.robot import Publication
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """The team after one tick. ``maps`` are the robots' octrees h_i - h_0, which the next tick changes."""
+    """The team after one tick.
+
+    ``maps`` are the robots' octrees h_i - h_0, and ``evidence`` their octrees s_i; the next tick changes both.
+    """
 
     number: int
     stamp_ns: int
@@ -20,6 +23,7 @@ class Tick:
     graph: CommunicationGraph
     published: tuple[Publication | None, ...]
     maps: tuple[SemanticOctree, ...]
+    evidence: tuple[SemanticOctree, ...]
     oracle: SemanticOctree
     poses: tuple[RobotPose, ...]
     metrics: TickMetrics

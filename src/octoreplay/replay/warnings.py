@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
+from octoreplay.mapping.contradiction import LABEL_LIMIT, contradicting_pairs
+from octoreplay.records import PairMetrics, ranked_pairs
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -50,3 +54,65 @@ def map_warnings(num_known_cells: int) -> tuple[str, ...]:
     if num_known_cells > 0:
         return ()
     return ("the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses",)
+
+
+def frame_warnings(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> tuple[str, ...]:
+    """Sentences on pairs of robots that contradict each other, and on robots that share no known space.
+
+    ``robot_ids`` are the robots with evidence, ``pairs`` those of them that share known cells.
+    """
+    sentences = []
+    clear = contradicting_pairs(pairs)
+    if clear:
+        worst = clear[0]
+        sentences.append(
+            f"{worst.first} and {worst.second} contradict each other in {100 * worst.contradiction:.0f} % of the"
+            f" {worst.occupied_cells:,} occupied cells that both know, {100 * worst.clear_contradiction:.0f} % by more"
+            f" than a cell{_others(clear)}: try `octoreplay align`"
+        )
+    labels = [pair for pair in ranked_pairs(pairs, "label_contradiction") if pair.label_contradiction > LABEL_LIMIT]
+    if labels:
+        worst = labels[0]
+        sentences.append(
+            f"{worst.first} and {worst.second} have different labels in {100 * worst.label_contradiction:.0f} % of the"
+            f" {worst.both_occupied_cells:,} cells that both call occupied{_others(labels)}: compare their labels, or"
+            " try `octoreplay align`"
+        )
+    groups = _groups_with_common_space(pairs, robot_ids)
+    if len(groups) > 1:
+        alone = [group[0] for group in groups if len(group) == 1]
+        if len(alone) == len(groups):
+            sentence = f"{_listed(alone)} share no known space"
+        elif len(groups) - len(alone) == 1:
+            sentence = f"{_listed(alone)} share{'s' if len(alone) == 1 else ''} no known space with any other robot"
+        else:
+            names = "; ".join(_listed(group) for group in groups)
+            sentence = f"the robots are in {len(groups)} groups that share no known space ({names})"
+        sentences.append(f"{sentence}: nothing to agree on between them; check the poses and T_team_map")
+    return tuple(sentences)
+
+
+def _others(pairs: Sequence[PairMetrics]) -> str:
+    """Clause on the pairs after the first one."""
+    if len(pairs) < 2:
+        return ""
+    common = set.intersection(*({pair.first, pair.second} for pair in pairs))
+    names = f", all with {common.pop()}" if common else ""
+    return f" ({len(pairs) - 1} more {'pairs' if len(pairs) > 2 else 'pair'}{names})"
+
+
+def _groups_with_common_space(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> list[list[str]]:
+    """Groups of robots that are connected by pairs with common known cells, in the robots' order."""
+    group_of = {robot_id: [robot_id] for robot_id in robot_ids}
+    for pair in pairs:
+        first, second = group_of[pair.first], group_of[pair.second]
+        if first is not second:
+            first += second
+            group_of.update(dict.fromkeys(second, first))
+    unique = {id(group): group for group in group_of.values()}
+    return [sorted(group, key=list(robot_ids).index) for group in unique.values()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names as a list in a sentence: 'a', 'a and b', 'a, b and c'."""
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

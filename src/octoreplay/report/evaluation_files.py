@@ -11,7 +11,10 @@ from typing import Any
 
 from octoreplay.evaluate.records import MAP_SCORES, SCORES, EvaluatedTick, Evaluation, MapScores
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, PAIR_SHARES
+
+_TICK_COLUMNS = ("label_disagreement", *PAIR_SHARES)
+"""Scores of the team in every row of the CSV."""
 
 OVER_ROBOTS: dict[str, Callable[[Sequence[float]], float]] = {
     "mean": lambda values: sum(values) / len(values),
@@ -31,10 +34,18 @@ def evaluation_csv(evaluation: Evaluation) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     classes = (f"iou.{name}" for name in evaluation.class_names)
-    writer.writerow(["tick", "seconds", "label_disagreement", "kind", "robot_id", "is_active", *SCORES, *classes])
+    writer.writerow(["tick", "seconds", *_TICK_COLUMNS, "kind", "robot_id", "is_active", *SCORES, *classes])
     for tick in evaluation.ticks:
         for kind, robot_id, is_active, numbers, iou in _rows(evaluation, tick):
-            cells = (tick.seconds, tick.label_disagreement, kind, robot_id, is_active, *numbers, *iou)
+            cells = (
+                tick.seconds,
+                *(getattr(tick, name) for name in _TICK_COLUMNS),
+                kind,
+                robot_id,
+                is_active,
+                *numbers,
+                *iou,
+            )
             writer.writerow([tick.tick, *map(_cell, cells)])
     return text.getvalue()
 
@@ -47,6 +58,7 @@ def evaluation_json(evaluation: Evaluation) -> str:
     ticks = [
         {
             **vars(tick),
+            **{name: getattr(tick, name) for name in PAIR_SHARES},
             "maps": [_map_fields(evaluation, scores) for scores in tick.maps],
             **{
                 kind: {**dict(zip(SCORES, numbers, strict=True)), "iou": iou}

@@ -10,9 +10,16 @@ from rich.table import Table
 from rich.text import Text
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation
+from octoreplay.mapping.contradiction import contradicting_pairs
 from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import OVER_ROBOTS
-from octoreplay.report.tables import number, share, styled_table
+from octoreplay.report.tables import (
+    number,
+    pairs_table,
+    share,
+    styled_table,
+    worst_pair,
+)
 
 MAX_ROBOT_COLUMNS = 6
 """Largest team with one column per robot in the table of classes."""
@@ -38,7 +45,12 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
         _title(f"Maps {final.seconds:.1f} s after the start, agreement with {_reference(evaluation)}"),
         _maps_table(final),
         f"cells with different labels: {share(final.label_disagreement)}",
+        f"contradiction of evidence, worst pair: {worst_pair(final.pairs, 'contradiction')}",
+        f"contradiction by more than a cell: {worst_pair(final.pairs, 'clear_contradiction')}",
+        f"label contradiction: {worst_pair(final.pairs, 'label_contradiction')}",
     ]
+    if contradicting_pairs(final.pairs):
+        parts += ["", pairs_table(final.pairs)]
     if evaluation.truth is not None:
         parts += ["", _title(f"Against {evaluation.truth}"), _truth_table(final)]
         parts += ["h: the map; N h: the team posterior h_0 + N (h - h_0) (docs/evaluation.md)"]

@@ -1,4 +1,4 @@
-"""Metrics as CSV and as the paper's two figures: disagreement and packet sizes over time."""
+"""Metrics as CSV and as figures over time: disagreement, packet sizes, contradiction of evidence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
-from octoreplay.records import TickMetrics
+from octoreplay.records import PAIR_SHARES, TickMetrics
+from octoreplay.report.contradiction_plots import contradiction_figure
 from octoreplay.report.figures import (
     BLUE,
     GREEN,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _TEAM_COLUMNS = (
     "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
     "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change",
+    *PAIR_SHARES,
 )  # fmt: skip
 _ROBOT_COLUMNS = (
     "active", "num_scans", "num_iterations", "agreement", "agreement_occupied", "num_leaves", "num_cells",
@@ -41,28 +43,38 @@ _LINK_COLUMNS = (
     "num_sent", "sent_bytes", "num_delivered", "delivered_bytes", "num_lost", "num_dropped", "num_late", "num_stale",
     "num_gaps", "num_damaged", "bytes_per_second",
 )  # fmt: skip
+_PAIR_COLUMNS = (
+    "overlap_cells", "occupied_cells", "contradiction", "clear_contradiction", "contradiction_of_first",
+    "contradiction_of_second",
+    "both_occupied_cells", "label_contradiction",
+)  # fmt: skip
 
 
 def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
-    """Return all metrics as CSV text, one row per tick: of the team, then of each robot and each link.
+    """Return all metrics as CSV text, one row per tick: of the team, then of each robot, each link and each pair.
 
-    Columns have the names of the metrics' fields, with the prefix ``<robot>.`` for a robot and ``<sender>><receiver>.``
-    for a link. Numbers have full precision; values that a tick does not have are empty.
+    Columns have the names of the metrics' fields, with the prefix ``<robot>.`` for a robot, ``<sender>><receiver>.``
+    for a link and ``<first>&<second>.`` for a pair. Numbers have full precision; values that a tick does not have are
+    empty.
     """
     robots = list(dict.fromkeys(robot.robot_id for tick in metrics for robot in tick.robots))
     links = list(dict.fromkeys((link.sender, link.receiver) for tick in metrics for link in tick.links))
+    pairs = list(dict.fromkeys((pair.first, pair.second) for tick in metrics for pair in tick.pairs))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(
         [*_TEAM_COLUMNS, *(f"{robot}.{name}" for robot in robots for name in _ROBOT_COLUMNS),
-         *(f"{a}>{b}.{name}" for a, b in links for name in _LINK_COLUMNS)]
+         *(f"{a}>{b}.{name}" for a, b in links for name in _LINK_COLUMNS),
+         *(f"{a}&{b}.{name}" for a, b in pairs for name in _PAIR_COLUMNS)]
     )  # fmt: skip
     for tick in metrics:
         of_robot: dict[Any, Any] = {robot.robot_id: robot for robot in tick.robots}
         of_link: dict[Any, Any] = {(link.sender, link.receiver): link for link in tick.links}
+        of_pair: dict[Any, Any] = {(pair.first, pair.second): pair for pair in tick.pairs}
         writer.writerow(
             [*_cells(tick, _TEAM_COLUMNS), *(v for r in robots for v in _cells(of_robot.get(r), _ROBOT_COLUMNS)),
-             *(v for key in links for v in _cells(of_link.get(key), _LINK_COLUMNS))]
+             *(v for key in links for v in _cells(of_link.get(key), _LINK_COLUMNS)),
+             *(v for key in pairs for v in _cells(of_pair.get(key), _PAIR_COLUMNS))]
         )  # fmt: skip
     return text.getvalue()
 
@@ -73,15 +85,16 @@ def write_metrics_csv(metrics: Sequence[TickMetrics], path: Path) -> None:
 
 
 def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:
-    """Write ``disagreement.png`` and ``packet_size.png`` into a folder, made if missing, and return the paths.
+    """Write ``disagreement.png``, ``packet_size.png`` and, where robots share known space, ``contradiction.png``.
 
-    Raises OutputError, and InputError without any tick.
+    The folder is made if missing. Returns the paths. Raises OutputError, and InputError without any tick.
     """
     if not metrics:
         raise InputError("the result has no tick to draw, since the run was interrupted before its first one")
-    return save_figures(
-        {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}, folder
-    )
+    figures = {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}
+    if any(tick.pairs for tick in metrics):
+        figures["contradiction.png"] = contradiction_figure(metrics, log_seconds(metrics))
+    return save_figures(figures, folder)
 
 
 def _cells(record: Any, names: Sequence[str]) -> list[str]:
@@ -92,7 +105,9 @@ def _cells(record: Any, names: Sequence[str]) -> list[str]:
 
 
 def _cell(value: Any) -> str:
-    """Value as text; truth values are 0 and 1."""
+    """Value as text, empty for NaN; truth values are 0 and 1."""
+    if value != value:
+        return ""
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
 
 

@@ -15,11 +15,23 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.config.resolved import MapFrame, ResolvedRun
+from octoreplay.config.resolved import MapFrame, ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.team_clocks import instant
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import ClassTable, FrameCounts, LeafTable, LinkMetrics, RunSummary, TickMetrics
+from octoreplay.mapping.contradiction import contradicting_pairs
+from octoreplay.records import (
+    MIN_COMPARED_CELLS,
+    PAIR_SHARES,
+    ClassTable,
+    FrameCounts,
+    LeafTable,
+    LinkMetrics,
+    PairMetrics,
+    RunSummary,
+    TickMetrics,
+    ranked_pairs,
+)
 
 if TYPE_CHECKING:
     from octoreplay.io.robots.describe import LogDescription, LogSummary
@@ -30,6 +42,9 @@ _CAUSES = {
     "undecodable": "unreadable",
 }  # fmt: skip
 """Causes of frames that were not mapped: fields of FrameCounts and their headings."""
+
+MAX_PAIRS = 8
+"""Largest number of rows of the table of pairs."""
 
 
 def number(value: float) -> str:
@@ -66,13 +81,41 @@ def seconds(value: float) -> str:
 
 
 def results(summary: RunSummary) -> RenderableType:
-    """Return the results of a run as tables: the team, each robot, lossy links and frames that were not mapped."""
+    """Return the results of a run as tables: team, robots, contradicting pairs, lossy links, frames not mapped."""
     parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
+    if contradicting_pairs(summary.last.pairs):
+        parts.append(pairs_table(summary.last.pairs))
     if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
         parts.append(_links_table(summary.links))
     if any(counts.skipped for counts in summary.frame_counts.values()):
         parts.append(_frames_table(summary.frame_counts))
     return _spaced(parts)
+
+
+def worst_pair(pairs: Sequence[PairMetrics], name: str) -> str:
+    """Return the largest share ``name`` of a pair with its number of cells; a dash without a pair that counts."""
+    ranked = ranked_pairs(pairs, name)
+    if not ranked:
+        return f"- (no pair shares {MIN_COMPARED_CELLS} occupied cells)" if pairs else "-"
+    pair = ranked[0]
+    num_cells = getattr(pair, PAIR_SHARES[name])
+    return f"{share(getattr(pair, name))} of {num_cells:,} occupied cells, {pair.first} and {pair.second}"
+
+
+def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
+    """Return a table of the pairs that contradict each other most, and of how many pairs they are."""
+    ranked = ranked_pairs(pairs, "clear_contradiction")
+    rows = ranked[:MAX_PAIRS]
+    table = styled_table(f"Contradiction of evidence, {len(rows)} of {len(ranked)} pairs")
+    table.add_column("pair", overflow="fold")
+    for name in ("shared\ncells", "of these\noccupied", "contra-\ndiction", "more than\na cell", "other\nlabel"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for pair in rows:
+        table.add_row(
+            f"{pair.first}, {pair.second}", f"{pair.overlap_cells:,}", f"{pair.occupied_cells:,}",
+            *(share(getattr(pair, name)) for name in PAIR_SHARES),
+        )  # fmt: skip
+    return table
 
 
 def chosen_inputs(config: ResolvedRun) -> Table:
@@ -216,6 +259,12 @@ def _team_table(summary: RunSummary) -> Table:
     robots = last.counted_robots
     worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
+    if len(last.robots) > 1:
+        table.add_row("contradiction, worst pair", worst_pair(last.pairs, "contradiction"))
+        table.add_row("by more than a cell", worst_pair(last.pairs, "clear_contradiction"))
+        table.add_row("labels, worst pair", worst_pair(last.pairs, "label_contradiction"))
+        if summary.frame_origins:
+            table.add_row("frames", _frame_origins(summary.frame_origins))
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
     grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
@@ -228,6 +277,13 @@ def _team_table(summary: RunSummary) -> Table:
         delivered = sum(link.num_delivered for link in summary.links) / num_sent
         table.add_row("packets", f"{num_sent:,} over {len(summary.links)} links, {share(delivered)} delivered")
     return table
+
+
+def _frame_origins(origins: Mapping[str, str]) -> str:
+    """Lines on the origins of the robots' frames: one for all robots, or one each."""
+    if len(set(origins.values())) == 1:
+        return next(iter(origins.values()))
+    return "\n".join(f"{robot_id}: {origin}" for robot_id, origin in origins.items())
 
 
 _AGREEMENTS = ("agreement", "agreement_occupied")
@@ -345,4 +401,6 @@ def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
     values = {name: value for field, name in names.items() if (value := getattr(robot, field))}
     if frame is not None and frame.origin:
         values["map frame"] += f" ({frame.origin})"
+    if isinstance(robot, ResolvedRobot) and robot.frame_origin:
+        values["team frame"] = robot.frame_origin
     return [f"{name:<{width}}  {value}" for name, value in values.items()]

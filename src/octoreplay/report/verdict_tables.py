@@ -96,9 +96,9 @@ def _values(row: CheckRow) -> tuple[str, str]:
 
 
 def _where(row: CheckRow) -> str:
-    """Robot, link and time of a value, and the explanation."""
+    """Robot, link or pair, and time of a value, and the explanation."""
     at = "" if row.seconds is None else f"at {row.seconds:.1f} s"
-    place = " ".join(part for part in (row.robot, row.link, at) if part)
+    place = " ".join(part for part in (row.robot, row.link, row.pair, at) if part)
     return "; ".join(part for part in (place, row.detail) if part)
 
 

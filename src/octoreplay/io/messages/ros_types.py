@@ -16,7 +16,7 @@ VISION_MSGS = {
 
 OCTOREPLAY_MSGS = {
     "octoreplay_msgs/msg/MapState": """\
-# One robot's map after the tick at header.stamp, as a packet of the map codec (docs/packet-format.md).
+# One robot's map or evidence after the tick at header.stamp, as a packet of the map codec (docs/packet-format.md).
 std_msgs/Header header
 string robot_id
 uint32 tick
@@ -73,6 +73,32 @@ uint32 num_stale
 uint32 num_gaps
 uint32 num_damaged
 float64 bytes_per_second
+""",
+    "octoreplay_msgs/msg/PairMetrics": """\
+# Contradiction of the evidence of two robots that share known cells.
+string first
+string second
+uint64 overlap_cells
+# Cells that one calls occupied and the other occupied or free; the share that the other calls free, and the share
+# around which it has no occupied cell either.
+uint64 occupied_cells
+float64 contradiction
+float64 clear_contradiction
+float64 contradiction_of_first
+float64 contradiction_of_second
+# Cells that both call occupied, and the share with different labels.
+uint64 both_occupied_cells
+float64 label_contradiction
+""",
+    "octoreplay_msgs/msg/Contradiction": """\
+# Contradiction of evidence after one tick; the definitions are in docs/metrics.md. NaN: nothing to compare.
+std_msgs/Header header
+uint32 tick
+# The largest of a pair with enough cells.
+float64 contradiction
+float64 clear_contradiction
+float64 label_contradiction
+octoreplay_msgs/PairMetrics[] pairs
 """,
     "octoreplay_msgs/msg/TickMetrics": """\
 # The team after one consensus tick; the definitions are in docs/metrics.md.

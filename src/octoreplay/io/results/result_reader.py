@@ -22,7 +22,14 @@ from octoreplay.config.team_file import parse_team
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
-from octoreplay.io.results.result_writer import FORMAT_VERSION, METRICS_TOPIC, map_state_topic, pose_topic
+from octoreplay.io.results.result_writer import (
+    CONTRADICTION_TOPIC,
+    FORMAT_VERSION,
+    METRICS_TOPIC,
+    evidence_topic,
+    map_state_topic,
+    pose_topic,
+)
 from octoreplay.records import (
     CENTRAL,
     ClassTable,
@@ -31,6 +38,7 @@ from octoreplay.records import (
     LinkMetrics,
     LinkTotals,
     MapState,
+    PairMetrics,
     RobotMetrics,
     RunSummary,
     TickMetrics,
@@ -104,8 +112,12 @@ class ResultReader:
         return float(self.description["prior"])
 
     def metrics(self) -> list[TickMetrics]:
-        """Return the metrics of all ticks, in order."""
-        return [_tick_metrics(value) for _, value in self._messages(METRICS_TOPIC)]
+        """Return the metrics of all ticks, in order; without pairs in results that do not hold them."""
+        pairs = {
+            int(value.tick): tuple(PairMetrics(**_fields(PairMetrics, pair)) for pair in value.pairs)
+            for _, value in self._messages(CONTRADICTION_TOPIC)
+        }
+        return [_tick_metrics(value, pairs.get(int(value.tick), ())) for _, value in self._messages(METRICS_TOPIC)]
 
     def summary(self, metrics: Sequence[TickMetrics]) -> RunSummary:
         """Return the summary of the run. The wall time is not stored and is NaN.
@@ -127,16 +139,16 @@ class ResultReader:
         values["frame_counts"] = {robot: _frame_counts(count) for robot, count in values["frame_counts"].items()}
         return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
 
-    def state_times(self, robot_id: str) -> list[tuple[int, int]]:
-        """Return (tick, stamp_ns) of a robot's stored maps, in order."""
+    def state_times(self, robot_id: str, *, evidence: bool = False) -> list[tuple[int, int]]:
+        """Return (tick, stamp_ns) of a robot's stored maps, or of its stored evidence, in order."""
         return [
             (int(value.tick), stamp_to_ns(value.header.stamp))
-            for _, value in self._messages(map_state_topic(self._known(robot_id)))
+            for _, value in self._messages(self._state_topic(robot_id, evidence))
         ]
 
-    def state_stamp(self, robot_id: str, tick: int) -> int | None:
-        """Return the stamp [ns] of a robot's map stored at a tick; None where none is. Raises as ``states``."""
-        topic = map_state_topic(self._known(robot_id))
+    def state_stamp(self, robot_id: str, tick: int, *, evidence: bool = False) -> int | None:
+        """Return the stamp [ns] of a robot's map or evidence stored at a tick, or None. Raises as ``states``."""
+        topic = self._state_topic(robot_id, evidence)
         for first_ns, first in self._messages(topic):
             # Ticks are one publish period apart, so only the chunks at the tick's time need be read.
             period_ns = round(self.config.network.publish_period * 1e9)
@@ -145,17 +157,17 @@ class ResultReader:
                 if value.tick == tick:
                     return stamp_ns
             break
-        return dict(self.state_times(robot_id)).get(tick)
+        return dict(self.state_times(robot_id, evidence=evidence)).get(tick)
 
-    def states(self, robot_id: str, until_ns: int | None = None) -> list[MapState]:
-        """Return the states of a robot's last map with a stamp of at most ``until_ns`` (None: the last of all).
+    def states(self, robot_id: str, until_ns: int | None = None, *, evidence: bool = False) -> list[MapState]:
+        """Return the states of a robot's last map, or evidence, with a stamp up to ``until_ns`` (None: the last one).
 
         The first is a key frame, the others are the deltas from it to that map. Only the chunks that hold them are
         read. Raises InputError for an unknown robot, a time before the first stored map, and a missing state.
         """
         end = None if until_ns is None else until_ns + 1
         chain: list[MapState] = []
-        for _, value in self._messages(map_state_topic(self._known(robot_id)), end_ns=end, reverse=True):
+        for _, value in self._messages(self._state_topic(robot_id, evidence), end_ns=end, reverse=True):
             state = _map_state(value)
             if chain and state.sequence != chain[-1].base_sequence:
                 continue
@@ -169,6 +181,10 @@ class ResultReader:
             )
         if robot_id == CENTRAL:
             raise InputError(f"{self.path}: holds no centralised map up to the time asked for; run the logs again")
+        if evidence:
+            raise InputError(
+                f"{self.path}: no evidence of robot '{robot_id}' is stored up to the time asked for; run the logs again"
+            )
         raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for")
 
     def all_states(self) -> Iterator[MapState]:
@@ -230,6 +246,12 @@ class ResultReader:
             raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
         return robot_id
 
+    def _state_topic(self, robot_id: str, evidence: bool) -> str:
+        """Return the topic of a robot's maps or evidence; raise InputError for an unknown robot."""
+        if evidence and robot_id == CENTRAL:
+            raise InputError(f"{self.path}: the centralised map has no evidence; robots: {', '.join(self.robots)}")
+        return (evidence_topic if evidence else map_state_topic)(self._known(robot_id))
+
     def _messages(
         self, *topics: str, start_ns: int | None = None, end_ns: int | None = None, reverse: bool = False
     ) -> Iterator[tuple[int, Any]]:
@@ -246,17 +268,32 @@ class ResultReader:
 
 _DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
 """Exceptions raised by reading a damaged file."""
+
+
+def is_result(path: Path) -> bool:
+    """Return True for the file of a result, of any format version; False for other files and folders."""
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            names = {record.name for record in SeekingReader(file).iter_metadata()}
+    except (OSError, *_DAMAGE):
+        return False
+    return {"octoreplay", "config"} <= names
+
+
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
 
 
-def _tick_metrics(value: Any) -> TickMetrics:
-    """Return TickMetrics from its message."""
+def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...]) -> TickMetrics:
+    """Return TickMetrics from its message and the metrics of the pairs."""
     plain = ("tick", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
              "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change")  # fmt: skip
     return TickMetrics(
         stamp_ns=stamp_to_ns(value.header.stamp),
         robots=tuple(RobotMetrics(**_fields(RobotMetrics, robot)) for robot in value.robots),
         links=tuple(LinkMetrics(**_fields(LinkMetrics, link)) for link in value.links),
+        pairs=pairs,
         **{name: getattr(value, name) for name in plain},
     )
 

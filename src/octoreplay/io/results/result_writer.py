@@ -21,7 +21,7 @@ from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_f
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.records import PAIR_SHARES, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
 from octoreplay.transforms import rotation_to_quaternion
 
 FORMAT_VERSION = "2"
@@ -30,6 +30,7 @@ TEAM_FRAME = "team"
 """Frame of all maps and poses in a result."""
 
 METRICS_TOPIC = "/metrics"
+CONTRADICTION_TOPIC = "/contradiction"
 GRAPH_TOPIC = "/graph"
 TF_TOPIC = "/tf"
 STATIC_TF_TOPIC = "/tf_static"
@@ -63,6 +64,11 @@ _LINE_LIST, _TEXT_VIEW_FACING, _ADD, _DELETE = 5, 9, 0, 2
 def map_state_topic(robot_id: str) -> str:
     """Return the topic of a robot's stored map states."""
     return f"/{robot_id}/map_state"
+
+
+def evidence_topic(robot_id: str) -> str:
+    """Return the topic of a robot's stored evidence."""
+    return f"/{robot_id}/evidence"
 
 
 def map_view_topic(robot_id: str) -> str:
@@ -128,6 +134,13 @@ class ResultWriter:
 
     def write_state(self, state: MapState) -> None:
         """Write one robot's map, a key frame or a delta, to ``/<robot>/map_state``."""
+        self._write_state(map_state_topic(state.robot_id), state)
+
+    def write_evidence(self, state: MapState) -> None:
+        """Write one robot's evidence, a key frame or a delta, to ``/<robot>/evidence``."""
+        self._write_state(evidence_topic(state.robot_id), state)
+
+    def _write_state(self, topic: str, state: MapState) -> None:
         self._start(state.stamp_ns)
         type_name = "octoreplay_msgs/msg/MapState"
         value = message(
@@ -135,13 +148,13 @@ class ResultWriter:
             sequence=state.sequence, base_sequence=state.base_sequence, is_key_frame=state.is_key_frame,
             data=np.frombuffer(state.data, dtype=np.uint8),
         )  # fmt: skip
-        self._writer.write(map_state_topic(state.robot_id), type_name, value, state.stamp_ns)
+        self._writer.write(topic, type_name, value, state.stamp_ns)
 
     def write_metrics(self, metrics: TickMetrics) -> None:
-        """Write the team's metrics after one tick to ``/metrics``."""
+        """Write the team's metrics after one tick to ``/metrics``, those of pairs to ``/contradiction``."""
         self._start(metrics.stamp_ns)
         fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
-        del fields["stamp_ns"]
+        del fields["stamp_ns"], fields["pairs"]
         fields["robots"] = [
             message("octoreplay_msgs/msg/RobotMetrics", **dataclasses.asdict(robot)) for robot in metrics.robots
         ]
@@ -151,6 +164,13 @@ class ResultWriter:
         type_name = "octoreplay_msgs/msg/TickMetrics"
         value = message(type_name, header=header(metrics.stamp_ns, TEAM_FRAME), **fields)
         self._writer.write(METRICS_TOPIC, type_name, value, metrics.stamp_ns)
+        pairs = [message("octoreplay_msgs/msg/PairMetrics", **dataclasses.asdict(pair)) for pair in metrics.pairs]
+        type_name = "octoreplay_msgs/msg/Contradiction"
+        value = message(
+            type_name, header=header(metrics.stamp_ns, TEAM_FRAME), tick=metrics.tick,
+            **{name: getattr(metrics, name) for name in PAIR_SHARES}, pairs=pairs,
+        )  # fmt: skip
+        self._writer.write(CONTRADICTION_TOPIC, type_name, value, metrics.stamp_ns)
 
     def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable) -> None:
         """Write the occupied leaves of one robot's map as a point cloud for viewers to ``/<robot>/map``."""

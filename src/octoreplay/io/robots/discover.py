@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -13,7 +14,7 @@ from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.classes import check_labelled, has_labels, team_class_table
 from octoreplay.io.robots.log_groups import group_of, groups_in
 from octoreplay.io.robots.survey import LogSurveys
-from octoreplay.io.robots.team_check import TeamMember, check_team, team_member
+from octoreplay.io.robots.team_check import TeamMember, check_team, team_frame_origins, team_member
 from octoreplay.io.robots.topics import find_topics
 
 
@@ -54,6 +55,8 @@ def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun
             classes = edited(team_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
     check_labelled(classes, robots, labelled)
     warnings = check_team(members, strict_frames=config.time.strict_frames)
+    origins = team_frame_origins(members)
+    robots = [dataclasses.replace(robot, frame_origin=origins[robot.robot_id]) for robot in robots]
     return ResolvedRun.from_config(config, robots, classes, warnings)
 
 

@@ -12,7 +12,7 @@ from octoreplay.errors import ConfigError
 from octoreplay.io.robots.log_groups import LogGroup
 from octoreplay.io.robots.pose_frames import find_map_frame
 from octoreplay.io.robots.team_clocks import RobotClock, clock_of, clock_warning
-from octoreplay.io.robots.team_frames import frames_warning
+from octoreplay.io.robots.team_frames import frame_origins, frames_warning
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,11 @@ def check_team(members: Sequence[TeamMember], *, strict_frames: bool) -> tuple[s
     clocks = clock_warning({m.robot.robot_id: m.clock for m in members if m.clock is not None})
     found = (unrelated, clocks, *_shared_messages([member.robot for member in members]))
     return tuple(sentence for sentence in found if sentence is not None)
+
+
+def team_frame_origins(members: Sequence[TeamMember]) -> dict[str, str]:
+    """Return a phrase on the origin of each robot's place in the team's frame, by robot_id."""
+    return frame_origins([(member.robot, member.frame) for member in members])
 
 
 def _shared_messages(robots: Sequence[RobotConfig]) -> Iterator[str]:

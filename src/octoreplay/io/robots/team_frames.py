@@ -38,6 +38,25 @@ def frames_warning(robots: Sequence[tuple[RobotConfig, MapFrame]]) -> str | None
     )
 
 
+def frame_origins(robots: Sequence[tuple[RobotConfig, MapFrame | None]]) -> dict[str, str]:
+    """Return a phrase on the origin of each robot's place in the team's frame, by robot_id.
+
+    A ``T_team_map`` is given, or computed as its ``T_team_map_from`` says. The map frames of the other robots are the
+    team's frame: a shared frame where the logs relate them all, else an assumption.
+    """
+    unplaced = [(robot, frame) for robot, frame in robots if robot.T_team_map is None and frame is not None]
+    is_related = len(_groups(unplaced)) == 1 and (len(robots) == 1 or len(unplaced) > 1)
+    origins = {}
+    for robot, frame in robots:
+        if robot.T_team_map is not None:
+            origins[robot.robot_id] = robot.T_team_map_from or "given in the team file"
+        elif is_related and frame is not None and frame.name is not None:
+            origins[robot.robot_id] = f"frame '{frame.name}' of the logs"
+        else:
+            origins[robot.robot_id] = "assumed: the map frame is taken for the team's frame"
+    return origins
+
+
 def _described(frame: MapFrame) -> str:
     """Map frame as a warning names it."""
     if frame.name is None:

@@ -1,0 +1,168 @@
+"""Command that finds the frames of a team: align."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from octoreplay.commands.exit_codes import EXIT_ERROR
+from octoreplay.commands.options import (
+    SectionedCommand,
+    check_folder,
+    check_output,
+    existing_path,
+    with_parameters,
+)
+from octoreplay.commands.progress import progress_bar, warn
+from octoreplay.commands.team_options import base_config, save_team_file
+from octoreplay.config.class_file import with_classes
+from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from octoreplay.config.resolved import ResolvedRun
+    from octoreplay.config.run import RunConfig
+    from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.replay.alignment import Alignment
+
+
+@with_parameters("sensor", "map", "time")
+@click.command(cls=SectionedCommand, short_help="Find the frames of a team from its robots' maps.")
+@click.argument("inputs", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml | LOG... | RESULT.mcap")
+@click.option("-o", "--output", type=existing_path, required=True, metavar="ALIGNED.yaml", help="team file to write")
+@click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
+              help="transforms T_team_map to try, which are used only where the maps verify them")  # fmt: skip
+@click.option("--components", is_flag=True,
+              help="write further groups of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
+@click.option("--csv", type=existing_path, metavar="FILE.csv", help="write the numbers of all pairs as CSV")
+@click.option("--json", type=existing_path, metavar="FILE.json",
+              help="write frames, covariances and pairs as JSON")  # fmt: skip
+@click.option("--plot", type=existing_path, metavar="DIR",
+              help="write pictures of the maps before and after into this folder")  # fmt: skip
+@click.option("--classes", metavar="NAME|FILE",
+              help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
+def align(
+    inputs: tuple[Path, ...], output: Path, guess: Path | None, components: bool, csv: Path | None, json: Path | None,
+    plot: Path | None, classes: str | None, **parameters: Any,
+) -> int:  # fmt: skip
+    """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
+
+    Writes the team file again with the frames, their standard deviations and their origins. Robots that no accepted
+    pair connects are named and left out. Exit code 0 if all robots are connected and no given T_team_map contradicts
+    the maps; else 1, and nothing is written if no two robots are connected.
+    """
+    from octoreplay.report import tables
+    from octoreplay.report.alignment_files import write_alignment
+    from octoreplay.report.alignment_plots import write_alignment_figures
+    from octoreplay.report.alignment_tables import alignment_tables
+
+    outputs = {output: ".yaml", **{path: suffix for path, suffix in ((csv, ".csv"), (json, ".json")) if path}}
+    for path, suffix in outputs.items():
+        check_output(path, suffix, [*inputs, *([guess] if guess else [])])
+    if plot is not None:
+        check_folder(plot)
+    out, err = tables.terminal(), tables.terminal(stderr=True)
+    given = {name: value for name, value in parameters.items() if value is not None}
+    config, alignment, warnings = _aligned(inputs, guess, classes, given, err)
+    tables.show(out, alignment_tables(alignment))
+    written = write_alignment(alignment, csv_path=csv, json_path=json)
+    written += write_alignment_figures(alignment, plot) if plot is not None else []
+    written = [*_write_teams(config, alignment, output, components=components), *written]
+    for sentence in (*warnings, *alignment.warnings):
+        warn(err, sentence)
+    for path in written:
+        out.print(f"wrote {path}", soft_wrap=True)
+    return 0 if alignment.is_whole else EXIT_ERROR
+
+
+def align_with_bar(
+    config: RunConfig, resolved: ResolvedRun, guesses: Mapping[str, Sequence[float]] | None = None
+) -> Alignment:
+    """Align the robots of a configuration from their logs, with progress bars."""
+    from octoreplay.replay.alignment import align_robots
+    from octoreplay.replay.own_maps import own_maps
+
+    with progress_bar("map") as update:
+        maps = own_maps(resolved, progress=lambda share: update(share, None, ""))
+    with progress_bar("align") as update:
+        return align_robots(config, maps, guesses=guesses, progress=lambda share: update(share, None, ""))
+
+
+def aligned_run(chosen: RunConfig, surveys: LogSurveys, out: Console) -> tuple[ResolvedRun, Alignment]:
+    """Align the robots of a configuration, show the tables, and return the aligned run, resolved, with the alignment.
+
+    Raises InputError where no two robots are connected.
+    """
+    from octoreplay.io.robots import discover
+    from octoreplay.replay.alignment import aligned_config, check_aligned
+    from octoreplay.report import tables
+    from octoreplay.report.alignment_tables import alignment_tables
+
+    # Frames that nothing relates are the reason to align them.
+    alignment = align_with_bar(chosen, discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys))
+    tables.show(out, alignment_tables(alignment))
+    check_aligned(alignment)
+    config = discover.resolve(aligned_config(chosen, alignment.teams[0]), surveys)
+    return dataclasses.replace(config, warnings=(*config.warnings, *alignment.warnings)), alignment
+
+
+def _aligned(
+    inputs: tuple[Path, ...], guess: Path | None, classes: str | None, given: Mapping[str, Any], err: Console
+) -> tuple[RunConfig, Alignment, tuple[str, ...]]:
+    """The configuration of the inputs, the alignment of its robots, and warnings of the logs."""
+    from octoreplay.config.frames_file import load_frames_file
+    from octoreplay.io.results.result_reader import is_result
+    from octoreplay.io.robots import discover
+    from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.replay.alignment import aligned_config
+
+    guesses = None if guess is None else load_frames_file(guess)
+    if is_result(inputs[0]):
+        if len(inputs) > 1:
+            raise click.UsageError(f"name one result alone, without {inputs[1]}")
+        if given or classes is not None:
+            raise ConfigError(f"{inputs[0]}: holds finished maps; leave out {_option(given)}, or name its logs")
+        return (*_aligned_result(inputs[0], guesses), ())
+    with LogSurveys() as surveys:
+        config = base_config(inputs, None, err, surveys)
+        config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
+        resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)
+        alignment = align_with_bar(config, resolved, guesses)
+        return config, alignment, discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings
+
+
+def _option(given: Mapping[str, Any]) -> str:
+    """The first option that was given."""
+    return f"--{next(iter(given), 'classes').replace('_', '-')}"
+
+
+def _aligned_result(path: Path, guesses: Mapping[str, Sequence[float]] | None) -> tuple[RunConfig, Alignment]:
+    """The configuration of a result, and the alignment of its robots from their stored evidence."""
+    from octoreplay.replay.alignment import align_robots, stored_maps
+    from octoreplay.result import open_result
+
+    with open_result(path) as result, progress_bar("align") as update:
+        maps, T_map_own = stored_maps(result)
+        return result.config, align_robots(
+            result.config, maps, T_map_own=T_map_own, guesses=guesses, progress=lambda share: update(share, None, "")
+        )
+
+
+def _write_teams(config: RunConfig, alignment: Alignment, output: Path, *, components: bool) -> list[Path]:
+    """Write the team file, and with ``components`` those of further teams; return the files."""
+    from octoreplay.replay.alignment import aligned_config, check_aligned
+
+    check_aligned(alignment)
+    teams = [team for team in alignment.teams if len(team) > 1]
+    written = []
+    for number, team in enumerate(teams if components else teams[:1], start=1):
+        path = output if number == 1 else output.with_stem(f"{output.stem}-{number}")
+        save_team_file(aligned_config(config, team), path)
+        written.append(path)
+    return written

@@ -1,0 +1,346 @@
+"""Alignment of a team: frames of the robots from their own maps, and the configuration that holds them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any, TypeVar
+
+import numpy as np
+
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
+from octoreplay.config.subteam import subteam
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.records import Float64Array
+from octoreplay.registration.covariance import about_point
+from octoreplay.registration.own_map import OwnMap
+from octoreplay.registration.pairs import PairAlignment
+from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots, pose_difference
+from octoreplay.registration.team import align_team
+from octoreplay.replay.own_maps import own_map_of
+from octoreplay.result import Result
+from octoreplay.transforms import inverse, numbers_of, transform_of
+
+Frames = Mapping[str, Sequence[float]]
+"""T_team_map (x, y, z, qx, qy, qz, qw) by robot_id."""
+
+_Config = TypeVar("_Config", bound=RunConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotFrame:
+    """Frame of one robot in its team.
+
+    Attributes
+    ----------
+    robot_id : str
+        The robot.
+    T_team_map : (4, 4) float64 array
+        Pose of the robot's map frame in the team's frame.
+    covariance : (6, 6) float64 array or None
+        Covariance of the rotation about the team's axes [rad] and of the map frame's origin [m], relative to the robot
+        whose frame the team's is or whose pose was given; None for such a robot.
+    origin : str
+        Phrase on the origin of the pose.
+    partner : str or None
+        Robot through whose pair the pose was found; None where it was given or is the team's frame.
+    is_given : bool
+        True where the T_team_map of the configuration was kept.
+    """
+
+    robot_id: str
+    T_team_map: Float64Array
+    covariance: Float64Array | None
+    origin: str
+    partner: str | None
+    is_given: bool
+
+    @property
+    def sigma(self) -> tuple[float, ...] | None:
+        """Standard deviations of the position along x, y, z [m] and of the rotation about x, y, z [rad]."""
+        if self.covariance is None:
+            return None
+        deviations = np.sqrt(np.diag(self.covariance))
+        return tuple(round(float(value), 6) for value in (*deviations[3:], *deviations[:3]))
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Frames of a team with the numbers behind them.
+
+    Attributes
+    ----------
+    robot_ids : tuple of str
+        All robots.
+    maps : tuple of OwnMap
+        The robots' own maps, each in the frame that ``T_map_own`` places in the robot's map frame.
+    T_map_own : tuple of (4, 4) float64 arrays
+        The identity for maps from logs; for evidence of a result, which is in the team's frame of that run, the inverse
+        of its T_team_map.
+    T_team_own_before : tuple of (4, 4) float64 arrays
+        Poses of the maps before the alignment: as configured, or the identity that is assumed.
+    pairs : tuple of PairAlignment
+        All pairs, by position in ``robot_ids``, in the frames of ``maps``.
+    teams : tuple of tuple of RobotFrame
+        Robots whose frames are related, the largest team first. The first is the team that the others are left out of.
+    problems : tuple of str
+        Sentences on given poses that the maps contradict.
+    notes : tuple of str
+        Sentences on given poses that no overlap verifies, and on equal maps.
+    """
+
+    robot_ids: tuple[str, ...]
+    maps: tuple[OwnMap, ...] = field(repr=False)
+    T_map_own: tuple[Float64Array, ...] = field(repr=False)
+    T_team_own_before: tuple[Float64Array, ...] = field(repr=False)
+    pairs: tuple[PairAlignment, ...]
+    teams: tuple[tuple[RobotFrame, ...], ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Robots whose frames nothing relates to the first team."""
+        team = {frame.robot_id for frame in self.teams[0]}
+        return tuple(robot_id for robot_id in self.robot_ids if robot_id not in team)
+
+    @property
+    def is_whole(self) -> bool:
+        """True where all robots are in one team and the maps contradict no given pose."""
+        return not self.left_out and not self.problems
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on robots that are left out, and on given poses that are refused or that no overlap verifies."""
+        return (*self.reasons(), *self.problems, *self.notes)
+
+    def best_refused(self, robot_id: str) -> PairAlignment:
+        """Return the pair of a robot that came closest to acceptance: that with the largest L, refused or not."""
+        index = self.robot_ids.index(robot_id)
+        own = [pair for pair in self.pairs if index in (pair.first, pair.second)]
+        return max(own, key=lambda pair: pair.verification.score)
+
+    def reasons(self) -> tuple[str, ...]:
+        """Return a sentence for each robot that is left out, with its best pair and the number that failed."""
+        sentences = []
+        for robot_id in self.left_out:
+            pair = self.best_refused(robot_id)
+            first, second = self.robot_ids[pair.first], self.robot_ids[pair.second]
+            reason = pair.refusal or "accepted, and they are a team of their own"
+            sentences.append(f"{robot_id} is not connected; its best pair is {first} and {second}: {reason}")
+        return tuple(sentences)
+
+
+def align_robots(
+    config: RunConfig,
+    maps: Sequence[OwnMap],
+    *,
+    T_map_own: Sequence[Float64Array] | None = None,
+    guesses: Frames | None = None,
+    progress: Callable[[float], None] | None = None,
+    num_threads: int | None = None,
+) -> Alignment:
+    """Return the frames of a team's robots from their own maps, in the order of ``config.robots``.
+
+    A ``T_team_map`` of the configuration that no command computed is trusted: it places its robot unless the maps
+    contradict it. ``guesses`` are verified and refined like every other candidate, and are not used where no overlap
+    verifies them. ``T_map_own`` (4, 4) places each map in its robot's map frame (default: it is in that frame).
+    ``progress`` is called with the finished share of pairs, 0 to 1. ``num_threads`` does not change the result. Raises
+    ConfigError for fewer than two robots, and for guesses of other robots.
+    """
+    robot_ids = tuple(robot.robot_id for robot in config.robots)
+    if len(robot_ids) < 2:
+        raise ConfigError(f"align: needs at least two robots; the team has one, {robot_ids[0]}")
+    for robot_id in guesses or {}:
+        if robot_id not in robot_ids:
+            raise ConfigError(f"guess: robot '{robot_id}' is not in the team: {', '.join(sorted(robot_ids))}")
+    placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
+    pairs = list(combinations(range(len(maps)), 2))
+    with ThreadPoolExecutor(num_threads or min(len(pairs), os.cpu_count() or 1)) as threads:
+
+        def run(function: Callable[[Any], Any], items: Any) -> Iterator[Any]:
+            for done, found in enumerate(threads.map(function, items), start=1):
+                if progress is not None:
+                    progress(done / len(pairs))
+                yield found
+
+        try:
+            aligned = align_team(maps, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run)
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    given = _given(config)
+    placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()})
+    for refusal in placement.refusals:
+        given.pop(refusal.index, None)
+    scores = {(pair.first, pair.second): pair.verification.score for pair in aligned.pairs}
+
+    def frames(team: Sequence[PlacedRobot]) -> tuple[RobotFrame, ...]:
+        first = team[0].anchor
+        # Without a given pose the team's frame is the map frame of the first robot.
+        T_team_own = np.eye(4) if first in given else placed[first]
+        return tuple(_robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, scores) for robot in team)
+
+    return Alignment(
+        robot_ids,
+        tuple(maps),
+        placed,
+        tuple(T @ own for T, own in zip(_configured(config), placed, strict=True)),
+        aligned.pairs,
+        tuple(frames(team) for team in placement.teams),
+        tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
+        (*_unverified(placement.teams, given, robot_ids), *_equal_maps(maps, robot_ids)),
+    )
+
+
+def stored_maps(
+    result: Result, *, progress: Callable[[float], None] | None = None
+) -> tuple[list[OwnMap], list[Float64Array]]:
+    """Return the maps of a result's robots from their stored evidence, and T_map_own (4, 4) of each.
+
+    The evidence is in the team's frame of the run. Raises InputError where the result holds none.
+    """
+    config, maps = result.config, []
+    for number, robot in enumerate(config.robots, start=1):
+        maps.append(own_map_of(config, result.evidence(robot.robot_id).octree))
+        if progress is not None:
+            progress(number / len(config.robots))
+    return maps, [inverse(transform_of(robot.T_team_map_or_identity)) for robot in config.robots]
+
+
+def aligned_config(config: _Config, team: Sequence[RobotFrame]) -> _Config:
+    """Return the configuration of a team's robots with their frames; other robots are left out.
+
+    ``T_team_map_sigma`` and ``T_team_map_from`` say how exact each frame is and which pair gave it.
+    """
+    frames = {frame.robot_id: frame for frame in team}
+    robots = [_aligned_robot(robot, frames[robot.robot_id]) for robot in config.robots if robot.robot_id in frames]
+    return subteam(config, robots)
+
+
+def check_aligned(alignment: Alignment) -> None:
+    """Raise InputError with the reasons where no two robots' frames are related."""
+    if len(alignment.teams[0]) < 2:
+        best = max(alignment.pairs, key=lambda pair: pair.verification.score)
+        first, second = alignment.robot_ids[best.first], alignment.robot_ids[best.second]
+        raise InputError(
+            f"no two of the {len(alignment.robot_ids)} robots could be aligned; the best pair is {first} and {second}:"
+            f" {best.refusal}; their maps must overlap (docs/frames.md has remedies)"
+        )
+
+
+def _aligned_robot(robot: RobotConfig, frame: RobotFrame) -> Any:
+    """The robot's configuration with its frame."""
+    if frame.is_given:
+        return robot
+    return dataclasses.replace(
+        robot,
+        T_team_map=numbers_of(frame.T_team_map),
+        T_team_map_sigma=frame.sigma,
+        T_team_map_from=frame.origin,
+    )
+
+
+def _given(config: RunConfig) -> dict[int, Float64Array]:
+    """T_team_map (4, 4) of the robots whose configuration gives one that no command computed."""
+    return {
+        index: transform_of(robot.T_team_map)
+        for index, robot in enumerate(config.robots)
+        if robot.T_team_map is not None and robot.T_team_map_from is None
+    }
+
+
+def _configured(config: RunConfig) -> list[Float64Array]:
+    """T_team_map (4, 4) of each robot, the identity where it is not configured."""
+    return [transform_of(robot.T_team_map_or_identity) for robot in config.robots]
+
+
+def _candidates(
+    config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames
+) -> dict[tuple[int, int], list[Float64Array]]:
+    """Known transforms between the maps of pairs: those that the configuration holds or assumes, and guesses.
+
+    Every further source of transforms between robots, such as position fixes or landmarks in the logs, belongs here.
+    """
+    configured = _configured(config)
+    # A robot with a frame and one without are not related by the identity.
+    is_known = [robot.T_team_map is not None for robot in config.robots]
+    guessed = {robot_id: transform_of(numbers) for robot_id, numbers in guesses.items()}
+    found: dict[tuple[int, int], list[Float64Array]] = {}
+    for i, j in combinations(range(len(config.robots)), 2):
+        poses = []
+        if is_known[i] == is_known[j]:
+            poses.append((configured[i], configured[j]))
+        ids = config.robots[i].robot_id, config.robots[j].robot_id
+        if all(robot_id in guessed for robot_id in ids):
+            poses.append((guessed[ids[0]], guessed[ids[1]]))
+        found[i, j] = [inverse(one @ T_map_own[i]) @ other @ T_map_own[j] for one, other in poses]
+    return found
+
+
+def _robot_frame(
+    robot: PlacedRobot, robot_ids: Sequence[str], T_team_own: Float64Array, T_map_own: Float64Array,
+    given: Mapping[int, Float64Array], scores: Mapping[tuple[int, int], float],
+) -> RobotFrame:  # fmt: skip
+    """The frame of a placed robot; ``T_team_own`` maps the frame that it is placed in to the team's."""
+    T = T_team_own @ robot.T_team_map @ inverse(T_map_own)
+    robot_id = robot_ids[robot.index]
+    if robot.partner is None:
+        is_given = robot.index in given
+        return RobotFrame(
+            robot_id, T, None, "given in the team file" if is_given else "frame of the team", None, is_given
+        )
+    turn = np.kron(np.eye(2), T_team_own[:3, :3])
+    # From the origin of the map to that of the map frame.
+    arm = T[:3, 3] - (T_team_own @ robot.T_team_map)[:3, 3]
+    covariance = about_point(turn @ robot.covariance @ turn.T, arm)
+    partner = robot_ids[robot.partner]
+    first, second = sorted((robot.index, robot.partner))
+    origin = f"aligned with {partner}, L {scores[first, second]:.0f}"
+    if robot.index in given:
+        origin += f"; the given pose differs by {_difference(*pose_difference(T, given[robot.index]))}"
+    return RobotFrame(robot_id, T, covariance, origin, partner, False)
+
+
+def _difference(shift: float, angle: float) -> str:
+    """Difference of two poses as text."""
+    return f"{shift:.2f} m and {math.degrees(angle):.1f} degrees"
+
+
+def _problem(refusal: Refusal, robot_ids: Sequence[str]) -> str:
+    """Sentence on a given pose that the maps contradict."""
+    robot_id, other = robot_ids[refusal.index], robot_ids[refusal.other]
+    if refusal.share_contra is None:
+        return (
+            f"the T_team_map given for {robot_id} is not used: it disagrees with that of {other}, from which the maps"
+            f" place {robot_id} {_difference(refusal.shift, refusal.angle)} elsewhere"
+        )
+    return (
+        f"the T_team_map given for {robot_id} is not used: under it the maps of {robot_id} and {other} contradict each"
+        f" other (q_c {refusal.share_contra:.3f})"
+    )
+
+
+def _unverified(
+    teams: Sequence[Sequence[PlacedRobot]], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
+) -> Iterator[str]:
+    """Sentences on robots whose given pose no overlap verifies."""
+    for team in teams:
+        for robot in team:
+            num_placed = sum(other.anchor == robot.index for other in team)
+            if robot.index in given and num_placed == 1:
+                yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
+
+
+def _equal_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
+    """Sentences on robots whose maps are equal."""
+    for i, j in combinations(range(len(maps)), 2):
+        is_equal = np.array_equal(maps[i].low, maps[j].low) and np.array_equal(maps[i].states, maps[j].states)
+        if is_equal and maps[i].states.any():
+            yield f"{robot_ids[i]} and {robot_ids[j]} have equal maps: are their logs the same?"

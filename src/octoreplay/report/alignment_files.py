@@ -1,0 +1,85 @@
+"""Alignments as CSV and JSON files (docs/frames.md)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.registration.pairs import PairAlignment
+from octoreplay.replay.alignment import Alignment, RobotFrame
+from octoreplay.transforms import inverse, numbers_of
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+PAIR_COLUMNS = (
+    "first", "second", "accepted", "refusal", "overlap", "num_cells", "q", "q_c", "q_g", "L", "tilt_degrees",
+    *(f"T_first_second.{name}" for name in _POSE),
+)  # fmt: skip
+"""Columns of the CSV file, one row for each pair."""
+
+
+def write_alignment(alignment: Alignment, *, csv_path: Path | None, json_path: Path | None) -> list[Path]:
+    """Write an alignment as CSV and JSON and return the files. Raises OutputError."""
+    if csv_path is not None:
+        write_whole(csv_path, alignment_csv(alignment))
+    if json_path is not None:
+        write_whole(json_path, alignment_json(alignment))
+    return [path for path in (csv_path, json_path) if path is not None]
+
+
+def alignment_csv(alignment: Alignment) -> str:
+    """Return all pairs as CSV text with the columns ``PAIR_COLUMNS``."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(PAIR_COLUMNS)
+    for pair in alignment.pairs:
+        values = _pair(alignment, pair)
+        writer.writerow([*(values[name] for name in PAIR_COLUMNS[:-7]), *values["T_first_second"]])
+    return text.getvalue()
+
+
+def alignment_json(alignment: Alignment) -> str:
+    """Return an alignment as JSON text: its teams with frames and covariances, all pairs, and the sentences."""
+    return json_text(
+        {
+            "teams": [[_frame(frame) for frame in team] for team in alignment.teams],
+            "left_out": alignment.left_out,
+            "pairs": [_pair(alignment, pair) | {"information": pair.information.tolist()} for pair in alignment.pairs],
+            "problems": alignment.problems,
+            "notes": alignment.notes,
+        }
+    )
+
+
+def _frame(frame: RobotFrame) -> dict[str, Any]:
+    """The values of one robot's frame."""
+    return {
+        "robot": frame.robot_id,
+        "T_team_map": numbers_of(frame.T_team_map),
+        "T_team_map_sigma": frame.sigma,
+        "covariance": None if frame.covariance is None else frame.covariance.tolist(),
+        "from": frame.origin,
+        "partner": frame.partner,
+    }
+
+
+def _pair(alignment: Alignment, pair: PairAlignment) -> dict[str, Any]:
+    """The values of one pair, with its pose between the robots' map frames."""
+    agreement, own = pair.verification, alignment.T_map_own
+    return {
+        "first": alignment.robot_ids[pair.first],
+        "second": alignment.robot_ids[pair.second],
+        "accepted": pair.is_accepted,
+        "refusal": pair.refusal,
+        "overlap": agreement.overlap,
+        "num_cells": agreement.obstacles.total,
+        "q": agreement.obstacles.share_same,
+        "q_c": agreement.obstacles.share_contra,
+        "q_g": agreement.ground.share_same,
+        "L": agreement.score,
+        "tilt_degrees": math.degrees(pair.tilt),
+        "T_first_second": numbers_of(own[pair.first] @ pair.T_first_second @ inverse(own[pair.second])),
+    }

@@ -1,0 +1,78 @@
+"""Tables of an alignment: pairs of robots, and frames of the robots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from octoreplay.registration.pairs import PairAlignment
+from octoreplay.replay.alignment import Alignment, RobotFrame
+from octoreplay.report.tables import share, styled_table
+
+MAX_PAIRS = 30
+"""Largest number of rows of the table of pairs."""
+
+
+def ranked(pairs: Sequence[PairAlignment]) -> list[PairAlignment]:
+    """Return the accepted pairs before the refused ones, each with the largest L first."""
+    return sorted(pairs, key=lambda pair: (not pair.is_accepted, -pair.verification.score))
+
+
+def alignment_tables(alignment: Alignment) -> RenderableType:
+    """Return the tables of an alignment: its pairs, and the frames of each team of two or more robots."""
+    parts: list[RenderableType] = [pairs_table(alignment)]
+    teams = [team for team in alignment.teams if len(team) > 1]
+    for number, team in enumerate(teams, start=1):
+        parts += ["", frames_table(team, f"Frames of team {number}" if len(teams) > 1 else "Frames")]
+    return Group(*parts)
+
+
+def pairs_table(alignment: Alignment) -> RenderableType:
+    """Return a table of the pairs with the numbers behind each verdict (docs/frames.md)."""
+    table = styled_table("Pairs")
+    table.add_column("robots", overflow="fold")
+    for name in ("overlap", "cells", "q", "q_c", "q_g", "L"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("verdict", overflow="fold")
+    rows = ranked(alignment.pairs)
+    for pair in rows[:MAX_PAIRS]:
+        agreement = pair.verification
+        table.add_row(
+            f"{alignment.robot_ids[pair.first]}, {alignment.robot_ids[pair.second]}",
+            share(agreement.overlap), f"{agreement.obstacles.total:,}", f"{agreement.obstacles.share_same:.3f}",
+            f"{agreement.obstacles.share_contra:.3f}", f"{agreement.ground.share_same:.3f}", f"{agreement.score:.0f}",
+            Text("accepted", style="green") if pair.is_accepted else f"refused: {pair.refusal}",
+        )  # fmt: skip
+    if len(rows) <= MAX_PAIRS:
+        return table
+    hidden = rows[MAX_PAIRS:]
+    accepted = sum(pair.is_accepted for pair in hidden)
+    return Group(table, f"and {len(hidden)} more pairs, of which {accepted} are accepted; --csv writes all")
+
+
+def frames_table(team: Sequence[RobotFrame], title: str) -> Table:
+    """Return a table of the robots' frames: position [m] and angles [degrees], each with its standard deviation."""
+    table = styled_table(title)
+    table.add_column("robot", no_wrap=True)
+    for name in ("x [m]", "y [m]", "z [m]", "yaw [\u00b0]", "tilt [\u00b0]", "\u00b1 xyz [m]", "\u00b1 yaw [\u00b0]"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("from", overflow="fold")
+    for frame in team:
+        T, sigma = frame.T_team_map, frame.sigma
+        # Adding 0 turns -0 into 0.
+        yaw = round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0
+        tilt = math.degrees(math.acos(min(1.0, max(-1.0, float(T[2, 2])))))
+        spread = ("-", "-") if sigma is None else (f"{math.hypot(*sigma[:3]):.2f}", f"{math.degrees(sigma[5]):.2f}")
+        table.add_row(
+            frame.robot_id,
+            *(f"{round(float(value), 2) + 0.0:.2f}" for value in T[:3, 3]),
+            f"{yaw:.1f}",
+            f"{tilt:.1f}",
+            *spread,
+            frame.origin,
+        )
+    return table
