@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from octoreplay.records import Float64Array
+from octoreplay.registration.features import feature_candidates
 from octoreplay.registration.icp import Surface, icp
 from octoreplay.registration.own_map import OwnMap
-from octoreplay.registration.search import Candidate, planar_candidates
+from octoreplay.registration.search import planar_candidates
 from octoreplay.registration.verify import Verification, verify
 from octoreplay.transforms import inverse
 
@@ -23,6 +24,8 @@ _COARSE_GATES, _FINE_GATES = (5.0, 3.0, 2.0), (2.0, 1.2)
 _NUM_REFINED = 4
 # Candidates are refined with one point in this many.
 _THINNING = 3
+_UPWARDS = np.zeros((4, 4))
+_UPWARDS[2, 3] = 1.0
 # Edge of the cells for which the least score holds [m].
 _SCORE_RESOLUTION = 0.3
 # A refined candidate with more contradicting obstacles than this is wrong.
@@ -36,15 +39,21 @@ class AcceptLimits:
     Attributes
     ----------
     min_score : float
-        Least log-likelihood ratio L at cells of 0.3 m. It grows with the number of cells on the same surface.
+        Least log-likelihood ratio L of maps with a vertical axis, at cells of 0.3 m. It grows with the number of cells
+        on the same surface.
     min_cells : int
-        Least number of obstacle cells that count.
+        Least number of obstacle cells that count, both maps together.
     max_contra : float
         Largest share q_c of obstacle cells that contradict.
     max_tilt : float
         Largest angle between the vertical axes [rad].
     max_rival : float
-        Largest score of another pose that is accepted by itself, relative to the best one.
+        Largest evidence of another pose that is accepted by itself, relative to the best one: L, or cells without a
+        vertical axis.
+    min_shape_cells : int
+        Least number of cells of each map that count, without a vertical axis.
+    min_shape_same : float
+        Least share q of each map's cells that are the same, without a vertical axis.
     """
 
     min_score: float = 280.0
@@ -52,6 +61,8 @@ class AcceptLimits:
     max_contra: float = 0.05
     max_tilt: float = math.radians(2.5)
     max_rival: float = 0.5
+    min_shape_cells: int = 800
+    min_shape_same: float = 0.90
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,103 +111,113 @@ def align_pair(
     first: int,
     second: int,
     *,
+    dof: int = 4,
     guesses: Sequence[Float64Array] = (),
     limits: AcceptLimits | None = None,
 ) -> PairAlignment:
-    """Return the pose between the maps of two robots whose vertical axes agree, accepted or refused.
+    """Return the pose between the maps of two robots, accepted or refused.
 
-    ``guesses`` are further candidates for T_first_second (4, 4), such as surveyed poses.
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``guesses`` are further
+    candidates for T_first_second (4, 4), such as surveyed poses.
     """
     limits = limits or AcceptLimits()
-    a, b = maps[first], maps[second]
-    refined = _refined_candidates(a, b, guesses)
-    poses = [_pair(a, b, first, second, *pose, limits) for pose in refined]
+    matcher = _Matcher(maps[first], maps[second], dof == 4, limits)
+    poses = []
+    for T, information, agreement in matcher.refined_candidates(guesses):
+        refusal = matcher.refusal(agreement, T)
+        poses.append(PairAlignment(first, second, T, information, agreement, refusal))
     if not poses:
-        nothing = verify(a, b, np.eye(4))
-        return PairAlignment(first, second, np.eye(4), np.zeros((6, 6)), nothing, "no candidate: too few known columns")
-    poses.sort(key=lambda pose: (not pose.is_accepted, -pose.verification.score))
+        nothing = matcher.verify(np.eye(4))
+        return PairAlignment(first, second, np.eye(4), np.zeros((6, 6)), nothing, "no candidate: too little is known")
+    poses.sort(key=lambda pose: (not pose.is_accepted, -matcher.evidence(pose.verification)))
     best = poses[0]
     for rival in poses[1:]:
-        if best.is_accepted and rival.is_accepted and _is_distinct(best, rival, a.columns.edge):
-            share = rival.verification.score / best.verification.score
+        if best.is_accepted and rival.is_accepted and matcher.is_distinct(best.T_first_second, rival.T_first_second):
+            share = matcher.evidence(rival.verification) / matcher.evidence(best.verification)
             if share > limits.max_rival:
-                return _refused(best, f"another pose fits as well (L {rival.verification.score:.0f} of "
-                                      f"{best.verification.score:.0f})")  # fmt: skip
+                return replace(best, refusal=f"ambiguous: another pose has {share:.0%} of the evidence")
     return best
 
 
-def refusal_of(verification: Verification, tilt_angle: float, resolution: float, limits: AcceptLimits) -> str:
-    """Return the number for which a pose is refused, as text; empty where it is accepted."""
-    obstacles = verification.obstacles
-    if obstacles.total < limits.min_cells:
-        return f"overlap: {obstacles.total} obstacle cells, fewer than {limits.min_cells}"
-    if obstacles.share_contra > limits.max_contra:
-        return f"q_c {obstacles.share_contra:.3f} above {limits.max_contra:g}"
-    if tilt_angle > limits.max_tilt:
-        return f"tilt {math.degrees(tilt_angle):.1f} degrees, above {math.degrees(limits.max_tilt):.1f}"
-    min_score = limits.min_score * (_SCORE_RESOLUTION / resolution) ** 2
-    if verification.score < min_score:
-        return f"L {verification.score:.0f} below {min_score:.0f}"
-    return ""
+class _Matcher:
+    """Candidates, refinement and verdict for one pair of maps."""
 
+    def __init__(self, first: OwnMap, second: OwnMap, is_upright: bool, limits: AcceptLimits) -> None:
+        self._first, self._second = first, second
+        self._is_upright = is_upright
+        self._limits = limits
+        self._surfaces = [own.upright_surface if is_upright else own.surface for own in (first, second)]
 
-def _refined_candidates(
-    a: OwnMap, b: OwnMap, guesses: Sequence[Float64Array]
-) -> list[tuple[Float64Array, Float64Array, Verification]]:
-    """Poses with their information and verification: the best candidates after refinement."""
-    levelled = [_at_best_height(a, b, candidate) for candidate in planar_candidates(a, b)]
-    levelled += [(verify(a, b, guess).score, guess) for guess in guesses]
-    levelled.sort(key=lambda candidate: -candidate[0])
-    thin_b, thin_a = _thinned(b.surface), _thinned(a.surface)
-    refined = []
-    for _, T in levelled[:_NUM_REFINED]:
-        coarse = _refine(thin_b, thin_a, T, _COARSE_GATES, a.resolution)
-        agreement = verify(a, b, coarse[0])
-        if agreement.obstacles.share_contra <= _EXCLUDING_CONTRA:
-            coarse = _refine(b.surface, a.surface, coarse[0], _FINE_GATES, a.resolution)
-            agreement = verify(a, b, coarse[0])
-        refined.append((*coarse, agreement))
-    return refined
+    def verify(self, T: Float64Array) -> Verification:
+        """Agreement of the maps under a pose."""
+        return verify(self._first, self._second, T, is_upright=self._is_upright)
 
+    def evidence(self, agreement: Verification) -> float:
+        """Number by which poses are ranked."""
+        return agreement.score if self._is_upright else agreement.least_same**4 * agreement.obstacles.total
 
-def _at_best_height(a: OwnMap, b: OwnMap, candidate: Candidate) -> tuple[float, Float64Array]:
-    """The candidate at its height or one cell above or below, whichever verifies best, with its score."""
-    poses = []
-    for cells in (0, -1, 1):
-        T = candidate.T_first_second.copy()
-        T[2, 3] += cells * a.resolution
-        poses.append((verify(a, b, T).score, T))
-    return max(poses, key=lambda pose: pose[0])
+    def refined_candidates(
+        self, guesses: Sequence[Float64Array]
+    ) -> list[tuple[Float64Array, Float64Array, Verification]]:
+        """Poses with their information and verification: the best candidates after refinement."""
+        candidates = [*self._candidates(), *guesses]
+        ranked = sorted(candidates, key=lambda T: -self.evidence(self.verify(T)))
+        thin = [_thinned(surface) for surface in self._surfaces]
+        refined = []
+        for candidate in ranked[:_NUM_REFINED]:
+            T, information = self._refine(thin, candidate, _COARSE_GATES)
+            agreement = self.verify(T)
+            if agreement.obstacles.share_contra <= _EXCLUDING_CONTRA:
+                T, information = self._refine(self._surfaces, T, _FINE_GATES)
+                agreement = self.verify(T)
+            refined.append((T, information, agreement))
+        return refined
 
+    def refusal(self, agreement: Verification, T: Float64Array) -> str:
+        """The number for which a pose is refused, as text; empty where it is accepted."""
+        limits, obstacles = self._limits, agreement.obstacles
+        min_cells = limits.min_cells if self._is_upright else 2 * limits.min_shape_cells
+        if obstacles.total < min_cells:
+            return f"overlap: {obstacles.total} obstacle cells, fewer than {min_cells}"
+        if obstacles.share_contra > limits.max_contra:
+            return f"q_c {obstacles.share_contra:.3f} above {limits.max_contra:g}"
+        if not self._is_upright:
+            is_same = agreement.least_same >= limits.min_shape_same
+            return "" if is_same else f"q {agreement.least_same:.3f} below {limits.min_shape_same:g}"
+        if tilt(T) > limits.max_tilt:
+            return f"tilt {math.degrees(tilt(T)):.1f} degrees, above {math.degrees(limits.max_tilt):.1f}"
+        min_score = limits.min_score * (_SCORE_RESOLUTION / self._first.resolution) ** 2
+        return "" if agreement.score >= min_score else f"L {agreement.score:.0f} below {min_score:.0f}"
 
-def _refine(
-    source: Surface, target: Surface, T: Float64Array, gates: Sequence[float], resolution: float
-) -> tuple[Float64Array, Float64Array]:
-    """The refined pose and its information."""
-    result = icp(source, target, T, gates=[gate * resolution for gate in gates], tilt_sigma=TILT_SIGMA)
-    return result.T_target_source, result.information
+    def is_distinct(self, one: Float64Array, other: Float64Array) -> bool:
+        """True where two poses differ by more than four cells or 8 degrees."""
+        difference = inverse(one) @ other
+        angle = math.acos(min(1.0, max(-1.0, (float(np.trace(difference[:3, :3])) - 1) / 2)))
+        return float(np.linalg.norm(difference[:3, 3])) > 4 * self._first.resolution or angle > math.radians(8)
+
+    def _candidates(self) -> list[Float64Array]:
+        """Candidate poses (4, 4)."""
+        if not self._is_upright:
+            points = self._first.described_points, self._second.described_points
+            return feature_candidates(*points, self._first.resolution)
+        return [self._at_best_height(T) for T in planar_candidates(self._first, self._second)]
+
+    def _at_best_height(self, candidate: Float64Array) -> Float64Array:
+        """The candidate at its height or one cell above or below, whichever verifies best."""
+        shifts = (0.0, -self._first.resolution, self._first.resolution)
+        poses = [candidate + shift * _UPWARDS for shift in shifts]
+        return max(poses, key=lambda T: self.verify(T).score)
+
+    def _refine(
+        self, surfaces: Sequence[Surface], T: Float64Array, gates: Sequence[float]
+    ) -> tuple[Float64Array, Float64Array]:
+        """The refined pose and its information."""
+        target, source = surfaces
+        sigma = TILT_SIGMA if self._is_upright else None
+        result = icp(source, target, T, gates=[gate * self._first.resolution for gate in gates], tilt_sigma=sigma)
+        return result.T_target_source, result.information
 
 
 def _thinned(surface: Surface) -> Surface:
     """One in ``_THINNING`` points of a surface."""
     return surface.subset(np.arange(len(surface.points)) % _THINNING == 0)
-
-
-def _pair(
-    a: OwnMap, b: OwnMap, first: int, second: int, T: Float64Array, information: Float64Array, agreement: Verification,
-    limits: AcceptLimits,
-) -> PairAlignment:  # fmt: skip
-    """The pose of a pair with its verdict."""
-    return PairAlignment(first, second, T, information, agreement, refusal_of(agreement, tilt(T), a.resolution, limits))
-
-
-def _refused(pair: PairAlignment, reason: str) -> PairAlignment:
-    """The pair, refused for a reason."""
-    return PairAlignment(pair.first, pair.second, pair.T_first_second, pair.information, pair.verification, reason)
-
-
-def _is_distinct(one: PairAlignment, other: PairAlignment, edge: float) -> bool:
-    """True where two poses differ by more than two columns or 8 degrees."""
-    difference = inverse(one.T_first_second) @ other.T_first_second
-    angle = math.acos(min(1.0, max(-1.0, (float(np.trace(difference[:3, :3])) - 1) / 2)))
-    return float(np.linalg.norm(difference[:3, 3])) > 2 * edge or angle > math.radians(8)

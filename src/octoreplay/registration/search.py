@@ -9,7 +9,8 @@ import numpy as np
 from scipy import fft
 
 from octoreplay.records import Float64Array, Int64Array
-from octoreplay.registration.own_map import Columns, OwnMap
+from octoreplay.registration.columns import Columns
+from octoreplay.registration.own_map import OwnMap
 
 # Share of columns whose code differs although the pose is right.
 _ERROR_SHARE = 0.2
@@ -27,16 +28,8 @@ _MAX_CLIMB = 8
 _SAME_YAW, _SAME_SHIFT = 8.0, 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """Pose found by the search: ``T_first_second`` (4, 4), a rotation about the vertical axis, and its score."""
-
-    T_first_second: Float64Array
-    score: float
-
-
-def planar_candidates(first: OwnMap, second: OwnMap) -> list[Candidate]:
-    """Return the most likely poses of the second map in the first one's frame, best first.
+def planar_candidates(first: OwnMap, second: OwnMap) -> list[Float64Array]:
+    """Return the most likely poses (4, 4) of the second map in the first one's frame, best first.
 
     The score is the log-likelihood ratio of the columns' codes: ln((1 - e) / P_c + e) where two known columns have the
     same code c, ln e where they differ. P_c is the mean frequency of the code in both maps, e = 0.2.
@@ -51,7 +44,7 @@ def planar_candidates(first: OwnMap, second: OwnMap) -> list[Candidate]:
     for planar in climbed:
         if len(kept) < _NUM_KEPT and not any(planar.is_close_to(other, a.edge) for other in kept):
             kept.append(planar)
-    return [Candidate(planar.pose(_height_difference(a, b, planar)), planar.score) for planar in kept]
+    return [planar.pose(_height_difference(a, b, planar)) for planar in kept]
 
 
 def column_score(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> float:

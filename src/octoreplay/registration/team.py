@@ -47,24 +47,27 @@ class TeamAlignment:
 def align_team(
     maps: Sequence[OwnMap],
     *,
+    dof: int = 4,
     guesses: Mapping[tuple[int, int], Sequence[Float64Array]] | None = None,
     limits: AcceptLimits | None = None,
     names: Sequence[str] | None = None,
     run: Run = map,
 ) -> TeamAlignment:
-    """Return the frames of robots whose vertical axes agree, from their maps in their own frames.
+    """Return the frames of robots from their maps in their own frames.
 
-    ``guesses`` are further candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are
-    the robots' names in refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the
-    result does not depend on it.
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``guesses`` are further
+    candidates for T_first_second (4, 4) of pairs (first, second), first < second. ``names`` are the robots' names in
+    refusals (default: their numbers from 1). ``run`` aligns the pairs, one call for each; the result does not depend on
+    it.
     """
     limits = limits or AcceptLimits()
     known = guesses or {}
 
     def align(pair: tuple[int, int]) -> PairAlignment:
-        return align_pair(maps, *pair, guesses=known.get(pair, ()), limits=limits)
+        return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
-    return join_pairs(maps, tuple(run(align, combinations(range(len(maps)), 2))), limits, names)
+    judged = tuple(run(align, combinations(range(len(maps)), 2)))
+    return join_pairs(maps, judged, limits, names, is_upright=dof == 4)
 
 
 def join_pairs(
@@ -72,6 +75,8 @@ def join_pairs(
     pairs: Sequence[PairAlignment],
     limits: AcceptLimits,
     names: Sequence[str] | None = None,
+    *,
+    is_upright: bool = True,
 ) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
 
@@ -95,7 +100,7 @@ def join_pairs(
             # The frame of j's component in that of i's.
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
-            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits)
+            worst = worst_contradiction(maps, poses, members[new], members[old], T, limits, is_upright=is_upright)
             if worst is not None:
                 first, second = (names[index] for index in worst[:2])
                 refusal = f"{first} and {second} would contradict each other (q_c {worst[2]:.3f})"
@@ -132,17 +137,19 @@ def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
 def worst_contradiction(
     maps: Sequence[OwnMap], poses: Sequence[Float64Array], ones: Sequence[int], others: Sequence[int], T: Float64Array,
     limits: AcceptLimits,
+    *, is_upright: bool = True,
 ) -> tuple[int, int, float] | None:  # fmt: skip
     """Return the two robots (first < second) of two groups that contradict each other most, with their share q_c.
 
     ``poses`` (4, 4) are those of each robot's map in its group's frame; ``T`` (4, 4) maps the frame of ``others`` to
-    that of ``ones``. Returns None where no two maps contradict each other clearly.
+    that of ``ones``. ``is_upright``: the vertical axis of each map is known. Returns None where no two maps contradict
+    each other clearly.
     """
     found: list[tuple[int, int, float]] = []
     for i in ones:
         for j in others:
             pose = inverse(poses[i]) @ T @ poses[j]
-            obstacles = verify(maps[i], maps[j], pose).obstacles
+            obstacles = verify(maps[i], maps[j], pose, is_upright=is_upright).obstacles
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
                 found.append((min(i, j), max(i, j), obstacles.share_contra))
     return max(found, key=lambda entry: entry[2], default=None)

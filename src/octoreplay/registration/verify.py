@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoreplay.records import Float64Array
-from octoreplay.registration.own_map import FREE, OccupiedCells, OwnMap, class_bits
+from octoreplay.registration.cells import FREE, OccupiedCells, class_bits
+from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.search import column_score
 from octoreplay.transforms import inverse
 
@@ -31,6 +32,9 @@ class CellCounts:
     same: int
     other: int
     contra: int
+
+    def __add__(self, other: CellCounts) -> CellCounts:
+        return CellCounts(self.same + other.same, self.other + other.other, self.contra + other.contra)
 
     @property
     def total(self) -> int:
@@ -59,15 +63,20 @@ class Verification:
     Attributes
     ----------
     obstacles, ground : CellCounts
-        Counts of the obstacles' and of the ground's cells, both maps together.
+        Counts of the obstacles' and of the ground's cells, both maps together. Without a vertical axis all occupied
+        cells are obstacles.
+    least_same : float
+        Share of the obstacles that are the same, of the map where it is less.
     column_score : float
-        Score of the pose over the maps' columns (``search.column_score``), mean of both directions.
+        Score of the pose over the maps' columns (``search.column_score``), mean of both directions; 0 without a
+        vertical axis.
     overlap : float
         Obstacle cells that count, as a share of the map where it is less.
     """
 
     obstacles: CellCounts
     ground: CellCounts
+    least_same: float
     column_score: float
     overlap: float
 
@@ -78,25 +87,34 @@ class Verification:
         return self.column_score + cells
 
 
-def verify(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> Verification:
-    """Return the agreement of two maps, where ``T_first_second`` (4, 4) maps the second frame to the first."""
+def verify(first: OwnMap, second: OwnMap, T_first_second: Float64Array, *, is_upright: bool = True) -> Verification:
+    """Return the agreement of two maps, where ``T_first_second`` (4, 4) maps the second frame to the first.
+
+    ``is_upright``: the vertical axis of each map is known.
+    """
     back = inverse(T_first_second)
-    obstacles = np.zeros(3, np.int64)
-    ground = np.zeros(3, np.int64)
-    shares = []
-    for cells, T, other in ((second, T_first_second, first), (first, back, second)):
-        counts = _counts(cells.obstacles, T, other)
-        obstacles += counts
-        ground += _counts(cells.ground, T, other)
-        shares.append((int(counts.sum()), len(cells.obstacles)))
-    obstacle_counts, ground_counts = CellCounts(*obstacles.tolist()), CellCounts(*ground.tolist())
-    columns = (column_score(first, second, T_first_second) + column_score(second, first, back)) / 2
-    return Verification(obstacle_counts, ground_counts, columns, min(n / max(size, 1) for n, size in shares))
+    obstacles, ground = [], []
+    for own, T, other in ((first, back, second), (second, T_first_second, first)):
+        obstacles.append(_counts(own.obstacles if is_upright else own.occupied, T, other))
+        if is_upright:
+            ground.append(_counts(own.ground, T, other))
+    columns = 0.0
+    if is_upright:
+        columns = (column_score(first, second, T_first_second) + column_score(second, first, back)) / 2
+    sizes = (len(own.obstacles if is_upright else own.occupied) for own in (first, second))
+    return Verification(
+        obstacles=sum(obstacles, CellCounts(0, 0, 0)),
+        ground=sum(ground, CellCounts(0, 0, 0)),
+        least_same=min(counts.share_same for counts in obstacles),
+        column_score=columns,
+        overlap=min(counts.total / max(size, 1) for counts, size in zip(obstacles, sizes, strict=True)),
+    )
 
 
-def _counts(cells: OccupiedCells, T: Float64Array, other: OwnMap) -> np.typing.NDArray[np.int64]:
-    """Numbers (same, other, contra) of cells against another map, where T maps to the other map's frame."""
+def _counts(cells: OccupiedCells, T: Float64Array, other: OwnMap) -> CellCounts:
+    """Counts of cells against another map, where T maps to the other map's frame."""
     states, nearby = other.at(cells.points @ T[:3, :3].T + T[:3, 3])
     is_same = (nearby & class_bits(cells.class_ids)) != 0
     is_near = nearby != 0
-    return np.array([is_same.sum(), (is_near & ~is_same).sum(), (~is_near & (states == FREE)).sum()])
+    counts = (is_same, is_near & ~is_same, ~is_near & (states == FREE))
+    return CellCounts(*(int(np.count_nonzero(count)) for count in counts))
