@@ -300,6 +300,16 @@ class Result:
         return sum(place.frame_id == state.frame_id for place in places)
 
     @cached_property
+    def places(self) -> dict[str, FramePlace]:
+        """Frame of each robot's last map with the place of the robot's own map frame in it, by robot_id."""
+        if self._places:
+            return {place.robot_id: place for place in self._places[max(self._places)]}
+        return {
+            robot.robot_id: FramePlace(robot.robot_id, TEAM, robot.T_team_map_or_identity)
+            for robot in self.config.robots
+        }
+
+    @cached_property
     def _places(self) -> dict[int, tuple[FramePlace, ...]]:
         """Frames of all robots by tick."""
         return self._reader.places()

@@ -68,7 +68,7 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
 @click.option("--align", type=click.Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
               help="find the robots' frames first, as 'octoreplay align' does, and leave other robots out (before, also"
-              " without a value); or during the run, from the evidence that robots send each other (on-air)")  # fmt: skip
+              " without a value); or during the run, from the evidence that robots send (on-air)")  # fmt: skip
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(

@@ -23,8 +23,8 @@ class AlignmentConfig:
         5.0, "align on-air: period in which a robot sends its evidence to robots in other frames [s]", above=0.0
     )
     align_growth: float = parameter(
-        0.1,
-        "align on-air: share by which the evidence of a robot grows until an alignment that failed is tried again",
+        0.25,
+        "align on-air: share by which one of two maps grows before their alignment is tried again",
         minimum=0.0,
     )
 

@@ -64,8 +64,8 @@ class Joining:
         self._exchanges = [Exchange(config.packet, packet_codec) for _ in range(num_robots)]
         self._public: dict[int, PublicMap] = {}
         self._found: list[PairAlignment] = []
-        # Cells of both maps at the last attempt of a pair.
-        self._tried: dict[tuple[int, int], tuple[int, int]] = {}
+        # Version of the received evidence and cells of both maps at the last attempt of a pair.
+        self._tried: dict[tuple[int, int], tuple[int, int, int]] = {}
         self._every = max(1, round(config.alignment.align_every / config.network.publish_period))
         self._last_chance: int | None = None
 
@@ -92,15 +92,12 @@ class Joining:
     # --- search and joins ---------------------------------------------------------------------------------------------
 
     def search(self, robots: Sequence[Robot], *, is_last: bool) -> None:
-        """Align the pairs of robots in different frames of which evidence has arrived and grown since the last attempt.
+        """Align the pairs of robots in different frames of which evidence arrived and a map grew since the last attempt.
 
         Accepted poses take effect at the next ``join``. ``is_last``: the logs have ended, and any growth counts.
         """
-        attempts = [
-            attempt
-            for pair in itertools.combinations(range(len(robots)), 2)
-            if (attempt := self._attempt(robots, *pair, growth=0.0 if is_last else self._config.alignment.align_growth))
-        ]
+        pairs = itertools.combinations(range(len(robots)), 2)
+        attempts = [attempt for pair in pairs if (attempt := self._attempt(robots, *pair, is_last=is_last))]
         maps = self._maps([octree for attempt in attempts for octree in attempt.evidence])
 
         def align(attempt: _Attempt) -> PairAlignment:
@@ -163,7 +160,7 @@ class Joining:
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 
-    def _attempt(self, robots: Sequence[Robot], first: int, second: int, *, growth: float) -> _Attempt | None:
+    def _attempt(self, robots: Sequence[Robot], first: int, second: int, *, is_last: bool) -> _Attempt | None:
         """The alignment of a pair that is due, by the first robot that holds evidence in the other one's frame."""
         if second in self.frames.members(first):
             return None
@@ -174,10 +171,12 @@ class Joining:
                 continue
             evidence = (own[0], held.octree) if aligner == first else (held.octree, own[1])
             sizes = evidence[0].num_cells, evidence[1].num_cells
-            tried = self._tried.get((first, second), (0, 0))
-            if not any(size > (1.0 + growth) * last for size, last in zip(sizes, tried, strict=True)):
+            version, *tried = self._tried.get((first, second), (-1, 0, 0))
+            growth = 0.0 if is_last else self._config.alignment.align_growth
+            has_grown = any(size > (1.0 + growth) * last for size, last in zip(sizes, tried, strict=True))
+            if not has_grown or (held.version == version and not is_last):
                 return None
-            self._tried[first, second] = sizes
+            self._tried[first, second] = (held.version, *sizes)
             return _Attempt(first, second, evidence, aligner)
         return None
 
