@@ -92,7 +92,7 @@ class Joining:
     # --- search and joins ---------------------------------------------------------------------------------------------
 
     def search(self, robots: Sequence[Robot], *, is_last: bool) -> None:
-        """Align the pairs of robots in different frames of which evidence arrived and a map grew since the last attempt.
+        """Align the pairs of robots in different frames whose evidence arrived and grew since the last attempt.
 
         Accepted poses take effect at the next ``join``. ``is_last``: the logs have ended, and any growth counts.
         """
