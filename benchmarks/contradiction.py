@@ -14,7 +14,8 @@ import itertools
 import math
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,15 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.io.datasets.rgbd_folder import import_rgbd
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
+from octoreplay.mapping.contradiction import (
+    CLEAR_LIMIT,
+    LABEL_LIMIT,
+    EvidenceComparer,
+    state_limits,
+)
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
-from octoreplay.records import Float64Array, Frame, PairMetrics
+from octoreplay.records import MIN_COMPARED_CELLS, PAIR_SHARES, Float64Array, Frame, PairMetrics
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 SENSOR = SensorConfig()
@@ -39,7 +45,9 @@ WRONG = (*((shift, 0.0) for shift in SHIFTS), *((0.0, yaw) for yaw in YAWS), (3.
 """Wrong frames: shift [m] and yaw [degrees]."""
 NOISES = ((0.0, 0.0), (0.2, 0.0), (0.4, 0.0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2))
 """Share of wrong labels and standard deviation of the poses [m] of the villages' second runs."""
-NUM_DISPLACED = 2
+LIMITS = {"clear_contradiction": CLEAR_LIMIT, "label_contradiction": LABEL_LIMIT}
+"""Limits of the warnings by share."""
+NUM_DISPLACED = 1
 """Number of robots of each team that are displaced, one after the other."""
 COLUMNS = (
     "scene", "kind", "resolution", "label_noise", "pose_noise", "seed", "displaced", "shift", "yaw",
@@ -147,14 +155,67 @@ def measure(scene: Scene, resolution: float) -> Iterator[dict[str, Any]]:
             yield from compare(maps, robot_id, shift, yaw)
 
 
+def summary(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return Markdown: for each frame and resolution the teams' numbers, and how many teams would be warned of.
+
+    A team's number is its largest share over the pairs with enough cells. Numbers are median (least - largest) over the
+    teams in per cent; '-' where no team has one. The interval is Wilson's, 95 %.
+    """
+    teams: dict[tuple[Any, ...], dict[str, float]] = defaultdict(dict)
+    for row in rows:
+        noise = f", labels {row['label_noise']}, poses {row['pose_noise']}" if row["kind"] == "village" else ""
+        frame = f"{row['shift']} m, {row['yaw']} degrees" if row["displaced"] else f"right{noise}"
+        team = teams[row["kind"], float(row["resolution"]), bool(row["displaced"]), frame, row["scene"]]
+        for name, num_cells in PAIR_SHARES.items():
+            if int(row[num_cells]) >= MIN_COMPARED_CELLS:
+                team[name] = max(team.get(name, 0.0), float(row[name]))
+    groups: dict[tuple[Any, ...], list[dict[str, float]]] = defaultdict(list)
+    for key, team in teams.items():
+        groups[key[:-1]].append(team)
+    heads = ("scenes", "cells [m]", "frame", "teams", *PAIR_SHARES, "warned", "95 % interval")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for (kind, resolution, _, frame), of_teams in sorted(groups.items()):
+        warned = sum(any(team.get(name, 0.0) > limit for name, limit in LIMITS.items()) for team in of_teams)
+        shares = (_spread([team[name] for team in of_teams if name in team]) for name in PAIR_SHARES)
+        low, high = _wilson(warned, len(of_teams))
+        cells = (kind, f"{resolution:g}", frame, len(of_teams), *shares, warned, f"{low:.2f} - {high:.2f}")
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Median, least and largest in per cent."""
+    if not values:
+        return "-"
+    return f"{100 * np.median(values):.1f} ({100 * min(values):.1f} - {100 * max(values):.1f})"
+
+
+def _wilson(count: int, total: int) -> tuple[float, float]:
+    """95 % interval of a share (Wilson 1927)."""
+    z, share = 1.96, count / total
+    centre, half = share + z * z / (2 * total), z * math.sqrt(share * (1 - share) / total + z * z / (4 * total**2))
+    return (centre - half) / (1 + z * z / total), (centre + half) / (1 + z * z / total)
+
+
 def main() -> None:
-    """Measure all scenes and write one row for each pair."""
+    """Measure all scenes and write one row for each pair, or sum up such rows."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--csv", type=Path, required=True, help="file to write")
+    parser.add_argument("--csv", type=Path, help="file to write")
+    parser.add_argument(
+        "--summary", type=Path, nargs="+", metavar="FILE.csv", help="print the summary of files instead"
+    )
     parser.add_argument("--seeds", type=int, nargs="*", default=list(range(101, 109)), help="seeds of the villages")
     parser.add_argument("--resolutions", type=float, nargs="+", default=[0.2, 0.3, 0.5])
     parser.add_argument("--folder", type=Path, help="folder with kapture_7scenes_stairs and tsdf_7scenes")
     options = parser.parse_args()
+    if options.summary:
+        rows = [
+            row for path in options.summary for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        ]
+        sys.stdout.write(summary(rows))
+        return
+    if options.csv is None:
+        parser.error("give --csv or --summary")
     with tempfile.TemporaryDirectory() as work, options.csv.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

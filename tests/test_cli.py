@@ -14,7 +14,7 @@ from support.command_line import octoreplay, octoreplay_process
 from support.fixture_paths import PAIR, PAIR_TEAM
 
 COMMANDS = (
-    "run", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
+    "run", "align", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
     "evaluate", "check", "compare", "sweep", "experiment",
 )  # fmt: skip
 

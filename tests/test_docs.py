@@ -15,7 +15,7 @@ from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
-from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
+from octoreplay.records import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.report.experiment_tables import answer_tables
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 
@@ -27,20 +27,21 @@ def named(page: str) -> set[str]:
     return set(re.findall(r"`([^`\n]+)`", (DOCS / page).read_text(encoding="utf-8")))
 
 
-@pytest.mark.parametrize("record", [TickMetrics, RobotMetrics, LinkMetrics])
+@pytest.mark.parametrize("record", [TickMetrics, RobotMetrics, LinkMetrics, PairMetrics])
 def test_every_metric_is_explained(record: type) -> None:
     fields = {item.name for item in dataclasses.fields(record)}
-    assert fields - {"robots", "links", "robot_id", "sender", "receiver"} <= named("metrics.md")
+    assert fields - {"robots", "links", "pairs", "robot_id", "sender", "receiver"} <= named("metrics.md")
 
 
 def test_every_score_of_a_map_is_explained() -> None:
     fields = {item.name for record in (MapScores, TruthScores, EvaluatedTick) for item in dataclasses.fields(record)}
+    fields |= set(PAIR_SHARES)
     assert fields - {"robot_id", "is_active", "truth", "tick", "seconds", "maps"} <= named("evaluation.md")
 
 
 def test_every_message_and_field_of_the_result_is_explained() -> None:
     words = named("result-format.md")
-    for name in ("MapState", "Packet", "TickMetrics"):
+    for name in ("MapState", "Packet", "TickMetrics", "Contradiction"):
         assert f"octoreplay_msgs/msg/{name}" in OCTOREPLAY_MSGS
         assert f"octoreplay_msgs/msg/{name}" in words
     assert set(VIEW_DTYPE.names or ()) <= words
@@ -63,7 +64,7 @@ def test_every_command_and_option_is_explained() -> None:
         parts = command.commands if isinstance(command, click.Group) else {}
         assert all(f"octoreplay {name} {part}" in section for part in parts)
         for parameter in (*command.params, *(option for part in parts.values() for option in part.params)):
-            if parameter.name not in ("output", "result", "folder", "logs", "teams", *PARAMETERS):
+            if parameter.name not in ("output", "inputs", "result", "folder", "logs", "teams", *PARAMETERS):
                 assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
     from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
+    from octoreplay.replay.alignment import Alignment, RobotFrame, align_logs, aligned_config
     from octoreplay.replay.run import Progress, replay_team
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
 
 _MODULES = {
+    "Alignment": "replay.alignment",
     "CheckRow": "evaluate.checks",
     "ClassTable": "records",
     "ConfigError": "errors",
@@ -43,6 +45,7 @@ _MODULES = {
     "Result": "result",
     "ResultComparison": "evaluate.comparison",
     "RobotConfig": "config.robot",
+    "RobotFrame": "replay.alignment",
     "RunConfig": "config.run",
     "RunSummary": "records",
     "SemanticClass": "records",
@@ -51,6 +54,8 @@ _MODULES = {
     "Sweep": "study.sweep",
     "SweepProgress": "study.sweep",
     "TickMetrics": "records",
+    "align_logs": "replay.alignment",
+    "aligned_config": "replay.alignment",
     "check_result": "evaluate.checks",
     "compare_results": "evaluate.comparison",
     "discover": "io.robots.discover",
@@ -68,11 +73,12 @@ _MODULES = {
 """Module of each public name."""
 
 __all__ = [
-    "CheckRow", "ClassTable", "ConfigError", "Evaluation", "InputError", "LeafTable", "OctoreplayError", "OutputError",
-    "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RunConfig", "RunSummary",
-    "SemanticClass", "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "TickMetrics", "__version__",
-    "check_result", "compare_results", "discover", "evaluate_result", "export_ply", "load_frames_file",
-    "load_team_file", "open_log", "open_result", "replay_team", "resolve", "run_sweep", "simulate_team",
+    "Alignment", "CheckRow", "ClassTable", "ConfigError", "Evaluation", "InputError", "LeafTable", "OctoreplayError",
+    "OutputError", "PacketError", "PointQuery", "Progress", "Result", "ResultComparison", "RobotConfig", "RobotFrame",
+    "RunConfig", "RunSummary", "SemanticClass", "SimulationConfig", "StoredMap", "Sweep", "SweepProgress",
+    "TickMetrics", "__version__", "align_logs", "aligned_config", "check_result", "compare_results", "discover",
+    "evaluate_result", "export_ply", "load_frames_file", "load_team_file", "open_log", "open_result", "replay_team",
+    "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 

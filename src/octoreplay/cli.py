@@ -15,7 +15,17 @@ from collections.abc import Sequence
 import click
 
 from octoreplay._version import __version__
-from octoreplay.commands import aligning, evaluation, experiments, logs, results, running, studies, verdicts
+from octoreplay.commands import (
+    aligning,
+    demonstration,
+    evaluation,
+    experiments,
+    logs,
+    results,
+    running,
+    studies,
+    verdicts,
+)
 from octoreplay.commands.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.errors import ConfigError, OctoreplayError
 
@@ -31,7 +41,7 @@ def cli() -> None:
 
 
 for _command in (
-    running.run, running.simulate, running.demo, logs.info, logs.init, logs.import_rgbd, logs.import_clouds,
+    running.run, running.simulate, demonstration.demo, logs.info, logs.init, logs.import_rgbd, logs.import_clouds,
     aligning.align,
     results.metrics, results.export, results.query, evaluation.evaluate, verdicts.check, verdicts.compare,
     studies.sweep, experiments.experiment,

@@ -272,8 +272,8 @@ class PairMetrics:
     contradiction : float
         Share of the occupied cells that the other robot calls free; NaN without occupied cells.
     clear_contradiction : float
-        Share of the occupied cells that the other robot calls free and around which it has no occupied cell, among the
-        26 neighbours; NaN without occupied cells.
+        Share of the occupied cells that the other robot calls firmly free, and has no occupied cell beside (26
+        neighbours); NaN without occupied cells.
     contradiction_of_first, contradiction_of_second : float
         The same over the cells that this robot calls occupied and the other one occupied or free.
     both_occupied_cells : int

@@ -18,6 +18,7 @@ FULL = RobotConfig(
     camera_info_topic="/info", pose_file=Path("/logs/a.txt"), pose_times=Path("/elsewhere/times.txt"),
     map_frame="map", sensor_frame="camera", intrinsics=(1.0, 2.0, 3.0, 4.0), rectified=False, depth_unit=0.01,
     clock_offset=-1.5, T_team_map=(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0),
+    T_team_map_sigma=(0.1, 0.1, 0.2, 0.01, 0.01, 0.02), T_team_map_from="aligned with c, L 812",
     T_body_sensor=(0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0), body_frame="base",
     body_box=(-1.0, -1.0, 0.0, 1.0, 1.0, 0.5), publish_period=2.0, publish_phase=1.0,
 )  # fmt: skip
@@ -60,6 +61,12 @@ def test_the_robots_above_set_every_field():
         ({"T_team_map": (0.0,) * 7}, "T_team_map's quaternion must have length 1"),
         ({"T_team_map": (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}, "T_team_map must be finite, not "),
         ({"T_body_sensor": (0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 1.0)}, "T_body_sensor must be finite, not "),
+        ({"T_team_map_sigma": (0.1,) * 6}, "T_team_map_sigma goes with T_team_map"),
+        ({"T_team_map_from": "aligned with c, L 812"}, "T_team_map_from goes with T_team_map"),
+        (
+            {"T_team_map": (0.0,) * 6 + (1.0,), "T_team_map_sigma": (-0.1, 0.0, 0.0, 0.0, 0.0, 0.0)},
+            "T_team_map_sigma expects 6 standard deviations, none below 0",
+        ),
         ({"intrinsics": (math.nan, 1.0, 1.0, 1.0)}, "intrinsics must be finite, not "),
         ({"intrinsics": (1.0, 1.0, math.inf, 1.0)}, "intrinsics must be finite, not "),
         ({"depth_unit": math.nan}, "depth_unit must be finite, not "),

@@ -18,7 +18,7 @@ from octoreplay.evaluate.checks import LIMITS, CheckRow, check_result, ticks_to_
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
-from octoreplay.records import CENTRAL, CONVERGED, FrameCounts, RobotMetrics, RunSummary, TickMetrics
+from octoreplay.records import CENTRAL, CONVERGED, FrameCounts, PairMetrics, RobotMetrics, RunSummary, TickMetrics
 from support.result_factory import CLASSES, summary, team, tick_metrics, write_until
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -112,6 +112,9 @@ WORST = {
     "max_ticks_to_consensus": (1.0, None, None, None),
     "min_agreement": (0.9, "alpha", None, 5.0),
     "min_agreement_occupied": (LAST.robots[1].agreement_occupied, "beta", None, 5.0),
+    "max_contradiction": (0.2, None, "alpha and beta", 5.0),
+    "max_clear_contradiction": (0.05, None, "alpha and beta", 5.0),
+    "max_label_contradiction": (0.125, None, "alpha and beta", 5.0),
     "max_entropy_bits": (LAST.robots[1].entropy_bits, "beta", None, 5.0),
     "max_num_leaves": (105.0, "alpha", None, 5.0),
     "min_num_leaves": (105.0, "alpha", None, 5.0),
@@ -125,7 +128,7 @@ WORST = {
     "max_calibration_error": (0.375, "beta", None, 5.0),
     "max_team_calibration_error": (0.0625, "beta", None, 5.0),
 }
-"""Worst value of every limit in ``ticks``, with its robot, link and time."""
+"""Worst value of every limit in ``ticks``, with its robot, its link or pair, and its time."""
 
 
 def test_worst_values_are_given_for_every_limit() -> None:
@@ -138,7 +141,9 @@ def test_a_limit_holds_at_the_worst_value_and_on_one_side_of_it(result: Path, na
     value, robot, link, seconds = WORST[name]
     good, bad = (math.inf, -math.inf) if name.startswith("max") else (-math.inf, math.inf)
     for limit, passed in ((value, True), (math.nextafter(value, good), True), (math.nextafter(value, bad), False)):
-        assert only(result, **{name: limit}) == CheckRow(name, limit, value, robot, link, seconds, passed)
+        pair = link if name.endswith("contradiction") else None
+        expected = CheckRow(name, limit, value, robot, None if pair else link, seconds, passed, pair=pair)
+        assert only(result, **{name: limit}) == expected
 
 
 def test_each_of_two_bounds_is_checked_with_its_worst_robot(tmp_path: Path) -> None:
@@ -167,6 +172,22 @@ def test_nan_fails_and_is_the_worst_value(tmp_path: Path, name: str) -> None:
     row = only(stored(tmp_path, metrics), **{name: 1.0})
     assert (row.passed, row.robot, row.detail) == (False, "beta", "no value to measure")
     assert math.isnan(row.measured)
+
+
+def test_the_contradiction_of_the_worst_pair_with_enough_cells_is_checked(tmp_path: Path) -> None:
+    (pair,) = LAST.pairs
+    small = dataclasses.replace(pair, first="small", occupied_cells=499, contradiction=0.9)
+    worst = dataclasses.replace(pair, first="worst", occupied_cells=500, contradiction=0.7)
+    path = stored(tmp_path, [*ticks()[:-1], dataclasses.replace(ticks()[-1], pairs=(pair, small, worst))])
+    row = only(path, max_contradiction=0.5)
+    assert (row.passed, row.measured, row.pair) == (False, 0.7, "worst and beta")
+
+
+def test_the_contradiction_of_robots_without_common_cells_cannot_be_checked(tmp_path: Path) -> None:
+    path = stored(tmp_path, [dataclasses.replace(tick, pairs=()) for tick in ticks()])
+    row = only(path, max_label_contradiction=1.0)
+    assert (row.passed, row.pair) == (False, None)
+    assert row.detail.startswith("no two robots share 500 occupied cells")
 
 
 def test_limits_without_packets_or_frames_fail(tmp_path: Path) -> None:
@@ -289,14 +310,15 @@ def test_rows_as_json(tmp_path: Path) -> None:
                         {"max_ticks_to_consensus": 3, "min_num_leaves": 1})  # fmt: skip
     assert json.loads(json_text(rows)) == [
         {"name": "max_ticks_to_consensus", "limit": 3.0, "measured": None, "robot": None, "link": None,
-         "seconds": None, "passed": False, "detail": "the labels did not reach consensus"},
+         "seconds": None, "passed": False, "detail": "the labels did not reach consensus", "pair": None},
         {"name": "min_num_leaves", "limit": 1.0, "measured": 102.0, "robot": "alpha", "link": None, "seconds": 2.0,
-         "passed": True, "detail": ""},
+         "passed": True, "detail": "", "pair": None},
     ]  # fmt: skip
 
 
 def test_quantities_have_the_names_of_the_metrics() -> None:
-    fields = {item.name for record in (TickMetrics, RobotMetrics, TruthScores) for item in dataclasses.fields(record)}
+    records = (TickMetrics, RobotMetrics, PairMetrics, TruthScores)
+    fields = {item.name for record in records for item in dataclasses.fields(record)}
     counted = {"ticks_to_consensus", "sent_bytes_per_second", "delivered_share", "frames_lost_share"}
     assert {quantity.name for quantity in checks.QUANTITIES} <= fields | counted
 

@@ -19,8 +19,9 @@ from reference.contradiction import cell_states, pair_metrics
 from support.long_suite import examples
 from support.octree_factory import cube, octree_of
 
-OCCUPIED_FROM, FREE_TO = state_limits(SensorConfig())
+LIMITS = state_limits(SensorConfig())
 GROUND, TREE, FREE, UNDECIDED = [2.0, -1.0], [-0.6, 1.0], [-0.3, -0.3], [0.1, -0.3]
+FIRMLY_FREE = [-1.5, -1.6]
 
 
 def compare(*evidence, num_classes=2, threads=None):
@@ -47,13 +48,20 @@ def test_a_contradiction_is_clear_without_an_occupied_cell_beside_it(axis, dista
     for start in range(-4, 5):
         hit, beside = [0, 0, 0], [0, 0, 0]
         hit[axis], beside[axis] = start, start + distance
-        (pair,) = compare({tuple(hit): GROUND}, {tuple(hit): FREE, tuple(beside): GROUND})
+        (pair,) = compare({tuple(hit): GROUND}, {tuple(hit): FIRMLY_FREE, tuple(beside): GROUND})
+        assert (pair.contradiction, pair.clear_contradiction) == (1.0, float(is_clear))
+
+
+@pytest.mark.parametrize(("value", "is_clear"), [(-1.5, True), (-1.4, False), (-0.3, False)])
+def test_a_contradiction_is_clear_where_the_cell_was_freed_several_times(value, is_clear):
+    for edge in (1, 8):
+        (pair,) = compare(cube((0, 0, 0), edge, GROUND), cube((0, 0, 0), edge, [np.float32(value)] * 2))
         assert (pair.contradiction, pair.clear_contradiction) == (1.0, float(is_clear))
 
 
 def test_cells_at_the_end_of_the_key_space_have_fewer_neighbours():
     low, high = -(1 << 18), (1 << 18) - 1
-    (pair,) = compare({(low, low, low): GROUND}, {(low, low, low): FREE, (high, low, low): GROUND})
+    (pair,) = compare({(low, low, low): GROUND}, {(low, low, low): FIRMLY_FREE, (high, low, low): GROUND})
     assert pair.clear_contradiction == 1.0
 
 
@@ -81,8 +89,9 @@ def test_one_hit_occupies_and_one_miss_frees_a_cell():
 
 
 def test_limits_stay_within_the_clamping():
-    assert state_limits(SensorConfig(hit=1.0, miss=-0.25)) == (0.5, -0.25)
-    assert state_limits(SensorConfig(hit=4.0, miss=-2.0, clamp_min=-1.5, clamp_max=1.25)) == (1.25, -1.5)
+    assert state_limits(SensorConfig(hit=1.0, miss=-0.25)) == (0.5, -0.25, -1.25)
+    assert state_limits(SensorConfig(hit=1.0, miss=-0.25, clamp_min=-1.0)) == (0.5, -0.25, -1.0)
+    assert state_limits(SensorConfig(hit=4.0, miss=-2.0, clamp_min=-1.5, clamp_max=1.25)) == (1.25, -1.5, -1.5)
 
 
 def test_the_teams_number_counts_pairs_with_enough_cells():
@@ -102,7 +111,7 @@ cells_of_robots = st.integers(1, 12).flatmap(
             st.dictionaries(
                 st.tuples(st.integers(-3, 5), st.integers(-1, 4), st.integers(-2, 1)),
                 st.lists(
-                    st.sampled_from([-5.0, -0.6, float(np.float32(-0.3)), -0.2, 0.0, 0.4, 0.5, 1.0, 5.0]),
+                    st.sampled_from([-5.0, -1.5, -0.6, float(np.float32(-0.3)), -0.2, 0.0, 0.4, 0.5, 1.0, 5.0]),
                     min_size=num_classes, max_size=num_classes,
                 ),
                 max_size=40,
@@ -137,7 +146,7 @@ def same(found, expected):
 def test_random_evidence_as_the_twin(team):
     num_classes, evidence = team
     values, known, keys = dense(evidence, num_classes)
-    states = cell_states(values, known, OCCUPIED_FROM, FREE_TO)
+    states = cell_states(values, known, *LIMITS)
     expected = pair_metrics([f"robot_{index}" for index in range(len(evidence))], states, keys)
     assert same(compare(*evidence, num_classes=num_classes), expected)
 
@@ -147,7 +156,7 @@ def test_random_evidence_as_the_twin(team):
 def test_updates_as_from_scratch(team, random):
     num_classes, evidence = team
     ids = [str(index) for index in range(len(evidence))]
-    comparer = EvidenceComparer(ids, num_classes, (OCCUPIED_FROM, FREE_TO))
+    comparer = EvidenceComparer(ids, num_classes, LIMITS)
     octrees = [SemanticOctree(0.25, num_classes) for _ in evidence]
     seen = [{} for _ in evidence]
     with ThreadPoolExecutor(2) as threads:
@@ -163,11 +172,11 @@ def test_updates_as_from_scratch(team, random):
                 ], bool)  # fmt: skip
                 octree.overwrite(source, np.flatnonzero(is_new | (random.random() < 0.5)), tick)
             found = comparer.compare(octrees, tick, threads)
-            assert same(found, EvidenceComparer(ids, num_classes, (OCCUPIED_FROM, FREE_TO)).compare(octrees, 0))
+            assert same(found, EvidenceComparer(ids, num_classes, LIMITS).compare(octrees, 0))
 
 
 def test_forgetting_compares_all_bricks_again():
-    ids, limits = ("a", "b"), (OCCUPIED_FROM, FREE_TO)
+    ids, limits = ("a", "b"), LIMITS
     ground, free = octree_of(cube((0, 0, 0), 4, GROUND)), octree_of(cube((0, 0, 0), 4, FREE))
     comparer = EvidenceComparer(ids, 2, limits)
     assert len(comparer.compare([ground, free], 1)) == 1

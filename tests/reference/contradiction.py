@@ -14,15 +14,18 @@ import numpy as np
 
 from octoreplay.records import BoolArray, Float32Array, Int64Array, PairMetrics
 
-UNKNOWN, FREE, UNDECIDED = -3, -2, -1
+UNKNOWN, FIRM, FREE, UNDECIDED = -4, -3, -2, -1
 """States of cells that are not occupied; an occupied cell has its class, counted from 0, as its state."""
 
 
-def cell_states(evidence: Float32Array, known: BoolArray, occupied_from: float, free_to: float) -> Int64Array:
+def cell_states(
+    evidence: Float32Array, known: BoolArray, occupied_from: float, free_to: float, firm_to: float
+) -> Int64Array:
     """Return the states (N, M) of the cells."""
     states = np.full(known.shape, UNDECIDED)
     best = evidence.max(axis=2)
     states[best <= free_to] = FREE
+    states[best <= firm_to] = FIRM
     # argmax gives the lowest class at a tie.
     states = np.where(best >= occupied_from, evidence.argmax(axis=2), states)
     states[~known] = UNKNOWN
@@ -37,6 +40,7 @@ def near_occupied(states: Int64Array, keys: Int64Array) -> BoolArray:
 
 def pair_metrics(robot_ids: Sequence[str], states: Int64Array, keys: Int64Array) -> tuple[PairMetrics, ...]:
     """Return the metrics of the pairs of robots with known cells in common."""
+    is_free = (states == FREE) | (states == FIRM)
     near = near_occupied(states, keys)
     pairs = []
     for i, j in itertools.combinations(range(len(states)), 2):
@@ -44,9 +48,9 @@ def pair_metrics(robot_ids: Sequence[str], states: Int64Array, keys: Int64Array)
         overlap = int(((a != UNKNOWN) & (b != UNKNOWN)).sum())
         if not overlap:
             continue
-        first_free = int(((a >= 0) & (b == FREE)).sum())
-        second_free = int(((b >= 0) & (a == FREE)).sum())
-        clear = int(((a >= 0) & (b == FREE) & ~near[j]).sum() + ((b >= 0) & (a == FREE) & ~near[i]).sum())
+        first_free = int(((a >= 0) & is_free[j]).sum())
+        second_free = int(((b >= 0) & is_free[i]).sum())
+        clear = int(((a >= 0) & (b == FIRM) & ~near[j]).sum() + ((b >= 0) & (a == FIRM) & ~near[i]).sum())
         both = int(((a >= 0) & (b >= 0)).sum())
         other_label = int(((a >= 0) & (b >= 0) & (a != b)).sum())
         pairs.append(

@@ -13,7 +13,7 @@ import pytest
 
 from octoreplay.errors import OutputError
 from octoreplay.evaluate.records import SCORES, MapScores, TruthScores
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, PAIR_SHARES
 from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json, write_evaluation
 from support.evaluation_factory import evaluation
 
@@ -36,6 +36,9 @@ def test_csv_has_one_row_per_map_and_three_for_the_team() -> None:
             row = next(places)
             assert (int(row["tick"]), float(row["seconds"])) == (tick.tick, tick.seconds)
             assert float(row["label_disagreement"]) == tick.label_disagreement
+            assert [repr(number(row[name])) for name in PAIR_SHARES] == [
+                repr(getattr(tick, name)) for name in PAIR_SHARES
+            ]
             assert row["robot_id"] == scores.robot_id
             assert row["kind"] == ("central" if scores.robot_id == CENTRAL else "robot")
             assert row["is_active"] == str(int(scores.is_active))

@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import io
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 from PIL import Image
 
 from octoreplay.errors import InputError, OutputError
+from octoreplay.records import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics, TickMetrics
 from octoreplay.report import plots
+from octoreplay.report.contradiction_plots import MAX_COLORED, contradiction_figure
 from support.result_factory import tick_metrics
 
 METRICS = [tick_metrics(tick, settling=tick > 6) for tick in range(1, 9)]
@@ -32,9 +35,18 @@ def test_csv_has_one_row_per_tick_with_exact_numbers() -> None:
 def test_csv_has_every_field_of_a_robot_and_of_a_tick() -> None:
     names = set(rows(plots.metrics_csv(METRICS))[0])
     tick, robot = METRICS[0], METRICS[0].robots[0]
-    of_tick = {item.name for item in dataclasses.fields(tick)} - {"robots", "links"}
+    of_tick = {item.name for item in dataclasses.fields(tick)} - {"robots", "links", "pairs"} | set(PAIR_SHARES)
     of_robot = {f"alpha.{item.name}" for item in dataclasses.fields(robot)} - {"alpha.robot_id"}
-    assert names >= of_tick | of_robot
+    of_pair = {f"alpha&beta.{item.name}" for item in dataclasses.fields(PairMetrics)}
+    assert names >= of_tick | of_robot | of_pair - {"alpha&beta.first", "alpha&beta.second"}
+
+
+def test_csv_has_the_pairs_and_empty_cells_without_them() -> None:
+    none = dataclasses.replace(METRICS[0], pairs=())
+    table = rows(plots.metrics_csv([none, *METRICS[1:]]))
+    assert (table[0]["contradiction"], table[0]["alpha&beta.overlap_cells"]) == ("", "")
+    assert float(table[1]["clear_contradiction"]) == float(table[1]["alpha&beta.clear_contradiction"]) == 0.02
+    assert (table[1]["alpha&beta.occupied_cells"], table[1]["label_contradiction"]) == ("1000", "0.125")
 
 
 def test_ticks_without_a_link_have_empty_columns_for_it() -> None:
@@ -45,11 +57,11 @@ def test_ticks_without_a_link_have_empty_columns_for_it() -> None:
 def test_figures_are_not_blank_and_reproducible(tmp_path: Path) -> None:
     first = plots.write_figures(METRICS, tmp_path / "a" / "b")
     second = plots.write_figures(METRICS, tmp_path / "c")
-    assert [path.name for path in first] == ["disagreement.png", "packet_size.png"]
+    assert [path.name for path in first] == ["disagreement.png", "packet_size.png", "contradiction.png"]
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()
         with Image.open(one) as image:
-            assert image.size == (1050, 540)
+            assert image.size == ((1650, 900) if one.name == "contradiction.png" else (1050, 540))
             assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
 
@@ -65,6 +77,39 @@ def test_figures_have_the_values_of_the_metrics() -> None:
     np.testing.assert_allclose(packets["uniform grid"].get_ydata(), mean)
 
 
+def large_team(num_robots: int) -> list[TickMetrics]:
+    """Ticks of a team in which the pairs of the last robot contradict each other most, and one pair is too small."""
+    ids = [f"robot_{index}" for index in range(num_robots)]
+    robots = tuple(dataclasses.replace(METRICS[0].robots[0], robot_id=name) for name in ids)
+    made = []
+    for tick in METRICS:
+        pairs = tuple(
+            dataclasses.replace(
+                tick.pairs[0], first=a, second=b, contradiction=(0.6 if b == ids[-1] else 0.1) + n / 1e4
+            )
+            for n, (a, b) in enumerate(itertools.combinations(ids, 2))
+        )
+        small = dataclasses.replace(pairs[0], occupied_cells=MIN_COMPARED_CELLS - 1, contradiction=1.0)
+        made.append(dataclasses.replace(tick, robots=robots, pairs=(small, *pairs[1:])))
+    return made
+
+
+@pytest.mark.parametrize("num_robots", [2, 6, 16])
+def test_the_worst_pairs_have_colours_and_the_others_are_grey(num_robots: int) -> None:
+    metrics = METRICS if num_robots == 2 else large_team(num_robots)
+    figure = contradiction_figure(metrics, plots.log_seconds(metrics))
+    lines = figure.axes[0].get_lines()
+    counted = 1 if num_robots == 2 else num_robots * (num_robots - 1) // 2 - 1
+    assert len(lines) == counted
+    named = [line.get_label() for line in lines if "," in line.get_label()]
+    assert len(named) == min(counted, MAX_COLORED)
+    if num_robots > 2:
+        assert all(f", robot_{num_robots - 1}" in label for label in named)
+        assert max(line.get_ydata()[-1] for line in lines) < 100.0
+    (image,) = next(axes for axes in figure.axes if axes.images).images
+    assert image.get_array().shape == (num_robots, num_robots)
+
+
 def test_a_robot_that_did_not_publish_is_left_out_of_the_mean() -> None:
     silent = dataclasses.replace(METRICS[0].robots[0], packet_bytes=0, octree_bytes=0, grid_bytes=0)
     tick = dataclasses.replace(METRICS[0], robots=(silent, METRICS[0].robots[1]))
@@ -76,7 +121,7 @@ def test_a_robot_that_did_not_publish_is_left_out_of_the_mean() -> None:
 def test_figures_of_a_run_without_exchange_or_disagreement(tmp_path: Path) -> None:
     silent = [
         dataclasses.replace(
-            tick, total_distance=0.0, total_distance_all=0.0, links=(),
+            tick, total_distance=0.0, total_distance_all=0.0, links=(), pairs=(),
             robots=tuple(dataclasses.replace(r, packet_bytes=0, octree_bytes=0, grid_bytes=0) for r in tick.robots),
         )
         for tick in METRICS[:1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, PairMetrics
 
 
 def map_scores(robot_id: str, start: float, *, is_active: bool = True, has_truth: bool = True) -> MapScores:
@@ -30,5 +30,10 @@ def evaluation(
         ]
         return (*robots, *([map_scores(CENTRAL, start + 0.3, has_truth=has_truth)] if has_central else []))
 
-    ticks = tuple(EvaluatedTick(5 * t, 2.5 * t, 0.25 / (1 + t), maps(t)) for t in range(num_ticks))
+    pairs = (PairMetrics("alpha", "beta", 5000, 1000, 0.2, 0.01, 0.17, 0.13, 800, 0.125),)
+    # The evidence is stored at the end only.
+    ticks = tuple(
+        EvaluatedTick(5 * t, 2.5 * t, 0.25 / (1 + t), maps(t), pairs if t == num_ticks - 1 else ())
+        for t in range(num_ticks)
+    )
     return Evaluation("result.mcap", "world.npz" if has_truth else None, CENTRAL, ("ground", "tree"), ticks)

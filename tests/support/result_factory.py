@@ -16,6 +16,7 @@ from octoreplay.records import (
     LinkMetrics,
     LinkTotals,
     MapState,
+    PairMetrics,
     RobotMetrics,
     RobotPose,
     RunSummary,
@@ -64,6 +65,7 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
         num_known_cells=2000 + tick, label_disagreement=0.25, max_change=float(tick) ** -2 if tick else 0.0,
         robots=robots,
         links=tuple(LinkMetrics(a, b, 1, 100 * tick, *range(2, 10), 100.0 * tick) for a, b in directed),
+        pairs=(PairMetrics("alpha", "beta", 5000 + tick, 1000, 0.2, tick / 100, 0.17, 0.13, 800, 0.125),),
     )  # fmt: skip
 
 

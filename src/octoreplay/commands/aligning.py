@@ -29,13 +29,24 @@ if TYPE_CHECKING:
     from octoreplay.config.resolved import ResolvedRun
     from octoreplay.config.run import RunConfig
     from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.mapping.octree import SemanticOctree
     from octoreplay.replay.alignment import Alignment
+
+
+dof_option = click.option(
+    "--dof",
+    type=click.Choice(("4", "6")),
+    default=None,
+    help="unknowns of a frame: 4 if the z axes of all map frames are vertical; 6 if not, as for hand-held cameras"
+    "  [default: 4]",
+)
 
 
 @with_parameters("sensor", "map", "time")
 @click.command(cls=SectionedCommand, short_help="Find the frames of a team from its robots' maps.")
 @click.argument("inputs", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml | LOG... | RESULT.mcap")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="ALIGNED.yaml", help="team file to write")
+@dof_option
 @click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
               help="transforms T_team_map to try, which are used only where the maps verify them")  # fmt: skip
 @click.option("--components", is_flag=True,
@@ -48,8 +59,8 @@ if TYPE_CHECKING:
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def align(
-    inputs: tuple[Path, ...], output: Path, guess: Path | None, components: bool, csv: Path | None, json: Path | None,
-    plot: Path | None, classes: str | None, **parameters: Any,
+    inputs: tuple[Path, ...], output: Path, dof: str | None, guess: Path | None, components: bool, csv: Path | None,
+    json: Path | None, plot: Path | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
 
@@ -69,43 +80,55 @@ def align(
         check_folder(plot)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config, alignment, warnings = _aligned(inputs, guess, classes, given, err)
+    config, alignment, warnings = _aligned(inputs, int(dof or 4), guess, classes, given, err)
     tables.show(out, alignment_tables(alignment))
     written = write_alignment(alignment, csv_path=csv, json_path=json)
     written += write_alignment_figures(alignment, plot) if plot is not None else []
-    written = [*_write_teams(config, alignment, output, components=components), *written]
     for sentence in (*warnings, *alignment.warnings):
         warn(err, sentence)
+    written = [*_write_teams(config, alignment, output, components=components), *written]
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
     return 0 if alignment.is_whole else EXIT_ERROR
 
 
-def align_with_bar(
-    config: RunConfig, resolved: ResolvedRun, guesses: Mapping[str, Sequence[float]] | None = None
-) -> Alignment:
-    """Align the robots of a configuration from their logs, with progress bars."""
-    from octoreplay.replay.alignment import align_robots
-    from octoreplay.replay.own_maps import own_maps
+def evidence_with_bar(config: ResolvedRun) -> list[SemanticOctree]:
+    """Map the robots of a team in their own frames, with a progress bar."""
+    from octoreplay.replay.own_maps import own_evidences
 
     with progress_bar("map") as update:
-        maps = own_maps(resolved, progress=lambda share: update(share, None, ""))
+        return own_evidences(config, progress=lambda share: update(share, None, ""))
+
+
+def align_with_bar(
+    config: RunConfig,
+    evidence: Sequence[SemanticOctree],
+    dof: int = 4,
+    guesses: Mapping[str, Sequence[float]] | None = None,
+) -> Alignment:
+    """Align the robots of a configuration from the evidence in their own frames, with a progress bar."""
+    from octoreplay.replay.alignment import align_robots
+    from octoreplay.replay.own_maps import own_map_of
+
     with progress_bar("align") as update:
-        return align_robots(config, maps, guesses=guesses, progress=lambda share: update(share, None, ""))
+        maps = [own_map_of(config, octree) for octree in evidence]
+        return align_robots(config, maps, dof=dof, guesses=guesses, progress=lambda share: update(share, None, ""))
 
 
-def aligned_run(chosen: RunConfig, surveys: LogSurveys, out: Console) -> tuple[ResolvedRun, Alignment]:
+def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys, out: Console) -> tuple[ResolvedRun, Alignment]:
     """Align the robots of a configuration, show the tables, and return the aligned run, resolved, with the alignment.
 
     Raises InputError where no two robots are connected.
     """
     from octoreplay.io.robots import discover
-    from octoreplay.replay.alignment import aligned_config, check_aligned
+    from octoreplay.replay.alignment import aligned_config, check_alignable, check_aligned
     from octoreplay.report import tables
     from octoreplay.report.alignment_tables import alignment_tables
 
+    check_alignable(chosen, {})
     # Frames that nothing relates are the reason to align them.
-    alignment = align_with_bar(chosen, discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys))
+    resolved = discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys)
+    alignment = align_with_bar(chosen, evidence_with_bar(resolved), dof)
     tables.show(out, alignment_tables(alignment))
     check_aligned(alignment)
     config = discover.resolve(aligned_config(chosen, alignment.teams[0]), surveys)
@@ -113,14 +136,14 @@ def aligned_run(chosen: RunConfig, surveys: LogSurveys, out: Console) -> tuple[R
 
 
 def _aligned(
-    inputs: tuple[Path, ...], guess: Path | None, classes: str | None, given: Mapping[str, Any], err: Console
+    inputs: tuple[Path, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any], err: Console
 ) -> tuple[RunConfig, Alignment, tuple[str, ...]]:
     """The configuration of the inputs, the alignment of its robots, and warnings of the logs."""
     from octoreplay.config.frames_file import load_frames_file
     from octoreplay.io.results.result_reader import is_result
     from octoreplay.io.robots import discover
     from octoreplay.io.robots.survey import LogSurveys
-    from octoreplay.replay.alignment import aligned_config
+    from octoreplay.replay.alignment import aligned_config, check_alignable
 
     guesses = None if guess is None else load_frames_file(guess)
     if is_result(inputs[0]):
@@ -128,12 +151,13 @@ def _aligned(
             raise click.UsageError(f"name one result alone, without {inputs[1]}")
         if given or classes is not None:
             raise ConfigError(f"{inputs[0]}: holds finished maps; leave out {_option(given)}, or name its logs")
-        return (*_aligned_result(inputs[0], guesses), ())
+        return (*_aligned_result(inputs[0], dof, guesses), ())
     with LogSurveys() as surveys:
         config = base_config(inputs, None, err, surveys)
         config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
+        check_alignable(config, guesses or {})
         resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)
-        alignment = align_with_bar(config, resolved, guesses)
+        alignment = align_with_bar(config, evidence_with_bar(resolved), dof, guesses)
         return config, alignment, discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings
 
 
@@ -142,7 +166,7 @@ def _option(given: Mapping[str, Any]) -> str:
     return f"--{next(iter(given), 'classes').replace('_', '-')}"
 
 
-def _aligned_result(path: Path, guesses: Mapping[str, Sequence[float]] | None) -> tuple[RunConfig, Alignment]:
+def _aligned_result(path: Path, dof: int, guesses: Mapping[str, Sequence[float]] | None) -> tuple[RunConfig, Alignment]:
     """The configuration of a result, and the alignment of its robots from their stored evidence."""
     from octoreplay.replay.alignment import align_robots, stored_maps
     from octoreplay.result import open_result
@@ -150,7 +174,12 @@ def _aligned_result(path: Path, guesses: Mapping[str, Sequence[float]] | None) -
     with open_result(path) as result, progress_bar("align") as update:
         maps, T_map_own = stored_maps(result)
         return result.config, align_robots(
-            result.config, maps, T_map_own=T_map_own, guesses=guesses, progress=lambda share: update(share, None, "")
+            result.config,
+            maps,
+            dof=dof,
+            T_map_own=T_map_own,
+            guesses=guesses,
+            progress=lambda share: update(share, None, ""),
         )
 
 

@@ -1,4 +1,4 @@
-"""Commands that produce logs and results: run, simulate, demo."""
+"""Commands that produce logs and results: run, simulate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from octoreplay.commands.aligning import aligned_run
+from octoreplay.commands.aligning import aligned_run, dof_option
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
@@ -69,12 +69,13 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
 @click.option("--align", type=click.Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
               help="find the robots' frames first, as 'octoreplay align' does, and leave other robots out (before, also"
               " without a value); or during the run, from the evidence that robots send (on-air)")  # fmt: skip
+@dof_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
-    classes: str | None, **parameters: Any,
+    dof: str | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
 
@@ -87,6 +88,8 @@ def run(
 
     if output is None and save_team is None:
         raise click.UsageError("name the result with -o OUT.mcap (or use --save-team TEAM.yaml to stop before the run)")
+    if dof is not None and align != _BEFORE:
+        raise click.UsageError("--dof goes with --align before; robots that align on air know their vertical axes")
     if output is not None:
         check_output(output, ".mcap")
     if save_team is not None:
@@ -100,7 +103,7 @@ def run(
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
         if align == _BEFORE:
-            config, alignment = aligned_run(chosen, surveys, out)
+            config, alignment = aligned_run(chosen, int(dof or 4), surveys, out)
         else:
             config, alignment = discover.resolve(chosen, surveys), None
     if config_from is None and not is_team_file(inputs):
@@ -164,48 +167,6 @@ def simulate(folder: Path, robots: int, image: str, odometry_drift: str, **optio
     team_file = simulate_with_bar(folder, {**values, **options})
     click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
     return 0
-
-
-@click.command(short_help="Simulate a team, replay it and export its map.")
-@click.argument("folder", type=existing_path, metavar="[DIR]", default=Path("octoreplay-demo"), required=False)
-@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
-@click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
-@click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
-def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
-    """Simulate a team, replay it, and export its map and figures into DIR (default: octoreplay-demo).
-
-    Takes less than two minutes. Lists the files written and the programs that open them.
-    """
-    from octoreplay.config.team_file import load_team_file
-    from octoreplay.io.robots import discover
-    from octoreplay.report import export, plots, tables
-    from octoreplay.result import open_result
-
-    out, err = tables.terminal(), tables.terminal(stderr=True)
-    result_path, ply, csv, figures = (folder / n for n in ("result.mcap", "map.ply", "metrics.csv", "figures"))
-    team_file = simulate_with_bar(folder / "logs", {"num_robots": robots, "duration": duration, "seed": seed})
-    summary = replay_with_bar(discover.resolve(load_team_file(team_file)), result_path)
-    with open_result(result_path) as result:
-        plots.write_metrics_csv(result.metrics, csv)
-        plots.write_figures(result.metrics, figures)
-    export.export_ply(result_path, ply, what="voxels")
-    tables.show(out, tables.results(summary))
-    show_warnings(err, summary)
-    first = summary.last.robots[0].robot_id
-    tables.show(
-        out,
-        tables.made_files(
-            {
-                folder / "logs": f"logs of {robots} robots, team file and the village as a mesh (world.ply)",
-                result_path: f"result; open it in Foxglove: 3D panel, frame 'team', topic /{first}/map",
-                ply: "final map as cubes; open it in CloudCompare, MeshLab or Open3D",
-                figures: "figures of disagreement over time and packet sizes",
-                csv: "all metrics of every tick",
-            }
-        ),
-    )
-    out.print(f"more: octoreplay metrics {result_path}", soft_wrap=True)
-    return EXIT_DATA_LOST if summary.lost_data else 0
 
 
 def _image_size(text: str) -> tuple[int, int]:

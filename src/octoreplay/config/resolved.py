@@ -58,7 +58,7 @@ class ResolvedRobot(RobotConfig):
 
     span_ns: tuple[int, int] | None = field(default=None, kw_only=True)
     frame: MapFrame | None = field(default=None, kw_only=True)
-    frame_origin: str = field(default="", kw_only=True)
+    frame_origin: str = field(default="", kw_only=True, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()

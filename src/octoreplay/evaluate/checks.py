@@ -348,7 +348,7 @@ QUANTITIES = (
              f" at the end; pairs with at least {MIN_COMPARED_CELLS} such cells",
              _pair_values("contradiction"), is_share=True, absent=_NO_PAIR),
     Quantity("clear_contradiction", ("max",),
-             "the same without the free cells that have an occupied cell of the same robot beside them",
+             "the same over cells that the other robot calls firmly free, with no occupied cell beside them",
              _pair_values("clear_contradiction"), is_share=True, absent=_NO_PAIR),
     Quantity("label_contradiction", ("max",),
              "share with different labels of the cells that two robots call occupied, likewise",

@@ -179,13 +179,15 @@ class _Evaluator:
         evidence = [self._result.evidence(robot_id, tick=tick).octree for robot_id in self._result.robots]
         self._comparer.forget()
         pairs = self._comparer.compare(evidence, 0)
-        with_evidence = [
-            robot_id for robot_id, octree in zip(self._result.robots, evidence, strict=True) if octree.num_cells
-        ]
+        num_cells = {
+            name: octree.num_cells
+            for name, octree in zip(self._result.robots, evidence, strict=True)
+            if octree.num_cells
+        }
         # Evidence in different frames is not compared.
         metrics = self._metrics[tick]
         pairs = tuple(pair for pair in pairs if metrics.frame_of(pair.first) == metrics.frame_of(pair.second))
-        self.warnings = team_frame_warnings(dataclasses.replace(metrics, pairs=pairs), with_evidence)
+        self.warnings = team_frame_warnings(dataclasses.replace(metrics, pairs=pairs), num_cells)
         return pairs
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:

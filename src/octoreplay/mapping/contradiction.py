@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -14,21 +14,44 @@ from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt8Array, UInt64Array, ranked_pairs
 
-CLEAR_LIMIT, LABEL_LIMIT = 0.06, 0.15
-"""Clear contradiction and label contradiction of a pair above which a run warns; docs/metrics.md has the source."""
+CLEAR_LIMIT, LABEL_LIMIT = 0.035, 0.25
+"""Clear contradiction and label contradiction of a pair above which a run warns.
+
+They lie between the values of right frames and those of wrong ones (benchmarks/contradiction.py, docs/metrics.md).
+"""
+MIN_OVERLAP = 0.05
+"""Share of the smaller evidence's cells that two robots must share to be compared, unless enough cells are occupied."""
 
 
-def state_limits(sensor: SensorConfig) -> tuple[np.float32, np.float32]:
-    """Return the log-odds from which a cell of the evidence is occupied, and those up to which it is free.
+class StateLimits(NamedTuple):
+    """Limits of a cell's largest log-odds in the evidence, float32.
 
-    These are psi / 2 and phi, or the clamping limit where that is nearer to 0: one hit makes a cell occupied, and one
-    miss makes it free.
+    A cell is occupied from ``occupied_from`` on, free up to ``free_to``, and firmly free up to ``firm_to``.
     """
-    return np.float32(min(sensor.hit / 2, sensor.clamp_max)), np.float32(max(sensor.miss, sensor.clamp_min))
+
+    occupied_from: np.float32
+    free_to: np.float32
+    firm_to: np.float32
+
+
+FIRM_MISSES = 5
+"""Number of misses without a hit that make a cell firmly free."""
+
+
+def state_limits(sensor: SensorConfig) -> StateLimits:
+    """Return the limits psi / 2, phi and FIRM_MISSES phi, or the clamping limit where that is nearer to 0.
+
+    One hit makes a cell occupied, and one miss makes it free.
+    """
+    return StateLimits(
+        np.float32(min(sensor.hit / 2, sensor.clamp_max)),
+        np.float32(max(sensor.miss, sensor.clamp_min)),
+        np.float32(max(FIRM_MISSES * sensor.miss, sensor.clamp_min)),
+    )
 
 
 def contradicting_pairs(pairs: Sequence[PairMetrics]) -> list[PairMetrics]:
-    """Return the pairs of which the clear contradiction is above CLEAR_LIMIT, the largest first."""
+    """Return the pairs whose clear contradiction is above CLEAR_LIMIT, the largest first."""
     return [pair for pair in ranked_pairs(pairs, "clear_contradiction") if pair.clear_contradiction > CLEAR_LIMIT]
 
 
@@ -39,7 +62,7 @@ class EvidenceComparer:
     must increase with every change.
     """
 
-    def __init__(self, robot_ids: Sequence[str], num_classes: int, limits: tuple[np.float32, np.float32]) -> None:
+    def __init__(self, robot_ids: Sequence[str], num_classes: int, limits: StateLimits) -> None:
         self._robot_ids = tuple(robot_ids)
         self._num_classes = num_classes
         self._limits = limits

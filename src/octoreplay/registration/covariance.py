@@ -13,41 +13,59 @@ robots that several pairs join.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from octoreplay.records import Float64Array
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.team import TeamAlignment
+from octoreplay.transforms import inverse
 
 # Information [1/rad^2, 1/m^2] that every pose is given: a direction that no surface fixes has a deviation of 1 km.
 _LEAST_INFORMATION = 1e-6
 
 
-def frame_covariances(alignment: TeamAlignment, root: int) -> dict[int, tuple[int | None, Float64Array]]:
-    """Return the neighbour towards ``root`` and the covariance (6, 6) of every robot in the component of ``root``.
+@dataclass(frozen=True, eq=False)
+class ChainedFrame:
+    """Frame of one robot at the end of a chain of pairs.
 
-    The covariance is that of the robot's map frame in the frame of ``root``: rotation [rad] about the axes of that
-    frame, then position of the map frame's origin [m]. That of ``root`` is zero, and its neighbour None.
+    - ``root``: robot at the other end, ``partner``: its neighbour in the chain; None for the root itself.
+    - ``T_root_map`` (4, 4) float64: pose of the robot's map.
+    - ``covariance`` (6, 6) float64: rotation about the axes of the root's map [rad], position [m].
     """
+
+    root: int
+    partner: int | None
+    T_root_map: Float64Array
+    covariance: Float64Array
+
+
+def chained_frames(alignment: TeamAlignment, roots: Sequence[int]) -> dict[int, ChainedFrame]:
+    """Return the frame of every robot in the component of ``roots``, each along the shortest chain from a root."""
     neighbours: dict[int, list[int]] = {}
     for index, parent in enumerate(alignment.parents):
         if parent is not None:
             neighbours.setdefault(index, []).append(parent)
             neighbours.setdefault(parent, []).append(index)
     pairs = {(pair.first, pair.second): pair for pair in alignment.pairs}
-    poses = _poses_from(alignment.T_component_map, root)
-    # Errors about the origin of the root's frame, which chain with the formulas above.
-    found: dict[int, tuple[int | None, Float64Array]] = {root: (None, np.zeros((6, 6)))}
-    queue = [root]
+    T = alignment.T_component_map
+    # Covariances about the origin of the root's map, which chain with the formulas above.
+    found = {root: ChainedFrame(root, None, np.eye(4), np.zeros((6, 6))) for root in roots}
+    queue = list(roots)
     for index in queue:
+        near = found[index]
         for other in neighbours.get(index, ()):
             if other not in found:
+                turn = adjoint(near.T_root_map)
                 across = _covariance(pairs[min(index, other), max(index, other)], to=index)
-                turn = adjoint(poses[index])
-                found[other] = index, found[index][1] + turn @ across @ turn.T
+                covariance: Float64Array = near.covariance + turn @ across @ turn.T
+                found[other] = ChainedFrame(near.root, index, inverse(T[near.root]) @ T[other], covariance)
                 queue.append(other)
-    return {index: (parent, about_point(value, poses[index][:3, 3])) for index, (parent, value) in found.items()}
+    return {
+        index: replace(frame, covariance=about_point(frame.covariance, frame.T_root_map[:3, 3]))
+        for index, frame in found.items()
+    }
 
 
 def adjoint(T: Float64Array) -> Float64Array:
@@ -60,10 +78,10 @@ def adjoint(T: Float64Array) -> Float64Array:
 
 def _covariance(pair: PairAlignment, *, to: int) -> Float64Array:
     """Covariance of a pair's pose, which maps to the frame of the robot ``to``."""
-    covariance: Float64Array = np.linalg.inv(pair.information + _LEAST_INFORMATION * np.eye(6))
+    covariance = np.asarray(np.linalg.inv(pair.information + _LEAST_INFORMATION * np.eye(6)), np.float64)
     if to == pair.first:
         return covariance
-    turn = np.linalg.inv(adjoint(pair.T_first_second))
+    turn = adjoint(inverse(pair.T_first_second))
     return turn @ covariance @ turn.T
 
 
@@ -73,12 +91,6 @@ def about_point(covariance: Float64Array, arm: Float64Array) -> Float64Array:
     shift[3:, :3] = -_cross(arm)
     result: Float64Array = shift @ covariance @ shift.T
     return result
-
-
-def _poses_from(T_component_map: Sequence[Float64Array], root: int) -> list[Float64Array]:
-    """Poses in the frame of ``root``."""
-    back = np.linalg.inv(T_component_map[root])
-    return [back @ T for T in T_component_map]
 
 
 def _cross(v: Float64Array) -> Float64Array:

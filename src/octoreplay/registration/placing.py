@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from octoreplay.records import Float64Array
-from octoreplay.registration.covariance import frame_covariances
+from octoreplay.registration.covariance import chained_frames
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import AcceptLimits
 from octoreplay.registration.team import TeamAlignment, worst_contradiction
@@ -18,6 +19,9 @@ from octoreplay.transforms import inverse
 LARGEST_SURVEY_SHIFT, LARGEST_SURVEY_ANGLE = 1.0, math.radians(3.0)
 """Largest difference [m, rad] between a surveyed pose and the pose that the maps give, up to which both agree."""
 
+# Squared Mahalanobis distance that 1 % of the errors of a pose exceed (chi-squared, six degrees of freedom).
+_LARGEST_DISTANCE = 16.81
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedRobot:
@@ -25,9 +29,10 @@ class PlacedRobot:
 
     - ``index``: position of the robot in the input.
     - ``T_team_map`` (4, 4) float64: pose of its map.
-    - ``covariance`` (6, 6): rotation about the team's axes [rad], position [m]; relative to ``anchor``.
+    - ``covariance`` (6, 6) float64: rotation about the team's axes [rad], position [m]; relative to ``anchor``.
     - ``partner``: robot through whose pair it got its pose; None for an anchor.
-    - ``anchor``: robot whose pose is given or is the team's frame.
+    - ``anchor``: robot with a surveyed pose, or that of the team's frame, from which the pose was found.
+    - ``is_verified``: the pair of another robot with a surveyed pose confirms that of this anchor.
     """
 
     index: int
@@ -35,6 +40,7 @@ class PlacedRobot:
     covariance: Float64Array
     partner: int | None
     anchor: int
+    is_verified: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +71,21 @@ def place_robots(
     maps: Sequence[OwnMap],
     alignment: TeamAlignment,
     surveyed: Mapping[int, Float64Array],
+    *,
+    dof: int = 4,
     limits: AcceptLimits | None = None,
 ) -> Placement:
     """Return the place of each robot in its team.
 
-    ``surveyed`` are trusted poses T_team_map (4, 4) by robot. A component without a surveyed robot is a team in the
-    frame of its first robot. All components with one form a single team in the surveyed frame; each is placed by the
-    surveyed pose that agrees with most others of the component, and its other poses come from the maps. Surveyed poses
-    that the maps contradict are refused: within a component where the aligned pose differs by more than
+    ``dof`` is 4 where the vertical axes of the maps are known and 6 where they are not. ``surveyed`` are trusted poses
+    T_team_map (4, 4) by robot.
+
+    A component without a surveyed robot is a team in the frame of its first robot. All components with one form a
+    single team in the surveyed frame. Each is placed by the surveyed pose that agrees with most others of the
+    component. Another surveyed pose of the component is kept where it differs from that of the maps by no more than the
+    covariance explains (99 %), and is replaced where it differs by more.
+
+    Surveyed poses that the maps contradict are refused: within a component where the aligned pose differs by more than
     ``LARGEST_SURVEY_SHIFT`` or ``LARGEST_SURVEY_ANGLE``, between components where two maps contradict each other
     clearly; then the smaller component is a team of its own.
     """
@@ -83,17 +96,17 @@ def place_robots(
     for component in alignment.components:
         known = [index for index in component if index in surveyed]
         if not known:
-            teams.append(_placed(alignment, component[0], np.eye(4)))
+            teams.append(_placed(alignment, {component[0]: np.eye(4)}))
             continue
         anchor, refused = _anchor(alignment, known, surveyed)
         refusals += refused
-        placed = _placed(alignment, anchor, surveyed[anchor])
-        worst = _worst_between(maps, together, placed, limits)
+        placed = _placed(alignment, _kept(alignment, anchor, {index: surveyed[index] for index in known}))
+        worst = _worst_between(maps, together, placed, limits, is_upright=dof == 4)
         if worst is None:
             together += placed
         else:
             refusals += [Refusal(index, *worst) for index in known]
-            teams.append(_placed(alignment, component[0], np.eye(4)))
+            teams.append(_placed(alignment, {component[0]: np.eye(4)}))
     if together:
         teams.insert(0, tuple(sorted(together, key=lambda robot: robot.index)))
     return Placement(tuple(sorted(teams, key=lambda team: -len(team))), tuple(refusals))
@@ -106,16 +119,28 @@ def pose_difference(one: Float64Array, other: Float64Array) -> tuple[float, floa
     return float(np.linalg.norm(difference[:3, 3])), math.acos(min(1.0, max(-1.0, cosine)))
 
 
-def _placed(alignment: TeamAlignment, anchor: int, T_team_anchor: Float64Array) -> tuple[PlacedRobot, ...]:
-    """The robots of a component in the frame in which the anchor has a pose."""
-    T_team_component = T_team_anchor @ inverse(alignment.T_component_map[anchor])
-    turn = np.kron(np.eye(2), T_team_anchor[:3, :3])
-    return tuple(
-        PlacedRobot(
-            index, T_team_component @ alignment.T_component_map[index], turn @ covariance @ turn.T, partner, anchor
-        )
-        for index, (partner, covariance) in sorted(frame_covariances(alignment, anchor).items())
-    )
+def _placed(alignment: TeamAlignment, anchors: Mapping[int, Float64Array]) -> tuple[PlacedRobot, ...]:
+    """The robots of a component, from the poses (4, 4) of one or more of them."""
+    robots = []
+    for index, frame in sorted(chained_frames(alignment, list(anchors)).items()):
+        T_team_root = anchors[frame.root]
+        turn = np.kron(np.eye(2), T_team_root[:3, :3])
+        T, covariance = T_team_root @ frame.T_root_map, turn @ frame.covariance @ turn.T
+        robots.append(PlacedRobot(index, T, covariance, frame.partner, frame.root, len(anchors) > 1))
+    return tuple(robots)
+
+
+def _kept(alignment: TeamAlignment, anchor: int, surveyed: Mapping[int, Float64Array]) -> dict[int, Float64Array]:
+    """The surveyed poses of a component that the covariances of the maps' poses explain, from that of the anchor on."""
+    kept = {anchor: surveyed[anchor]}
+    for robot in _placed(alignment, kept):
+        if robot.index in surveyed and robot.index != anchor:
+            T, given = robot.T_team_map, surveyed[robot.index]
+            rotation = Rotation.from_matrix(given[:3, :3] @ T[:3, :3].T).as_rotvec()
+            error = np.concatenate([rotation, given[:3, 3] - T[:3, 3]])
+            if error @ np.linalg.solve(robot.covariance, error) <= _LARGEST_DISTANCE:
+                kept[robot.index] = given
+    return kept
 
 
 def _anchor(
@@ -137,14 +162,16 @@ def _anchor(
 
 
 def _worst_between(
-    maps: Sequence[OwnMap], team: Sequence[PlacedRobot], others: Sequence[PlacedRobot], limits: AcceptLimits
-) -> tuple[int, float] | None:
+    maps: Sequence[OwnMap], team: Sequence[PlacedRobot], others: Sequence[PlacedRobot], limits: AcceptLimits, *,
+    is_upright: bool,
+) -> tuple[int, float] | None:  # fmt: skip
     """Robot of the team that contradicts another group most, with the share q_c; None without contradiction."""
     poses = [np.eye(4) for _ in maps]
     for robot in (*team, *others):
         poses[robot.index] = robot.T_team_map
     ones = [robot.index for robot in team]
-    worst = worst_contradiction(maps, poses, ones, [robot.index for robot in others], np.eye(4), limits)
+    apart = [robot.index for robot in others]
+    worst = worst_contradiction(maps, poses, ones, apart, np.eye(4), limits, is_upright=is_upright)
     if worst is None:
         return None
     return (worst[0] if worst[0] in ones else worst[1]), worst[2]

@@ -66,16 +66,16 @@ def align_team(
     def align(pair: tuple[int, int]) -> PairAlignment:
         return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
-    judged = tuple(run(align, combinations(range(len(maps)), 2)))
-    return join_pairs(maps, judged, limits, names, is_upright=dof == 4)
+    pairs = tuple(run(align, combinations(range(len(maps)), 2)))
+    return join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
 
 
 def join_pairs(
     maps: Sequence[OwnMap],
     pairs: Sequence[PairAlignment],
     limits: AcceptLimits,
-    names: Sequence[str] | None = None,
     *,
+    names: Sequence[str] | None = None,
     is_upright: bool = True,
 ) -> TeamAlignment:
     """Return the components that the accepted pairs form, best pair first.
@@ -101,11 +101,8 @@ def join_pairs(
             T = poses[i] @ pair.T_first_second @ inverse(poses[j])
             old, new = component[j], component[i]
             worst = worst_contradiction(maps, poses, members[new], members[old], T, limits, is_upright=is_upright)
-            if worst is not None:
-                first, second = (names[index] for index in worst[:2])
-                refusal = f"{first} and {second} would contradict each other (q_c {worst[2]:.3f})"
-            else:
-                refusal = ""
+            refusal = "" if worst is None else _contradiction(worst, names)
+            if not refusal:
                 for index in members[old]:
                     poses[index] = T @ poses[index]
                     component[index] = new
@@ -142,8 +139,7 @@ def worst_contradiction(
     """Return the two robots (first < second) of two groups that contradict each other most, with their share q_c.
 
     ``poses`` (4, 4) are those of each robot's map in its group's frame; ``T`` (4, 4) maps the frame of ``others`` to
-    that of ``ones``. ``is_upright``: the vertical axis of each map is known. Returns None where no two maps contradict
-    each other clearly.
+    that of ``ones``. Returns None where no two maps contradict each other clearly.
     """
     found: list[tuple[int, int, float]] = []
     for i in ones:
@@ -153,6 +149,12 @@ def worst_contradiction(
             if obstacles.total >= limits.min_cells and obstacles.share_contra > 2 * limits.max_contra:
                 found.append((min(i, j), max(i, j), obstacles.share_contra))
     return max(found, key=lambda entry: entry[2], default=None)
+
+
+def _contradiction(worst: tuple[int, int, float], names: Sequence[str]) -> str:
+    """Reason not to join the groups of two robots that contradict each other."""
+    first, second, share = worst
+    return f"{names[first]} and {names[second]} would contradict each other (q_c {share:.3f})"
 
 
 def _turn_parents(parents: list[int | None], root: int) -> None:

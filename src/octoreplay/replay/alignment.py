@@ -17,13 +17,14 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.subteam import subteam
 from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.robots.discover import resolve
 from octoreplay.records import Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots, pose_difference
 from octoreplay.registration.team import align_team
-from octoreplay.replay.own_maps import own_map_of
+from octoreplay.replay.own_maps import own_map_of, own_maps
 from octoreplay.result import Result
 from octoreplay.transforms import inverse, numbers_of, transform_of
 
@@ -76,6 +77,8 @@ class Alignment:
 
     Attributes
     ----------
+    dof : int
+        4 for robots whose map frames have a vertical z axis, 6 for others.
     robot_ids : tuple of str
         All robots.
     maps : tuple of OwnMap
@@ -92,9 +95,10 @@ class Alignment:
     problems : tuple of str
         Sentences on given poses that the maps contradict.
     notes : tuple of str
-        Sentences on given poses that no overlap verifies, and on equal maps.
+        Sentences on given poses that no overlap verifies, and on empty and equal maps.
     """
 
+    dof: int
     robot_ids: tuple[str, ...]
     maps: tuple[OwnMap, ...] = field(repr=False)
     T_map_own: tuple[Float64Array, ...] = field(repr=False)
@@ -127,9 +131,9 @@ class Alignment:
         return max(own, key=lambda pair: pair.verification.score)
 
     def reasons(self) -> tuple[str, ...]:
-        """Return a sentence for each robot that is left out, with its best pair and the number that failed."""
-        sentences = []
-        for robot_id in self.left_out:
+        """Return a sentence for each robot that is left out of a team: its best pair and the number that failed."""
+        sentences: list[str] = []
+        for robot_id in self.left_out if len(self.teams[0]) > 1 else ():
             pair = self.best_refused(robot_id)
             first, second = self.robot_ids[pair.first], self.robot_ids[pair.second]
             reason = pair.refusal or "accepted, and they are a team of their own"
@@ -137,10 +141,37 @@ class Alignment:
         return tuple(sentences)
 
 
+def align_logs(
+    config: RunConfig,
+    *,
+    dof: int = 4,
+    guesses: Frames | None = None,
+    progress: Callable[[float], None] | None = None,
+    num_threads: int | None = None,
+) -> Alignment:
+    """Return the frames of a team's robots from the maps that each one's own logs give.
+
+    The parameters are those of ``align_robots``; ``progress`` counts maps and pairs as one half each. A configuration
+    that is not resolved is resolved first. Raises InputError and ConfigError as ``resolve`` and ``align_robots`` do.
+    """
+    check_alignable(config, guesses or {})
+
+    def show(share: float) -> None:
+        if progress is not None:
+            progress(share)
+
+    resolved = resolve(config.with_parameters({"strict_frames": False}))
+    maps = own_maps(resolved, progress=lambda share: show(share / 2), num_threads=num_threads)
+    return align_robots(
+        config, maps, dof=dof, guesses=guesses, progress=lambda share: show((1 + share) / 2), num_threads=num_threads
+    )
+
+
 def align_robots(
     config: RunConfig,
     maps: Sequence[OwnMap],
     *,
+    dof: int = 4,
     T_map_own: Sequence[Float64Array] | None = None,
     guesses: Frames | None = None,
     progress: Callable[[float], None] | None = None,
@@ -148,18 +179,15 @@ def align_robots(
 ) -> Alignment:
     """Return the frames of a team's robots from their own maps, in the order of ``config.robots``.
 
-    A ``T_team_map`` of the configuration that no command computed is trusted: it places its robot unless the maps
-    contradict it. ``guesses`` are verified and refined like every other candidate, and are not used where no overlap
-    verifies them. ``T_map_own`` (4, 4) places each map in its robot's map frame (default: it is in that frame).
-    ``progress`` is called with the finished share of pairs, 0 to 1. ``num_threads`` does not change the result. Raises
-    ConfigError for fewer than two robots, and for guesses of other robots.
+    ``dof`` is 4 for robots whose map frames have a vertical z axis, 6 for others. A ``T_team_map`` of the configuration
+    that no command computed is trusted: it places its robot unless the maps contradict it. ``guesses`` are verified and
+    refined like every other candidate, and are not used where no overlap verifies them. ``T_map_own`` (4, 4) places
+    each map in its robot's map frame (default: it is in that frame). ``progress`` is called with the finished share of
+    pairs, 0 to 1. ``num_threads`` does not change the result. Raises ConfigError for fewer than two robots, and for
+    guesses of other robots.
     """
     robot_ids = tuple(robot.robot_id for robot in config.robots)
-    if len(robot_ids) < 2:
-        raise ConfigError(f"align: needs at least two robots; the team has one, {robot_ids[0]}")
-    for robot_id in guesses or {}:
-        if robot_id not in robot_ids:
-            raise ConfigError(f"guess: robot '{robot_id}' is not in the team: {', '.join(sorted(robot_ids))}")
+    check_alignable(config, guesses or {})
     placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
     pairs = list(combinations(range(len(maps)), 2))
     with ThreadPoolExecutor(num_threads or min(len(pairs), os.cpu_count() or 1)) as threads:
@@ -171,23 +199,28 @@ def align_robots(
                 yield found
 
         try:
-            aligned = align_team(maps, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run)
+            aligned = align_team(
+                maps, dof=dof, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run
+            )
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
             raise
     given = _given(config)
-    placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()})
+    placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
     for refusal in placement.refusals:
         given.pop(refusal.index, None)
-    scores = {(pair.first, pair.second): pair.verification.score for pair in aligned.pairs}
+    qualities = {(pair.first, pair.second): _quality(pair, dof) for pair in aligned.pairs}
 
     def frames(team: Sequence[PlacedRobot]) -> tuple[RobotFrame, ...]:
         first = team[0].anchor
         # Without a given pose the team's frame is the map frame of the first robot.
         T_team_own = np.eye(4) if first in given else placed[first]
-        return tuple(_robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, scores) for robot in team)
+        return tuple(
+            _robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, qualities) for robot in team
+        )
 
     return Alignment(
+        dof,
         robot_ids,
         tuple(maps),
         placed,
@@ -195,8 +228,18 @@ def align_robots(
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
-        (*_unverified(placement.teams, given, robot_ids), *_equal_maps(maps, robot_ids)),
+        (*_unverified(placement.teams[0], given, robot_ids), *_odd_maps(maps, robot_ids)),
     )
+
+
+def check_alignable(config: RunConfig, guesses: Frames) -> None:
+    """Raise ConfigError for fewer than two robots, and for guesses of robots that are not in the team."""
+    robot_ids = [robot.robot_id for robot in config.robots]
+    if len(robot_ids) < 2:
+        raise ConfigError(f"align: needs at least two robots; the team has one, {robot_ids[0]}")
+    for robot_id in guesses:
+        if robot_id not in robot_ids:
+            raise ConfigError(f"guess: robot '{robot_id}' is not in the team: {', '.join(sorted(robot_ids))}")
 
 
 def stored_maps(
@@ -287,26 +330,32 @@ def _candidates(
 
 def _robot_frame(
     robot: PlacedRobot, robot_ids: Sequence[str], T_team_own: Float64Array, T_map_own: Float64Array,
-    given: Mapping[int, Float64Array], scores: Mapping[tuple[int, int], float],
+    given: Mapping[int, Float64Array], qualities: Mapping[tuple[int, int], str],
 ) -> RobotFrame:  # fmt: skip
     """The frame of a placed robot; ``T_team_own`` maps the frame that it is placed in to the team's."""
     T = T_team_own @ robot.T_team_map @ inverse(T_map_own)
     robot_id = robot_ids[robot.index]
     if robot.partner is None:
         is_given = robot.index in given
-        return RobotFrame(
-            robot_id, T, None, "given in the team file" if is_given else "frame of the team", None, is_given
-        )
+        verified = " and verified by its overlaps" if robot.is_verified else ""
+        origin = f"given in the team file{verified}" if is_given else "frame of the team"
+        return RobotFrame(robot_id, T, None, origin, None, is_given)
     turn = np.kron(np.eye(2), T_team_own[:3, :3])
     # From the origin of the map to that of the map frame.
     arm = T[:3, 3] - (T_team_own @ robot.T_team_map)[:3, 3]
     covariance = about_point(turn @ robot.covariance @ turn.T, arm)
     partner = robot_ids[robot.partner]
     first, second = sorted((robot.index, robot.partner))
-    origin = f"aligned with {partner}, L {scores[first, second]:.0f}"
+    origin = f"aligned with {partner}, {qualities[first, second]}"
     if robot.index in given:
         origin += f"; the given pose differs by {_difference(*pose_difference(T, given[robot.index]))}"
     return RobotFrame(robot_id, T, covariance, origin, partner, False)
+
+
+def _quality(pair: PairAlignment, dof: int) -> str:
+    """Number by which a pair is ranked, as text."""
+    agreement = pair.verification
+    return f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
 
 
 def _difference(shift: float, angle: float) -> str:
@@ -329,18 +378,20 @@ def _problem(refusal: Refusal, robot_ids: Sequence[str]) -> str:
 
 
 def _unverified(
-    teams: Sequence[Sequence[PlacedRobot]], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
+    team: Sequence[PlacedRobot], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
 ) -> Iterator[str]:
-    """Sentences on robots whose given pose no overlap verifies."""
-    for team in teams:
-        for robot in team:
-            num_placed = sum(other.anchor == robot.index for other in team)
-            if robot.index in given and num_placed == 1:
-                yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
+    """Sentences on robots of the team with given poses that no overlap verifies."""
+    for robot in team:
+        is_alone = not any(other.anchor == robot.index != other.index for other in team)
+        if robot.index in given and robot.partner is None and is_alone and not robot.is_verified:
+            yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
 
 
-def _equal_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
-    """Sentences on robots whose maps are equal."""
+def _odd_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
+    """Sentences on empty and on equal maps."""
+    for own, robot_id in zip(maps, robot_ids, strict=True):
+        if not own.states.any():
+            yield f"the map of {robot_id} is empty: check max_range, body_box and the poses"
     for i, j in combinations(range(len(maps)), 2):
         is_equal = np.array_equal(maps[i].low, maps[j].low) and np.array_equal(maps[i].states, maps[j].states)
         if is_equal and maps[i].states.any():

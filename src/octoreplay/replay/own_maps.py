@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
+from octoreplay.records import PairMetrics
 from octoreplay.registration.own_map import OwnMap
 
 _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -62,6 +64,13 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> SemanticOctree:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
     return octree
+
+
+def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[SemanticOctree]) -> tuple[PairMetrics, ...]:
+    """Return the contradiction of the robots' evidence, each in its own map frame, as if these were one frame."""
+    robot_ids = [robot.robot_id for robot in config.robots]
+    comparer = EvidenceComparer(robot_ids, config.classes.num_classes, state_limits(config.sensor))
+    return comparer.compare(evidence, 0)
 
 
 def own_map_of(config: RunConfig, evidence: SemanticOctree) -> OwnMap:

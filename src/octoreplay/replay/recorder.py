@@ -88,7 +88,8 @@ class Recorder:
         if self.last is None:
             return ()
         evidence = zip(self.last.graph.robot_ids, self.last.evidence, strict=True)
-        return team_frame_warnings(self.last.metrics, [robot_id for robot_id, octree in evidence if octree.num_cells])
+        num_cells = {name: octree.num_cells for name, octree in evidence if octree.num_cells}
+        return team_frame_warnings(self.last.metrics, num_cells)
 
     def record(self, tick: Tick) -> None:
         """Record one tick."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
-from octoreplay.mapping.contradiction import LABEL_LIMIT, contradicting_pairs
-from octoreplay.records import PairMetrics, TickMetrics, ranked_pairs
+from octoreplay.mapping.contradiction import LABEL_LIMIT, MIN_OVERLAP, contradicting_pairs
+from octoreplay.records import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -56,15 +56,15 @@ def map_warnings(num_known_cells: int) -> tuple[str, ...]:
     return ("the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses",)
 
 
-def team_frame_warnings(metrics: TickMetrics, robot_ids: Sequence[str]) -> tuple[str, ...]:
+def team_frame_warnings(metrics: TickMetrics, num_cells: Mapping[str, int]) -> tuple[str, ...]:
     """Sentences on the frames after the last tick: ``frame_warnings`` of each component, and the components.
 
-    ``robot_ids`` are the robots with evidence.
+    ``num_cells`` are the known cells of each robot's evidence, of robots with at least one.
     """
     sentences: list[str] = []
     for component in metrics.components:
         pairs = [pair for pair in metrics.pairs if pair.first in component]
-        sentences += frame_warnings(pairs, [robot_id for robot_id in component if robot_id in robot_ids])
+        sentences += frame_warnings(pairs, {name: num_cells[name] for name in component if name in num_cells})
     if metrics.num_components > 1:
         names = "; ".join(_listed(component) for component in metrics.components)
         sentences.append(
@@ -74,19 +74,19 @@ def team_frame_warnings(metrics: TickMetrics, robot_ids: Sequence[str]) -> tuple
     return tuple(sentences)
 
 
-def frame_warnings(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on pairs of robots that contradict each other, and on robots that share no known space.
+def frame_warnings(pairs: Sequence[PairMetrics], num_cells: Mapping[str, int]) -> tuple[str, ...]:
+    """Sentences on pairs of robots that contradict each other, and on robots that share too little known space.
 
-    ``robot_ids`` are the robots with evidence, ``pairs`` those of them that share known cells.
+    ``pairs`` are those that share known cells. ``num_cells`` are the known cells of each robot's evidence, of robots
+    with at least one.
     """
     sentences = []
-    clear = contradicting_pairs(pairs)
-    if clear:
-        worst = clear[0]
+    if bad := contradicting_pairs(pairs):
+        worst, clear = bad[0], f"{100 * bad[0].clear_contradiction:.0f} %"
         sentences.append(
             f"{worst.first} and {worst.second} contradict each other in {100 * worst.contradiction:.0f} % of the"
-            f" {worst.occupied_cells:,} occupied cells that both know, {100 * worst.clear_contradiction:.0f} % by more"
-            f" than a cell{_others(clear)}: try `octoreplay align`"
+            f" {worst.occupied_cells:,} occupied cells that both know, clearly in {clear}{_others(bad)}:"
+            " try `octoreplay align`"
         )
     labels = [pair for pair in ranked_pairs(pairs, "label_contradiction") if pair.label_contradiction > LABEL_LIMIT]
     if labels:
@@ -96,18 +96,24 @@ def frame_warnings(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> tu
             f" {worst.both_occupied_cells:,} cells that both call occupied{_others(labels)}: compare their labels, or"
             " try `octoreplay align`"
         )
-    groups = _groups_with_common_space(pairs, robot_ids)
+    groups = _groups_with_common_space(pairs, num_cells)
     if len(groups) > 1:
-        alone = [group[0] for group in groups if len(group) == 1]
-        if len(alone) == len(groups):
-            sentence = f"{_listed(alone)} share no known space"
-        elif len(groups) - len(alone) == 1:
-            sentence = f"{_listed(alone)} share{'s' if len(alone) == 1 else ''} no known space with any other robot"
-        else:
-            names = "; ".join(_listed(group) for group in groups)
-            sentence = f"the robots are in {len(groups)} groups that share no known space ({names})"
-        sentences.append(f"{sentence}: nothing to agree on between them; check the poses and T_team_map")
+        group_of = {robot_id: number for number, group in enumerate(groups) for robot_id in group}
+        most = max((p.overlap_cells for p in pairs if group_of[p.first] != group_of[p.second]), default=0)
+        shared = f"hardly any known space (at most {most:,} cells)" if most else "no known space"
+        rest = "little to agree on" if most else "nothing to agree on"
+        sentences.append(f"{_apart(groups, shared)}: {rest}; check the poses and T_team_map, or try `octoreplay align`")
     return tuple(sentences)
+
+
+def _apart(groups: Sequence[Sequence[str]], shared: str) -> str:
+    """Clause on groups of robots that share ``shared``."""
+    alone = [group[0] for group in groups if len(group) == 1]
+    if len(alone) == len(groups):
+        return f"{_listed(alone)} share {shared}"
+    if len(groups) - len(alone) == 1:
+        return f"{_listed(alone)} share{'s' if len(alone) == 1 else ''} {shared} with any other robot"
+    return f"the robots are in {len(groups)} groups that share {shared} ({'; '.join(map(_listed, groups))})"
 
 
 def _others(pairs: Sequence[PairMetrics]) -> str:
@@ -119,16 +125,17 @@ def _others(pairs: Sequence[PairMetrics]) -> str:
     return f" ({len(pairs) - 1} more {'pairs' if len(pairs) > 2 else 'pair'}{names})"
 
 
-def _groups_with_common_space(pairs: Sequence[PairMetrics], robot_ids: Sequence[str]) -> list[list[str]]:
-    """Groups of robots that are connected by pairs with common known cells, in the robots' order."""
-    group_of = {robot_id: [robot_id] for robot_id in robot_ids}
+def _groups_with_common_space(pairs: Sequence[PairMetrics], num_cells: Mapping[str, int]) -> list[list[str]]:
+    """Groups of robots that are connected by pairs with enough common known cells, in the robots' order."""
+    group_of = {robot_id: [robot_id] for robot_id in num_cells}
     for pair in pairs:
+        least = MIN_OVERLAP * min(num_cells[pair.first], num_cells[pair.second])
         first, second = group_of[pair.first], group_of[pair.second]
-        if first is not second:
+        if first is not second and (pair.occupied_cells >= MIN_COMPARED_CELLS or pair.overlap_cells >= least):
             first += second
             group_of.update(dict.fromkeys(second, first))
     unique = {id(group): group for group in group_of.values()}
-    return [sorted(group, key=list(robot_ids).index) for group in unique.values()]
+    return [sorted(group, key=list(num_cells).index) for group in unique.values()]
 
 
 def _listed(names: Sequence[str]) -> str:

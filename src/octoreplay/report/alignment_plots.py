@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from octoreplay.records import Float64Array
-from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.replay.alignment import Alignment
 from octoreplay.report.alignment_tables import ranked
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
 MAX_PAIRS = 30
 """Largest number of pairs that are drawn: the accepted ones first, then the refused ones with the largest L."""
 
-_Layer = tuple[str, OwnMap, Float64Array, str]
-"""Name, map, pose (4, 4) and colour of one robot in a picture."""
+_Layer = tuple[str, Float64Array, str]
+"""Name, occupied columns (n, 2) [m] and colour of one robot in a picture."""
 
 
 def write_alignment_figures(alignment: Alignment, folder: Path) -> list[Path]:
@@ -44,16 +43,17 @@ def team_figure(alignment: Alignment, *, before: str = "before", after: str = "a
 
     ``before`` and ``after`` are the titles of the two pictures.
     """
-    own = dict(zip(alignment.robot_ids, zip(alignment.maps, alignment.T_map_own, strict=True), strict=True))
-    colors = {robot_id: COLORS[index % len(COLORS)] for index, robot_id in enumerate(alignment.robot_ids)}
+    ids = alignment.robot_ids
+    colors = [COLORS[index % len(COLORS)] for index in range(len(ids))]
     old = [
-        (robot_id, own[robot_id][0], T, colors[robot_id])
-        for robot_id, T in zip(alignment.robot_ids, alignment.T_team_own_before, strict=True)
+        (robot_id, _cells(alignment, index, alignment.T_team_own_before[index]), colors[index])
+        for index, robot_id in enumerate(ids)
     ]
-    new = [
-        (frame.robot_id, own[frame.robot_id][0], frame.T_team_map @ own[frame.robot_id][1], colors[frame.robot_id])
-        for frame in alignment.teams[0]
-    ]
+    new = []
+    for frame in alignment.teams[0]:
+        index = ids.index(frame.robot_id)
+        T = frame.T_team_map @ alignment.T_map_own[index]
+        new.append((frame.robot_id, _cells(alignment, index, T), colors[index]))
     left_out = f"; left out: {', '.join(alignment.left_out)}" if alignment.left_out else ""
     return _before_and_after(f"{len(new)} of {len(old)} robots aligned{left_out}", old, new, (before, after))
 
@@ -64,8 +64,8 @@ def pair_figure(alignment: Alignment, pair: PairAlignment) -> Figure:
     T_before = inverse(alignment.T_team_own_before[i]) @ alignment.T_team_own_before[j]
     before, after = (
         [
-            (alignment.robot_ids[i], alignment.maps[i], np.eye(4), BLUE),
-            (alignment.robot_ids[j], alignment.maps[j], T, ORANGE),
+            (alignment.robot_ids[i], _cells(alignment, i, np.eye(4)), BLUE),
+            (alignment.robot_ids[j], _cells(alignment, j, T), ORANGE),
         ]
         for T in (T_before, pair.T_first_second)
     )
@@ -91,15 +91,20 @@ def _before_and_after(
     return figure
 
 
+def _cells(alignment: Alignment, index: int, T: Float64Array) -> Float64Array:
+    """Occupied columns (n, 2) of a robot's map under a pose (4, 4): centres [m], of obstacles only where z is up."""
+    own = alignment.maps[index]
+    points = (own.obstacles if alignment.dof == 4 else own.occupied).points
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    columns: Float64Array = (np.unique(np.floor(moved[:, :2] / own.resolution), axis=0) + 0.5) * own.resolution
+    return columns
+
+
 def _draw(axes: Axes, title: str, layers: Iterable[_Layer]) -> None:
-    """Draw the obstacles of robots seen from above."""
+    """Draw the columns of robots."""
     style(axes, title, "x [m]", "y [m]")
-    for name, own, T, color in layers:
-        points = own.obstacles.points @ T[:3, :3].T + T[:3, 3]
-        # One square for each column of cells.
-        cells = np.unique(np.floor(points[:, :2] / own.resolution), axis=0)
-        x, y = (cells + 0.5).T * own.resolution
-        axes.scatter(x, y, s=3.0, marker="s", linewidths=0, color=color, alpha=0.6)
-        # The legend's markers would be as small as the cells.
+    for name, columns, color in layers:
+        axes.scatter(columns[:, 0], columns[:, 1], s=3.0, marker="s", linewidths=0, color=color, alpha=0.6)
+        # The legend's markers would be as small as the columns.
         axes.scatter([], [], s=30.0, marker="s", linewidths=0, color=color, label=name)
     axes.set_aspect("equal", adjustable="datalim")

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from octoreplay.records import PAIR_SHARES, PairMetrics
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.replay.alignment import Alignment, RobotFrame
-from octoreplay.report.tables import share, styled_table
+from octoreplay.report.tables import share, styled_table, worst_pair
 
 MAX_PAIRS = 30
 """Largest number of rows of the table of pairs."""
@@ -29,6 +30,16 @@ def alignment_tables(alignment: Alignment) -> RenderableType:
     for number, team in enumerate(teams, start=1):
         parts += ["", frames_table(team, f"Frames of team {number}" if len(teams) > 1 else "Frames")]
     return Group(*parts)
+
+
+def contradiction_table(pairs_by_frames: Mapping[str, Sequence[PairMetrics]]) -> Table:
+    """Return a table of the contradiction of evidence, with one row for each choice of frames."""
+    table = styled_table("Contradiction of evidence, worst pair")
+    for name in ("frames", "contradiction", "clear contradiction", "label contradiction"):
+        table.add_column(name, overflow="fold")
+    for frames, pairs in pairs_by_frames.items():
+        table.add_row(frames, *(worst_pair(pairs, name) for name in PAIR_SHARES))
+    return table
 
 
 def pairs_table(alignment: Alignment) -> RenderableType:

@@ -19,7 +19,7 @@ MAX_COLORED = 5
 """Number of pairs with a colour and a name of their own; the others are grey."""
 _PANELS: Mapping[str, tuple[str, float | None]] = {
     "contradiction": ("occupied / free", None),
-    "clear_contradiction": ("by more than a cell", CLEAR_LIMIT),
+    "clear_contradiction": ("clearly", CLEAR_LIMIT),
     "label_contradiction": ("other label", LABEL_LIMIT),
 }
 """Shares of the panels with their labels and limits."""

@@ -46,7 +46,7 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
         _maps_table(final),
         f"cells with different labels: {share(final.label_disagreement)}",
         f"contradiction of evidence, worst pair: {worst_pair(final.pairs, 'contradiction')}",
-        f"contradiction by more than a cell: {worst_pair(final.pairs, 'clear_contradiction')}",
+        f"clear contradiction: {worst_pair(final.pairs, 'clear_contradiction')}",
         f"label contradiction: {worst_pair(final.pairs, 'label_contradiction')}",
     ]
     if contradicting_pairs(final.pairs):

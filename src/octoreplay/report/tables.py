@@ -108,7 +108,7 @@ def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
     rows = ranked[:MAX_PAIRS]
     table = styled_table(f"Contradiction of evidence, {len(rows)} of {len(ranked)} pairs")
     table.add_column("pair", overflow="fold")
-    for name in ("shared\ncells", "of these\noccupied", "contra-\ndiction", "more than\na cell", "other\nlabel"):
+    for name in ("shared\ncells", "of these\noccupied", "contra-\ndiction", "clear", "labels"):
         table.add_column(name, justify="right", no_wrap=True)
     for pair in rows:
         table.add_row(
@@ -261,8 +261,8 @@ def _team_table(summary: RunSummary) -> Table:
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
     if len(last.robots) > 1:
         table.add_row("contradiction, worst pair", worst_pair(last.pairs, "contradiction"))
-        table.add_row("by more than a cell", worst_pair(last.pairs, "clear_contradiction"))
-        table.add_row("labels, worst pair", worst_pair(last.pairs, "label_contradiction"))
+        table.add_row("clear contradiction", worst_pair(last.pairs, "clear_contradiction"))
+        table.add_row("label contradiction", worst_pair(last.pairs, "label_contradiction"))
         if summary.frame_origins:
             table.add_row("frames", _frame_origins(summary.frame_origins))
         if last.places:

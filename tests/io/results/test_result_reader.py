@@ -46,6 +46,28 @@ def test_a_written_result_is_read(tmp_path: Path) -> None:
     assert read.lost_data
 
 
+def test_a_result_of_an_older_version_has_no_pairs_and_no_evidence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = RosMcapWriter.write
+
+    def old_write(writer: RosMcapWriter, topic: str, *rest: object) -> None:
+        if topic != "/contradiction":
+            write(writer, topic, *rest)
+
+    monkeypatch.setattr(RosMcapWriter, "write", old_write)
+    with ResultReader(write_result(tmp_path)) as reader:
+        assert reader.metrics() == [dataclasses.replace(tick, pairs=()) for tick in METRICS]
+        assert np.isnan(reader.metrics()[-1].contradiction)
+        assert reader.state_times("alpha", evidence=True) == []
+        with pytest.raises(InputError, match="no evidence of robot 'alpha' is stored up to the time asked for"):
+            reader.states("alpha", evidence=True)
+        with pytest.raises(InputError, match="robot 'gamma' not found; robots: alpha, beta"):
+            reader.states("gamma", evidence=True)
+        with pytest.raises(InputError, match="the centralised map has no evidence; robots: alpha, beta"):
+            reader.states("central", evidence=True)
+
+
 def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:
     values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
     config = team(tmp_path).with_parameters(values)

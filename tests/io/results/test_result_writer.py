@@ -27,6 +27,7 @@ from support.result_factory import (
 def fill(writer: ResultWriter) -> None:
     writer.write_state(state("alpha", 0, 1, b"key frame", key=True))
     writer.write_state(state("alpha", 1, 3, b""))
+    writer.write_evidence(state("beta", 0, 3, b"evidence", key=True))
     writer.write_view("alpha", START + 3 * SECOND, leaf_table())
     writer.write_packet("beta", START + 3 * SECOND, 3, b"\x00\xffpacket")
 
@@ -45,13 +46,21 @@ def test_rosbags_reads_every_message_by_the_schemas_in_the_file(tmp_path: Path) 
             seen.setdefault(connection.topic, []).append((stamp, reader.deserialize(raw, connection.msgtype)))
     counts = {topic: len(entries) for topic, entries in seen.items()}
     assert counts == {
-        "/tf_static": 1, "/metrics": 4, "/alpha/pose": 4, "/beta/pose": 4, "/tf": 4, "/graph": 4, "/alpha/map_state": 2,
-        "/alpha/map": 1, "/beta/packet": 1,
+        "/tf_static": 1, "/metrics": 4, "/contradiction": 4, "/alpha/pose": 4, "/beta/pose": 4, "/tf": 4, "/graph": 4,
+        "/alpha/map_state": 2, "/alpha/map": 1, "/beta/packet": 1, "/beta/evidence": 1,
     }  # fmt: skip
     stamp, metrics = seen["/metrics"][2]
     assert stamp == START + 3 * SECOND
     assert (metrics.tick, metrics.total_distance, metrics.robots[1].packet_bytes) == (3, 1.0 / 3.0 + 3, 340)
     assert [(link.sender, link.receiver) for link in metrics.links] == [("alpha", "beta"), ("beta", "alpha")]
+    contradiction = seen["/contradiction"][2][1]
+    assert (contradiction.tick, contradiction.clear_contradiction, contradiction.label_contradiction) == (
+        3,
+        0.03,
+        0.125,
+    )
+    assert [(pair.first, pair.second, pair.overlap_cells) for pair in contradiction.pairs] == [("alpha", "beta", 5003)]
+    assert seen["/beta/evidence"][0][1].data.tobytes() == b"evidence"
     (_, first), (_, second) = seen["/alpha/map_state"]
     assert (first.data.tobytes(), first.is_key_frame, first.sequence) == (b"key frame", True, 0)
     assert (second.data.tobytes(), second.is_key_frame, second.base_sequence) == (b"", False, 0)
@@ -201,7 +210,7 @@ def test_an_interrupt_leaves_a_valid_partial_result(tmp_path: Path) -> None:
     assert not out.exists()
     assert metadata(tmp_path / "out.partial.mcap")["summary"]["stop_reason"] == "interrupted"
     with AnyReader([tmp_path / "out.partial.mcap"]) as reader:
-        assert {connection.topic for connection in reader.connections} == {"/tf_static", "/metrics"}
+        assert {connection.topic for connection in reader.connections} == {"/tf_static", "/metrics", "/contradiction"}
 
 
 def test_partial_names() -> None:

@@ -12,7 +12,7 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import ConfigError
 from octoreplay.io.robots.describe import describe
 from octoreplay.io.robots.discover import discover, resolve
-from octoreplay.io.robots.team_frames import frames_warning
+from octoreplay.io.robots.team_frames import frame_origins, frames_warning
 from support.discovered_logs import run_of
 from support.log_factory import IDENTITY, Entry, robot_entries, ros2, write_mcap
 
@@ -147,3 +147,30 @@ def test_robots_of_one_log(tmp_path, frame_id, num_warnings):
     joints = [("odom", f"{name}/base_link", stamp, (0, 0, 0), IDENTITY) for name in "ab"]
     entries.append(Entry("/tf", "tf2_msgs/msg/TFMessage", ros2.tf(*joints), stamp))
     assert describe([write_mcap(tmp_path / "tree.mcap", entries)]).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected"),
+    [
+        ((stated("map"), stated("map")), ("frame 'map' of the logs",) * 2),
+        ((stated("odom"), stated("odom")), ("assumed: the map frame is taken for the team's frame",) * 2),
+        ((None, stated("map")), ("assumed: the map frame is taken for the team's frame",) * 2),
+        ((stated("odom"),), ("frame 'odom' of the logs",)),
+    ],
+)
+def test_the_origin_of_a_frame_is_the_logs_or_an_assumption(frames, expected):
+    robots = [RobotConfig(name, (Path(name),), pose_topic="/odom") for name in "abc"[: len(frames)]]
+    assert tuple(frame_origins(list(zip(robots, frames, strict=True))).values()) == expected
+
+
+def test_the_origin_of_a_given_frame_is_the_team_file_or_the_command_that_found_it():
+    robots = [
+        RobotConfig("a", (Path("a"),), T_team_map=ORIGIN),
+        RobotConfig("b", (Path("b"),), T_team_map=ORIGIN, T_team_map_from="aligned with a, L 812"),
+        RobotConfig("c", (Path("c"),)),
+    ]
+    assert frame_origins([(robot, stated("map")) for robot in robots]) == {
+        "a": "given in the team file",
+        "b": "aligned with a, L 812",
+        "c": "assumed: the map frame is taken for the team's frame",
+    }

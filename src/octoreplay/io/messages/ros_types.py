@@ -80,7 +80,7 @@ string first
 string second
 uint64 overlap_cells
 # Cells that one calls occupied and the other occupied or free; the share that the other calls free, and the share
-# around which it has no occupied cell either.
+# that it calls firmly free without an occupied cell beside.
 uint64 occupied_cells
 float64 contradiction
 float64 clear_contradiction

@@ -1,8 +1,8 @@
 """Contradiction of evidence, brick by brick: the state of each cell in one robot's evidence, and counts of robot pairs.
 
 The *state* of a brick is a row of W masks (uint64, bit i stands for cell i): at KNOWN the known cells, at FREE the free
-ones, at NEAR the occupied cells and their 26 neighbours, and from LABEL on the binary digits of the cells' labels,
-lowest first. A label is the class_id 1..C of an occupied cell, else 0.
+ones, at FIRM those that were freed several times, at NEAR the occupied cells and their 26 neighbours, and from LABEL on
+the binary digits of the cells' labels, lowest first. A label is the class_id 1..C of an occupied cell, else 0.
 
 Each brick of the team has a row of *slots*, with the position of each robot's state, -1 where a robot does not have the
 brick. In shapes, N is the number of robots, n of bricks, m of rows and s of slots.
@@ -24,7 +24,7 @@ from octoreplay.mapping.kernels.storage import (
     spread_bits,
 )
 
-KNOWN, FREE, NEAR, LABEL = 0, 1, 2, 3
+KNOWN, FREE, FIRM, NEAR, LABEL = 0, 1, 2, 3, 4
 """Positions of the masks in a state."""
 OVERLAP, OCCUPIED_FREE, OCCUPIED_CLEAR, BOTH_OCCUPIED, OTHER_LABEL = 0, 1, 2, 3, 4
 """Positions of the counts of a pair."""
@@ -56,7 +56,7 @@ def _first_shared_class(bricks, index, octet, num_classes):
 
 
 @kernel
-def classify_bricks(bricks, indices, places, occupied_from, free_to, num_classes, states):
+def classify_bricks(bricks, indices, places, occupied_from, free_to, firm_to, num_classes, states):
     """Write the states of bricks of one robot's evidence, without the mask NEAR.
 
     A cell's label is the class with the largest value; ties go to the lower id.
@@ -66,19 +66,21 @@ def classify_bricks(bricks, indices, places, occupied_from, free_to, num_classes
     - ``places`` (n,) int32: position of each brick in ``states``.
     - ``occupied_from``: float32 log-odds; a cell is occupied where its largest value is at least this.
     - ``free_to``: float32 log-odds below ``occupied_from``; a cell is free where its largest value is at most this.
+    - ``firm_to``: float32 log-odds; a free cell is firmly free where its largest value is at most this.
     - ``num_classes``: C.
     - ``states`` (s, W) uint64: output.
     """
     for n in range(indices.size):
         index, i = indices[n], places[n]
         block, known = np.int64(bricks.blocks[index]), bricks.known[index]
-        states[i, KNOWN], states[i, FREE] = known, np.uint64(0)
+        states[i, KNOWN], states[i, FREE], states[i, FIRM] = known, np.uint64(0), np.uint64(0)
         for w in range(LABEL, states.shape[1]):
             states[i, w] = np.uint64(0)
         if block < 0:
             # All classes are equal: the label is the lowest class.
             if bricks.values[index] <= free_to:
                 states[i, FREE] = known
+                states[i, FIRM] = known if bricks.values[index] <= firm_to else np.uint64(0)
             elif bricks.values[index] >= occupied_from:
                 states[i, LABEL] = known
             continue
@@ -106,6 +108,7 @@ def classify_bricks(bricks, indices, places, occupied_from, free_to, num_classes
                     word_row += count_ones(mask)
                 if best <= free_to:
                     states[i, FREE] |= cell
+                    states[i, FIRM] |= cell if best <= firm_to else np.uint64(0)
                 elif best >= occupied_from:
                     label = best_class + 1
                     for w in range(LABEL, states.shape[1]):
@@ -227,15 +230,16 @@ def _count_pair(counts, sign, robot, own_states, own, other_robot, other_states,
     differs = np.uint64(0)
     for w in range(LABEL, own_states.shape[1]):
         differs |= own_states[own, w] ^ other_states[other, w]
-    occupied_free, free_occupied = occupied & other_states[other, FREE], other_occupied & own_states[own, FREE]
+    clear = own_states[own, FIRM] & ~own_states[own, NEAR]
+    other_clear = other_states[other, FIRM] & ~other_states[other, NEAR]
     first, second = min(robot, other_robot), max(robot, other_robot)
     counts[first, second, OVERLAP] += sign * count_ones(own_states[own, KNOWN] & other_states[other, KNOWN])
     counts[first, second, BOTH_OCCUPIED] += sign * count_ones(both)
     counts[first, second, OTHER_LABEL] += sign * count_ones(both & differs)
-    counts[robot, other_robot, OCCUPIED_FREE] += sign * count_ones(occupied_free)
-    counts[other_robot, robot, OCCUPIED_FREE] += sign * count_ones(free_occupied)
-    counts[robot, other_robot, OCCUPIED_CLEAR] += sign * count_ones(occupied_free & ~other_states[other, NEAR])
-    counts[other_robot, robot, OCCUPIED_CLEAR] += sign * count_ones(free_occupied & ~own_states[own, NEAR])
+    counts[robot, other_robot, OCCUPIED_FREE] += sign * count_ones(occupied & other_states[other, FREE])
+    counts[other_robot, robot, OCCUPIED_FREE] += sign * count_ones(other_occupied & own_states[own, FREE])
+    counts[robot, other_robot, OCCUPIED_CLEAR] += sign * count_ones(occupied & other_clear)
+    counts[other_robot, robot, OCCUPIED_CLEAR] += sign * count_ones(other_occupied & clear)
 
 
 @kernel
@@ -250,7 +254,8 @@ def update_counts(slots, counted, latest, robot, marks, counts):
     - ``robot``: index of the robot.
     - ``marks`` (m,) uint8: rows to count.
     - ``counts`` (N, N, NUM_COUNTS) int64: in place. [i, j] counts at OCCUPIED_FREE the cells that i calls occupied and
-      j calls free, and at OCCUPIED_CLEAR those of them around which j has no occupied cell. For i < j it counts at
+      j calls free, and at OCCUPIED_CLEAR those of them that are firmly free and have no occupied cell of j beside them.
+      For i < j it counts at
       OVERLAP the cells that both know, at BOTH_OCCUPIED those that both call occupied, and at OTHER_LABEL those of them
       with different labels. The rest is unused.
     """

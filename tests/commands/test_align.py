@@ -1,0 +1,106 @@
+"""The command 'align' and the option 'run --align'."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.config.frames_file import load_frames_file
+from octoreplay.config.team_file import load_team_file
+from octoreplay.registration.placing import pose_difference
+from octoreplay.result import open_result
+from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.transforms import inverse, transform_of
+from support.command_line import assert_fails, octoreplay
+from support.fixture_paths import PAIR_TEAM
+from support.long_suite import long
+
+
+@pytest.fixture(scope="module")
+def twins(shared_file) -> Path:
+    """Folder with one robot's log under two names."""
+
+    def make(folder: Path) -> None:
+        simulate_team(
+            folder,
+            SimulationConfig(
+                num_robots=1, duration=6.0, rate=2.0, image=(96, 72), own_frames=True, world_size=40.0, seed=3
+            ),
+        )
+        shutil.copy(folder / "husky_1.mcap", folder / "twin.mcap")
+
+    return shared_file("twins", make)
+
+
+def test_align_writes_a_team_file_that_a_run_takes(twins, tmp_path):
+    logs = (twins / "husky_1.mcap", twins / "twin.mcap")
+    done = octoreplay("align", *logs, "-o", "aligned.yaml", "--json", "a.json", "--csv", "a.csv", "--plot", "plots",
+                      folder=tmp_path)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "accepted" in done.stdout
+    assert "have equal maps: are their logs the same?" in done.stderr
+    team = load_team_file(tmp_path / "aligned.yaml")
+    assert [robot.robot_id for robot in team.robots] == ["husky_1", "twin"]
+    shift, angle = pose_difference(transform_of(team.robots[1].T_team_map), np.eye(4))
+    assert (shift, angle) == pytest.approx((0, 0), abs=1e-3)
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"team.png", "pair_husky_1_twin.png"}
+    assert (tmp_path / "a.json").stat().st_size > 0
+    assert (tmp_path / "a.csv").stat().st_size > 0
+
+
+def test_run_align_stores_the_origin_of_each_frame_and_align_reads_the_stored_evidence(twins, tmp_path):
+    logs = (twins / "husky_1.mcap", twins / "twin.mcap")
+    done = octoreplay("run", "--align", *logs, "-o", "r.mcap", "--settle", 0, "--strict-frames", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "nothing relates the map frames" not in done.stderr
+    assert "twin: aligned with husky_1, L " in octoreplay("metrics", "r.mcap", folder=tmp_path).stdout
+    with open_result(tmp_path / "r.mcap") as result:
+        origins = result.summary.frame_origins
+        assert origins["husky_1"] == "frame of the team"
+        assert result.config.robots[1].T_team_map_from == origins["twin"]
+    again = octoreplay("align", "r.mcap", "-o", "again.yaml", folder=tmp_path)
+    assert again.returncode == 0, again.stderr
+    T = transform_of(load_team_file(tmp_path / "again.yaml").robots[1].T_team_map)
+    assert pose_difference(T, np.eye(4))[0] < 0.02
+    assert_fails(2, "holds finished maps; leave out --resolution", "align", tmp_path / "r.mcap", "-o",
+                 tmp_path / "x.yaml", "--resolution", 0.5)  # fmt: skip
+
+
+def test_robots_without_overlap_give_a_reason_and_no_team_file(tmp_path):
+    done = octoreplay("align", PAIR_TEAM, "-o", "out.yaml", "--csv", "pairs.csv", "--max-range", 0.2, folder=tmp_path)
+    assert done.returncode == 1
+    assert "error: no two of the 2 robots could be aligned; the best pair is" in done.stderr
+    assert not (tmp_path / "out.yaml").exists()
+    assert "fewer than 150" in (tmp_path / "pairs.csv").read_text()
+
+
+def test_wrong_inputs_are_named(tmp_path):
+    out = tmp_path / "out.yaml"
+    guess = tmp_path / "guess.yaml"
+    guess.write_text("T_team_map: {nobody: [0, 0, 0, 0, 0, 0, 1]}\n")
+    assert_fails(2, "guess: robot 'nobody' is not in the team", "align", PAIR_TEAM, "-o", out, "--guess", guess)
+    assert_fails(2, "missing.yaml: cannot be read", "align", PAIR_TEAM, "-o", out, "--guess", tmp_path / "missing.yaml")
+    assert_fails(2, "must end in .yaml", "align", PAIR_TEAM, "-o", tmp_path / "out.txt")
+    assert_fails(1, "is an input of this command", "align", PAIR_TEAM, "-o", PAIR_TEAM)
+    assert_fails(1, "is a file; name a folder", "align", PAIR_TEAM, "-o", out, "--plot", guess)
+    assert not out.exists()
+
+
+@long
+def test_a_simulated_team_with_frames_of_its_own_is_aligned(tmp_path):
+    simulate_team(tmp_path / "team", SimulationConfig(num_robots=3, duration=60.0, own_frames=True, seed=0))
+    done = octoreplay("align", "team/team.yaml", "-o", "aligned.yaml", "--components", folder=tmp_path)
+    truth = load_frames_file(tmp_path / "team" / "frames.yaml")
+    robots = load_team_file(tmp_path / "aligned.yaml").robots
+    assert done.returncode == (0 if len(robots) == 3 else 1)
+    assert len(robots) > 1
+    T_team_truth = inverse(transform_of(truth[robots[0].robot_id]))
+    for robot in robots:
+        shift, angle = pose_difference(
+            transform_of(robot.T_team_map), T_team_truth @ transform_of(truth[robot.robot_id])
+        )
+        assert shift < 0.5
+        assert angle < np.radians(1.5)

@@ -1,0 +1,163 @@
+"""Alignment of a team from its robots' maps: frames, candidates, given poses, configuration, tables and files."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.team_file import dump_team, parse_team
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.registration.placing import pose_difference
+from octoreplay.replay.alignment import Alignment, align_robots, aligned_config, check_aligned
+from octoreplay.report.alignment_files import PAIR_COLUMNS, write_alignment
+from octoreplay.report.alignment_plots import write_alignment_figures
+from octoreplay.report.alignment_tables import alignment_tables
+from octoreplay.report.tables import terminal
+from octoreplay.transforms import inverse, numbers_of
+from support.village_maps import T_village_map, empty_map, team_config, village_map
+
+PLACES = {"ant": ((-2.0, 0.0), 0), "bee": ((3.0, 3.0), 1), "cow": ((2.0, -4.0), 2)}
+TRUTH = {name: T_village_map(center, turns=turns) for name, (center, turns) in PLACES.items()}
+IDS = (*PLACES, "dog")
+
+
+@pytest.fixture(scope="module")
+def maps():
+    """Maps of three robots of one village, and an empty one."""
+    return [*(village_map(center, 13.0, turns=turns) for center, turns in PLACES.values()), empty_map()]
+
+
+@pytest.fixture(scope="module")
+def alignment(maps) -> Alignment:
+    return align_robots(team_config(*IDS), maps)
+
+
+def errors(alignment: Alignment, T_team_village: np.ndarray) -> list[tuple[float, float]]:
+    """Errors [m, rad] of the robots of the first team."""
+    return [pose_difference(f.T_team_map, T_team_village @ TRUTH[f.robot_id]) for f in alignment.teams[0]]
+
+
+def test_frames_are_those_of_the_village(alignment):
+    assert [frame.robot_id for frame in alignment.teams[0]] == ["ant", "bee", "cow"]
+    for shift, angle in errors(alignment, inverse(TRUTH["ant"])):
+        assert shift < 0.05
+        assert math.degrees(angle) < 0.2
+    first, second, _ = alignment.teams[0]
+    assert (first.origin, first.sigma) == ("frame of the team", None)
+    assert second.origin.startswith(f"aligned with {second.partner}, L ")
+    assert second.sigma is not None
+    assert min(second.sigma) > 0
+    assert max(second.sigma) < 0.5
+
+
+def test_a_robot_without_a_map_is_left_out_and_named(alignment):
+    assert alignment.left_out == ("dog",)
+    assert not alignment.is_whole
+    assert any("dog is not connected" in s and "fewer than 150" in s for s in alignment.warnings)
+    assert any("map of dog is empty" in sentence for sentence in alignment.notes)
+
+
+def test_maps_in_a_known_frame_give_the_frames_of_the_robots(maps, alignment):
+    T_map_own = [T_village_map((1.0, 2.0), turns=k) for k in range(4)]
+    shares = []
+    placed = align_robots(team_config(*IDS), maps, T_map_own=T_map_own, progress=shares.append, num_threads=1)
+    assert shares[-1] == 1.0
+    for robot, T, before in zip(placed.teams[0], T_map_own, alignment.teams[0], strict=False):
+        expected = T_map_own[0] @ before.T_team_map @ inverse(T)
+        assert pose_difference(robot.T_team_map, expected) == pytest.approx((0, 0), abs=1e-6)
+
+
+def given(name, T):
+    """A robot with a surveyed T_team_map."""
+    return RobotConfig(name, (Path(f"{name}.mcap"),), T_team_map=numbers_of(T))
+
+
+def test_given_poses_keep_the_team_frame_and_wrong_ones_are_named(maps):
+    far = T_village_map((100.0, 0.0))
+    wrong = T_village_map((5.0, 0.0)) @ TRUTH["cow"]
+    robots = (given("ant", TRUTH["ant"]), "bee", given("cow", wrong), given("dog", far))
+    aligned = align_robots(team_config(*robots), maps)
+    placed = {frame.robot_id: frame for frame in aligned.teams[0]}
+    assert list(placed) == list(IDS)
+    assert placed["ant"].is_given
+    assert placed["dog"].is_given
+    assert not placed["cow"].is_given
+    assert all(
+        shift < 0.05 for shift, _ in errors(dataclasses.replace(aligned, teams=(aligned.teams[0][:3],)), np.eye(4))
+    )
+    (problem,) = aligned.problems
+    assert problem.startswith("the T_team_map given for cow is not used: it disagrees with that of ant")
+    assert any("dog keeps its given T_team_map, which no overlap" in note for note in aligned.notes)
+    written = aligned_config(team_config(*robots), aligned.teams[0]).robots
+    assert written[0] == robots[0]
+    assert written[3] == robots[3]
+    assert written[2].T_team_map_from == placed["cow"].origin
+
+
+def test_a_guess_is_verified_and_never_trusted():
+    empty = [empty_map(), empty_map()]
+    guess = {"ant": numbers_of(np.eye(4)), "bee": numbers_of(T_village_map((1.0, 0.0)))}
+    with pytest.raises(InputError, match="no two of the 2 robots could be aligned; the best pair is ant and bee"):
+        check_aligned(align_robots(team_config("ant", "bee"), empty, guesses=guess))
+
+
+def test_equal_maps_are_aligned_exactly_and_named(maps):
+    twins = align_robots(team_config("ant", "twin"), [maps[0], maps[0]])
+    assert pose_difference(twins.teams[0][1].T_team_map, np.eye(4)) == pytest.approx((0, 0), abs=1e-6)
+    assert twins.notes == ("ant and twin have equal maps: are their logs the same?",)
+
+
+def test_one_robot_and_unknown_guesses_are_refused(maps):
+    with pytest.raises(ConfigError, match="align: needs at least two robots; the team has one, ant"):
+        align_robots(team_config("ant"), maps[:1])
+    with pytest.raises(ConfigError, match="guess: robot 'eel' is not in the team: ant, bee"):
+        align_robots(team_config("ant", "bee"), maps[:2], guesses={"eel": numbers_of(np.eye(4))})
+
+
+def test_the_aligned_team_file_has_frames_and_deviations_and_loads_again(alignment):
+    config = team_config(*IDS)
+    config = dataclasses.replace(
+        config, network=dataclasses.replace(config.network, one_way=(("ant", "bee"), ("dog", "ant")))
+    )
+    aligned = aligned_config(config, alignment.teams[0])
+    assert [robot.robot_id for robot in aligned.robots] == ["ant", "bee", "cow"]
+    assert aligned.network.one_way == (("ant", "bee"),)
+    again = parse_team(dump_team(aligned), name="aligned.yaml", folder=Path())
+    assert again == aligned
+    assert again.robots[1].T_team_map == numbers_of(alignment.teams[0][1].T_team_map)
+    assert again.robots[1].T_team_map_sigma == alignment.teams[0][1].sigma
+
+
+def test_tables_show_every_pair_with_the_number_that_failed(alignment, capsys):
+    terminal(width=160).print(alignment_tables(alignment))
+    text = capsys.readouterr().out
+    assert text.count("accepted") == 3
+    assert text.count("refused") == 3
+    assert "aligned with ant" in text
+
+
+def test_files_hold_every_pair_and_frame(alignment, tmp_path):
+    csv_path, json_path = tmp_path / "pairs.csv", tmp_path / "frames.json"
+    assert write_alignment(alignment, csv_path=csv_path, json_path=json_path) == [csv_path, json_path]
+    rows = list(csv.DictReader(csv_path.read_text().splitlines()))
+    assert tuple(rows[0]) == PAIR_COLUMNS
+    assert [row["accepted"] for row in rows] == ["True", "True", "False", "True", "False", "False"]
+    content = json.loads(json_path.read_text())
+    assert content["left_out"] == ["dog"]
+    frame = content["teams"][0][1]
+    assert frame["T_team_map"] == list(numbers_of(alignment.teams[0][1].T_team_map))
+    assert np.array(frame["covariance"]).shape == (6, 6)
+    assert len(content["pairs"]) == 6
+
+
+def test_figures_are_of_the_team_and_of_every_pair(alignment, tmp_path):
+    written = write_alignment_figures(dataclasses.replace(alignment, pairs=alignment.pairs[:1]), tmp_path)
+    assert written == [tmp_path / "team.png", tmp_path / "pair_ant_bee.png"]
+    assert all(path.stat().st_size > 1000 for path in written)
