@@ -158,6 +158,10 @@ def _check_on_air(config: RunConfig) -> None:
             f"align: '{ON_AIR}' has no positions in one frame, which topology '{config.network.topology}' needs; use"
             " another topology, or find the frames first with 'octoreplay align'"
         )
+    if len(config.map.bounds) == 6:
+        raise ConfigError(
+            f"bounds: x and y are in the team's frame, which robots do not know with align '{ON_AIR}'; give ZMIN,ZMAX"
+        )
     if config.sensor.hide_robots:
         raise ConfigError(
             f"hide_robots: needs the positions of all robots from the beginning, which align '{ON_AIR}' does not give;"

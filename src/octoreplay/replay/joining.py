@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -99,14 +99,8 @@ class Joining:
         pairs = itertools.combinations(range(len(robots)), 2)
         attempts = [attempt for pair in pairs if (attempt := self._attempt(robots, *pair, is_last=is_last))]
         maps = self._maps([octree for attempt in attempts for octree in attempt.evidence])
-
-        def align(attempt: _Attempt) -> PairAlignment:
-            pair = align_pair([maps[id(octree)] for octree in attempt.evidence], 0, 1, limits=self._limits)
-            pair = dataclasses.replace(pair, first=attempt.first, second=attempt.second)
-            is_contradicted = pair.is_accepted and self._is_contradicted(robots, attempt.aligner, pair)
-            return dataclasses.replace(pair, refusal="contradicts another robot") if is_contradicted else pair
-
-        accepted = [pair for pair in self._threads.map(align, attempts) if pair.is_accepted]
+        aligned = self._threads.map(lambda attempt: self._align(robots, attempt, maps), attempts)
+        accepted = [pair for pair in aligned if pair.is_accepted]
         self._found = sorted(accepted, key=lambda pair: -pair.verification.score)
 
     def join(self, tick: int, seconds: float) -> tuple[int, ...]:
@@ -185,6 +179,14 @@ class Joining:
         unique = {id(octree): octree for octree in octrees}
         maps = self._threads.map(lambda octree: own_map_of(self._config, octree), unique.values())
         return dict(zip(unique, maps, strict=True))
+
+    def _align(self, robots: Sequence[Robot], attempt: _Attempt, maps: Mapping[int, OwnMap]) -> PairAlignment:
+        """The alignment of an attempt; refused where the aligner holds evidence that contradicts it."""
+        pair = align_pair([maps[id(octree)] for octree in attempt.evidence], 0, 1, limits=self._limits)
+        pair = dataclasses.replace(pair, first=attempt.first, second=attempt.second)
+        if pair.is_accepted and self._is_contradicted(robots, attempt.aligner, pair):
+            return dataclasses.replace(pair, refusal="contradicts the evidence of another robot")
+        return pair
 
     def _is_contradicted(self, robots: Sequence[Robot], aligner: int, pair: PairAlignment) -> bool:
         """True where other evidence in the found frame that the aligner holds contradicts its own clearly."""
