@@ -15,6 +15,7 @@ from octoreplay.replay.joining import Joining
 from octoreplay.replay.session import Session
 from octoreplay.transforms import inverse, numbers_of, pose_matrix, transform_of
 from reference.scenarios import TeamShape, make_scenario
+from support.long_suite import long, one_in
 from support.sessions import FrameList
 
 SCENARIO = make_scenario(5, TeamShape(num_robots=3, num_ticks=12, image=(12, 9), resolution=0.4, late_start=0.1))
@@ -106,9 +107,11 @@ def given_run(session, **parameters):
 
 
 @pytest.mark.parametrize("parameters", [
-    {"rule": "bayes"}, {"rule": "flood"}, {"rule": "ratio"}, {"rule": "local"},
-    {"rule": "bayes", "mode": "on-arrival"}, {"rule": "bayes", "evidence": "cell-average"},
-    {"rule": "flood", "packets": "delta", "latency": 1.2}, {"rule": "bayes", "topology": "line"},
+    {"rule": "bayes"}, {"rule": "local"}, {"rule": "flood", "packets": "delta", "latency": 1.2},
+    pytest.param({"rule": "ratio"}, marks=long), pytest.param({"rule": "flood"}, marks=long),
+    pytest.param({"rule": "bayes", "mode": "on-arrival"}, marks=long),
+    pytest.param({"rule": "bayes", "evidence": "cell-average"}, marks=long),
+    pytest.param({"rule": "bayes", "topology": "line"}, marks=long),
 ], ids=str)  # fmt: skip
 def test_after_joining_maps_and_evidence_equal_those_of_a_run_with_the_found_frames(by_truth, parameters):
     session = session_of(configured(**parameters))
@@ -123,7 +126,7 @@ def test_after_joining_maps_and_evidence_equal_those_of_a_run_with_the_found_fra
     assert_equal(ticks[-1].oracle, expected[-1].oracle)
 
 
-@pytest.mark.parametrize("rule", ["gradient", "natural", "merge"])
+@pytest.mark.parametrize("rule", one_in(3, ["gradient", "natural", "merge"]))
 def test_other_rules_have_the_evidence_and_the_known_cells_of_a_run_with_the_found_frames(by_truth, rule):
     session = session_of(configured(rule=rule))
     ticks = replayed(session)
@@ -134,7 +137,7 @@ def test_other_rules_have_the_evidence_and_the_known_cells_of_a_run_with_the_fou
         np.testing.assert_array_equal(values(mine)[0], values(other)[0])
 
 
-@pytest.mark.parametrize("latency", [0.0, 1.2])
+@pytest.mark.parametrize("latency", one_in(2, [1.2, 0.0]))
 def test_robots_mix_only_with_robots_in_their_frame(by_truth, latency):
     """Until the first join, each map is the robot's own evidence; after it, the known cells are the component's."""
     seen = set()
