@@ -14,8 +14,8 @@ from support.command_line import octoreplay, octoreplay_process
 from support.fixture_paths import PAIR, PAIR_TEAM
 
 COMMANDS = (
-    "run", "align", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd", "import-clouds",
-    "evaluate", "check", "compare", "sweep", "experiment",
+    "run", "align", "refine", "simulate", "demo", "export", "metrics", "info", "init", "query", "import-rgbd",
+    "import-clouds", "evaluate", "check", "compare", "sweep", "experiment",
 )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from octoreplay.commands import (
     evaluation,
     experiments,
     logs,
+    refining,
     results,
     running,
     studies,
@@ -41,10 +42,9 @@ def cli() -> None:
 
 
 for _command in (
-    running.run, running.simulate, demonstration.demo, logs.info, logs.init, logs.import_rgbd, logs.import_clouds,
-    aligning.align,
-    results.metrics, results.export, results.query, evaluation.evaluate, verdicts.check, verdicts.compare,
-    studies.sweep, experiments.experiment,
+    running.run, running.simulate, demonstration.demo, aligning.align, refining.refine, logs.info, logs.init,
+    logs.import_rgbd, logs.import_clouds, results.metrics, results.export, results.query, evaluation.evaluate,
+    verdicts.check, verdicts.compare, studies.sweep, experiments.experiment,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -23,7 +23,11 @@ def test_a_part_of_a_team_keeps_what_concerns_its_robots_alone():
     config = RunConfig(tuple(robots), link_overrides=(("a", "b", (("loss", 0.1),)), ("a", "c", (("loss", 0.2),))))
     config = config.with_parameters({"hide_robots": True, "resolution": 0.4})
     network = dataclasses.replace(
-        config.network, edges=(("a", "b", None), ("b", "c", None)), one_way=(("c", "a"),), schedule=schedule
+        config.network,
+        topology="edges",
+        edges=(("a", "b", None), ("b", "c", None)),
+        one_way=(("c", "a"),),
+        schedule=schedule,
     )
     part = subteam(dataclasses.replace(config, network=network), robots[:2])
     assert part.robots == tuple(robots[:2])
@@ -37,3 +41,11 @@ def test_a_part_of_a_team_keeps_what_concerns_its_robots_alone():
     assert part.map == config.map
     # No robot of the part has a body to hide.
     assert not part.sensor.hide_robots
+
+
+def test_without_a_remaining_edge_the_topology_is_complete():
+    robots = [RobotConfig(name, (Path(f"{name}.mcap"),)) for name in ("a", "b", "c")]
+    config = RunConfig(tuple(robots))
+    network = dataclasses.replace(config.network, topology="edges", weights="given", edges=(("a", "c", 0.5),))
+    part = subteam(dataclasses.replace(config, network=network), robots[:2]).network
+    assert (part.topology, part.weights, part.edges) == ("complete", "metropolis", ())

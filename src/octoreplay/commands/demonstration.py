@@ -52,7 +52,7 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
     save_figures({"frames.png": team_figure(alignment, before=titles[0], after=titles[1])}, figures)
     export.export_ply(result_path, ply, what="voxels")
     tables.show(out, tables.results(summary))
-    tables.show(out, contradiction_table({"assumed, all the same": before, "aligned": after}))
+    tables.show(out, contradiction_table({"assumed": before, "aligned": after}))
     show_warnings(err, summary)
     for sentence in alignment.warnings:
         warn(err, sentence)
@@ -100,4 +100,4 @@ def _clear(pairs: tuple[PairMetrics, ...]) -> str:
     from octoreplay.report.tables import share
 
     ranked = ranked_pairs(pairs, "clear_contradiction")
-    return f"{share(ranked[0].clear_contradiction)} contradiction, worst pair" if ranked else "no common space"
+    return f"{share(ranked[0].clear_contradiction)} clear contradiction, worst pair" if ranked else "no common space"

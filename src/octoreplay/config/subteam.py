@@ -16,16 +16,21 @@ _Config = TypeVar("_Config", bound=RunConfig)
 def subteam(config: _Config, robots: Sequence[RobotConfig]) -> _Config:
     """Return the configuration with these robots only, whose ids are among those of ``config``.
 
-    Edges, one-way links, schedule entries and link parameters of other robots are left out.
+    Edges, one-way links, schedule entries and link parameters of other robots are left out. Where an edge list has no
+    edge left, the topology is complete.
     """
     kept = {robot.robot_id for robot in robots}
 
     def is_kept(link: Sequence[object]) -> bool:
         return link[0] in kept and link[1] in kept
 
+    edges = tuple(filter(is_kept, config.network.edges))
+    has_topology = bool(edges) or config.network.topology != "edges"
     network = dataclasses.replace(
         config.network,
-        edges=tuple(filter(is_kept, config.network.edges)),
+        topology=config.network.topology if has_topology else "complete",
+        weights=config.network.weights if has_topology or config.network.weights != "given" else "metropolis",
+        edges=edges,
         one_way=tuple(filter(is_kept, config.network.one_way)),
         schedule=tuple(_entry(entry, kept) for entry in config.network.schedule),
     )

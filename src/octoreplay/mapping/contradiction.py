@@ -51,7 +51,7 @@ def state_limits(sensor: SensorConfig) -> StateLimits:
 
 
 def contradicting_pairs(pairs: Sequence[PairMetrics]) -> list[PairMetrics]:
-    """Return the pairs whose clear contradiction is above CLEAR_LIMIT, the largest first."""
+    """Return the pairs with a clear contradiction above CLEAR_LIMIT, the largest first."""
     return [pair for pair in ranked_pairs(pairs, "clear_contradiction") if pair.clear_contradiction > CLEAR_LIMIT]
 
 
@@ -115,7 +115,7 @@ class EvidenceComparer:
             self._latest = _with_rows(self._latest, len(self._counted), 0)
 
     def _refresh(self, robot: int, octree: SemanticOctree, indices: Int64Array, rows: Int64Array) -> UInt8Array:
-        """Update the latest states of a robot's bricks; returns the marks of the rows whose state changed."""
+        """Update the latest states of a robot's bricks; returns a mark for each row, not 0 for changed states."""
         team, neighbours = self._bricks.bricks, np.empty((3, 3, 3), np.int64)
         marks = np.zeros(self._bricks.num_bricks, np.uint8)
         kernels.classify_bricks(

@@ -1,1 +1,1 @@
-"""Frames of a team: own maps, search, verification and refinement of pairs, and the frames of a team."""
+"""Frames of a team: own maps, search, verification and refinement of pairs, frames of a team, and repair of drift."""

@@ -17,6 +17,7 @@ from octoreplay.records import Float64Array, Int64Array
 # Largest distance of a match under a right pose [cell].
 _INLIER = 3.0
 _NUM_NEIGHBOURS = 100
+_MIN_POINTS = 20
 _NUM_BINS = 11
 _MATCHES_PER_POINT = 2
 _NUM_TRIPLES = 400_000
@@ -46,9 +47,9 @@ def feature_candidates(first: DescribedPoints, second: DescribedPoints, cell: fl
 
     ``cell`` is the edge of the maps' cells [m].
     """
-    sources, targets = _matches(second, first)
-    if len(sources) < 3:
+    if min(len(first.points), len(second.points)) < _MIN_POINTS:
         return []
+    sources, targets = _matches(second, first)
     source, target = second.points[sources], first.points[targets]
     rng = np.random.default_rng(0)
     triples = rng.integers(0, len(source), (_NUM_TRIPLES, 3))

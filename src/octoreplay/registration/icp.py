@@ -27,6 +27,8 @@ _FLATNESS = 0.25
 # Squared Mahalanobis distance at which Geman and McClure's weight is 1/4.
 _ROBUST_SCALE = 4.0
 _NUM_ITERATIONS = 12
+# Iterations of a stage end where a step is below this share of its gate; a rotation is measured at this distance [m].
+_RELATIVE_STEP, _LEVER = 0.005, 10.0
 # Number of neighbouring correspondences that carry the information of one independent measurement.
 _CORRESPONDENCES_PER_SAMPLE = 50.0
 
@@ -54,6 +56,8 @@ class Surface:
 
         Local surfaces come from the principal components of the points of equal code within ``radius`` [m].
         """
+        if len(points) == 0:
+            return cls(points, codes, np.zeros((0, 3, 3)), weights)
         tree = cKDTree(_keys(points, codes))
         _, neighbours = tree.query(_keys(points, codes), k=_NUM_NEIGHBOURS, distance_upper_bound=radius)
         exists = neighbours < len(points)
@@ -111,8 +115,8 @@ def icp(
     T = np.array(T_target_source, np.float64)
     hessian, num = np.zeros((6, 6)), 0
     centre = np.zeros(3)
+    near_source, near_target = _close_parts(source, target, T, 1.5 * gates[0])
     for gate in gates:
-        near_source, near_target = _close_parts(source, target, T, 1.5 * gate)
         for _ in range(_NUM_ITERATIONS):
             pairs = _correspondences(near_source, near_target, T, gate)
             num = len(pairs[0])
@@ -126,7 +130,8 @@ def icp(
             damping = 1e-9 * np.trace(hessian) * np.eye(6)
             motion = -np.linalg.solve(hessian + damping, gradient)
             T = _moved(T, motion, centre)
-            if np.linalg.norm(motion[3:]) < 1e-3 and np.linalg.norm(motion[:3]) < 1e-4:
+            shift, angle = np.linalg.norm(motion[3:]), np.linalg.norm(motion[:3])
+            if shift < _RELATIVE_STEP * gate and angle < _RELATIVE_STEP * gate / _LEVER:
                 break
     about_origin = np.eye(6)
     about_origin[3:, :3] = -_cross_matrix(centre)

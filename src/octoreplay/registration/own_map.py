@@ -169,6 +169,8 @@ class OwnMap:
     @cached_property
     def described_points(self) -> DescribedPoints:
         """Thinned points of the surface with descriptors of their local shapes; normals point to free space."""
+        if len(self.occupied) == 0:
+            return DescribedPoints(np.zeros((0, 3)), np.zeros((0, 33)))
         cells = np.floor(self.surface.points / (_FEATURE_SPACING * self.resolution)).astype(np.int64)
         _, chosen = np.unique(cells, axis=0, return_index=True)
         points = self.surface.points[chosen]

@@ -62,7 +62,7 @@ class AcceptLimits:
     max_tilt: float = math.radians(2.5)
     max_rival: float = 0.5
     min_shape_cells: int = 800
-    min_shape_same: float = 0.90
+    min_shape_same: float = 0.96
 
 
 @dataclass(frozen=True, eq=False)

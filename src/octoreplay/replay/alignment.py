@@ -23,7 +23,7 @@ from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots, pose_difference
-from octoreplay.registration.team import align_team
+from octoreplay.registration.team import TeamAlignment, align_team
 from octoreplay.replay.own_maps import own_map_of, own_maps
 from octoreplay.result import Result
 from octoreplay.transforms import inverse, numbers_of, transform_of
@@ -189,22 +189,8 @@ def align_robots(
     robot_ids = tuple(robot.robot_id for robot in config.robots)
     check_alignable(config, guesses or {})
     placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
-    pairs = list(combinations(range(len(maps)), 2))
-    with ThreadPoolExecutor(num_threads or min(len(pairs), os.cpu_count() or 1)) as threads:
-
-        def run(function: Callable[[Any], Any], items: Any) -> Iterator[Any]:
-            for done, found in enumerate(threads.map(function, items), start=1):
-                if progress is not None:
-                    progress(done / len(pairs))
-                yield found
-
-        try:
-            aligned = align_team(
-                maps, dof=dof, guesses=_candidates(config, placed, guesses or {}), names=robot_ids, run=run
-            )
-        except BaseException:
-            threads.shutdown(wait=False, cancel_futures=True)
-            raise
+    candidates = _candidates(config, placed, guesses or {})
+    aligned = _align_pairs(maps, robot_ids, dof, candidates, progress, num_threads)
     given = _given(config)
     placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
     for refusal in placement.refusals:
@@ -230,6 +216,31 @@ def align_robots(
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
         (*_unverified(placement.teams[0], given, robot_ids), *_odd_maps(maps, robot_ids)),
     )
+
+
+def _align_pairs(
+    maps: Sequence[OwnMap],
+    robot_ids: Sequence[str],
+    dof: int,
+    candidates: Mapping[tuple[int, int], Sequence[Float64Array]],
+    progress: Callable[[float], None] | None,
+    num_threads: int | None,
+) -> TeamAlignment:
+    """The alignment of all pairs, in threads."""
+    num_pairs = math.comb(len(maps), 2)
+    with ThreadPoolExecutor(num_threads or min(num_pairs, os.cpu_count() or 1)) as threads:
+
+        def run(function: Callable[[Any], Any], items: Any) -> Iterator[Any]:
+            for done, found in enumerate(threads.map(function, items), start=1):
+                if progress is not None:
+                    progress(done / num_pairs)
+                yield found
+
+        try:
+            return align_team(maps, dof=dof, guesses=candidates, names=robot_ids, run=run)
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def check_alignable(config: RunConfig, guesses: Frames) -> None:

@@ -75,8 +75,7 @@ def _draw(axes: Axes, times: Any, curves: dict[tuple[str, str], Any], worst: Seq
     """Draw the curves of all pairs, the worst ones in colour and on top."""
     others = [curve for pair, curve in curves.items() if pair not in worst]
     for index, curve in enumerate(others):
-        label = f"{len(others)} other pairs" if len(others) > 1 else "another pair"
-        axes.plot(times, curve, color=GREY, linewidth=0.7, alpha=0.6, label=None if index else label)
+        axes.plot(times, curve, color=GREY, linewidth=0.7, alpha=0.6, label=None if index else "other pairs")
     for pair, color in reversed(list(zip(worst, COLORS, strict=False))):
         if pair in curves:
             axes.plot(times, curves[pair], color=color, linewidth=1.6, label=f"{pair[0]}, {pair[1]}")

@@ -1,0 +1,65 @@
+"""Table and figure of the repair of drift."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+
+from rich.table import Table
+
+from octoreplay.evaluate.trajectories import TrajectoryErrors
+from octoreplay.io.text_files import write_whole
+from octoreplay.replay.refinement import Refinement
+from octoreplay.report.figures import COLORS, GREY, legend_below, new_figure, style
+from octoreplay.report.tables import share, styled_table
+
+
+def refinement_table(refinement: Refinement, errors: TrajectoryErrors | None) -> Table:
+    """Return a table with one row per robot: size of the correction, test on held-back scans, errors, verdict."""
+    table = styled_table("Repair of drift, before -> after")
+    table.add_column("robot", no_wrap=True)
+    table.add_column("correction [m]\nmean / largest", justify="right")
+    table.add_column("contradiction on\nheld-back scans", justify="right")
+    table.add_column("entropy\n[bits]", justify="right")
+    if errors is not None:
+        table.add_column("trajectory\nerror [m]", justify="right")
+    table.add_column("poses", overflow="fold")
+    for trajectory, score in zip(refinement.trajectories, refinement.scores, strict=True):
+        shifts = trajectory.shifts
+        cells = [
+            trajectory.robot_id,
+            f"{shifts.mean():.2f} / {shifts.max():.2f}" if shifts.size else "-",
+            _change(share(score.before.share), share(score.after.share), is_known=score.before.num_cells > 0),
+            _change(f"{score.entropy_before:.3f}", f"{score.entropy_after:.3f}"),
+        ]
+        if errors is not None:
+            cells.append(_change(*(f"{error:.3f}" for error in errors.robots[trajectory.robot_id])))
+        table.add_row(*cells, "corrected" if score.is_accepted else f"as recorded: {score.reason}")
+    if errors is not None:
+        team = _change(f"{errors.before:.3f}", f"{errors.after:.3f}")
+        table.add_row("team", "", "", "", team, "", style="bold")
+    return table
+
+
+def _change(before: str, after: str, *, is_known: bool = True) -> str:
+    """Text of a value before and after."""
+    return f"{before} -> {after}" if is_known else "-"
+
+
+def write_trajectory_figure(refinement: Refinement, path: Path) -> None:
+    """Write a figure of the robots' trajectories from above, recorded (dashed) and corrected. Raises OutputError."""
+    figure = new_figure(width=7.0, height=7.0)
+    axes = style(figure.subplots(), title="Trajectories in the team's frame", x_label="x [m]", y_label="y [m]")
+    for number, trajectory in enumerate(refinement.trajectories):
+        color = COLORS[number % len(COLORS)]
+        recorded, corrected = trajectory.recorded[:, :2, 3].T, trajectory.corrected[:, :2, 3].T
+        axes.plot(*recorded, color=color, linewidth=0.9, linestyle="--", alpha=0.7)
+        axes.plot(*corrected, color=color, linewidth=1.5, label=trajectory.robot_id)
+        axes.plot(*corrected[:, :1], color=color, marker="o", markersize=4)
+    axes.plot([], [], color=GREY, linewidth=0.9, linestyle="--", label="recorded")
+    axes.set_aspect("equal", adjustable="datalim")
+    legend_below(figure, axes, columns=min(6, math.ceil((len(refinement.trajectories) + 1) / 2) + 1))
+    picture = io.BytesIO()
+    figure.savefig(picture, metadata={"Software": None})
+    write_whole(path, picture.getvalue())
