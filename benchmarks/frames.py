@@ -24,6 +24,7 @@ from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import CameraModel, CloudFrame, DepthFrame, Float32Array, Float64Array, Frame, UInt8Array
+from octoreplay.registration.cell_means import CellMeans
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment, align_pair
 from octoreplay.registration.team import align_team
@@ -253,11 +254,13 @@ def _map(
     T_own_village[:3, 3] = (*rng.uniform(-30, 30, 2), rng.uniform(-1, 1))
     num_classes = NUM_CLASSES if condition.is_labelled else 1
     grid = MapConfig(resolution=condition.resolution)
+    means = CellMeans(grid.resolution)
     octree, caster = SemanticOctree(grid.resolution, num_classes), ScanCaster(sensor, grid, num_classes)
     for frame in frames:
         pose = T_own_village @ drift[frame.stamp_ns] @ frame.T_team_sensor
         add_scan(octree, caster.cast(replace(frame, T_team_sensor=pose)), clamped_increments(sensor), 0)
-    own = OwnMap.of_evidence(octree, hit=sensor.hit, miss=sensor.miss)
+        means.add_scan(replace(frame, T_team_sensor=pose), sensor)
+    own = OwnMap.of_evidence(octree, hit=sensor.hit, miss=sensor.miss, means=means)
     return OwnFrame(own, inverse(T_own_village))
 
 

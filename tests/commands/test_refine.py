@@ -122,6 +122,7 @@ def test_the_refined_team_gives_sensor_poses_of_the_corrected_trajectory(team: P
         assert np.linalg.norm(of_new - true, axis=1).mean() < np.linalg.norm(of_old - true, axis=1).mean()
 
 
+@pytest.mark.long
 def test_refining_again_changes_little(refined: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.yaml"
     assert octoreplay("refine", refined, "-o", again, "--drift", "0.3,0.2").returncode == 0
@@ -172,6 +173,7 @@ def test_a_pose_file_without_times_in_common_is_refused(tmp_path: Path) -> None:
     refused(tmp_path, robots, 1, "no robot has a frame that can be used")
 
 
+@pytest.mark.long
 def test_a_kitti_file_is_replaced_by_times_and_poses(team: Path, tmp_path: Path) -> None:
     config = load_team_file(team)
     robot = config.robots[0].with_absolute_paths()

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from octoreplay.config.resolved import ResolvedRun
     from octoreplay.config.run import RunConfig
     from octoreplay.io.robots.survey import LogSurveys
-    from octoreplay.mapping.octree import SemanticOctree
     from octoreplay.replay.alignment import Alignment
+    from octoreplay.replay.own_maps import OwnEvidence
 
 
 dof_option = click.option(
@@ -92,7 +92,7 @@ def align(
     return 0 if alignment.is_whole else EXIT_ERROR
 
 
-def evidence_with_bar(config: ResolvedRun) -> list[SemanticOctree]:
+def evidence_with_bar(config: ResolvedRun) -> list[OwnEvidence]:
     """Map the robots of a team in their own frames, with a progress bar."""
     from octoreplay.replay.own_maps import own_evidences
 
@@ -102,7 +102,7 @@ def evidence_with_bar(config: ResolvedRun) -> list[SemanticOctree]:
 
 def align_with_bar(
     config: RunConfig,
-    evidence: Sequence[SemanticOctree],
+    evidence: Sequence[OwnEvidence],
     dof: int = 4,
     guesses: Mapping[str, Sequence[float]] | None = None,
 ) -> Alignment:
@@ -111,7 +111,7 @@ def align_with_bar(
     from octoreplay.replay.own_maps import own_map_of
 
     with progress_bar("align") as update:
-        maps = [own_map_of(config, octree) for octree in evidence]
+        maps = [own_map_of(config, *own) for own in evidence]
         return align_robots(config, maps, dof=dof, guesses=guesses, progress=lambda share: update(share, None, ""))
 
 

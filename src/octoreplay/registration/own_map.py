@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from octoreplay.mapping.octree import SemanticOctree, codes_to_keys
 from octoreplay.records import BoolArray, Float64Array, Int64Array, UInt8Array, UInt64Array
+from octoreplay.registration.cell_means import CellMeans
 from octoreplay.registration.cells import (
     COLUMN_CELLS,
     FREE,
@@ -53,26 +54,44 @@ class OwnMap:
     - ``low`` (3,) int64: key of the first cell.
     - ``resolution``: edge of a cell [m].
     - ``num_classes``: number of occupied classes, at most 253.
+    - ``means``: means of the measured points; occupied cells without them stand at their centres.
     """
 
-    def __init__(self, states: UInt8Array, low: Int64Array, resolution: float, num_classes: int) -> None:
+    def __init__(
+        self,
+        states: UInt8Array,
+        low: Int64Array,
+        resolution: float,
+        num_classes: int,
+        means: CellMeans | None = None,
+    ) -> None:
+        self._means = means
         self.states = states
         self.low = low
         self.resolution = resolution
         self.num_classes = num_classes
 
     @classmethod
-    def of_cells(cls, keys: Int64Array, states: UInt8Array, resolution: float, num_classes: int) -> OwnMap:
+    def of_cells(
+        cls,
+        keys: Int64Array,
+        states: UInt8Array,
+        resolution: float,
+        num_classes: int,
+        means: CellMeans | None = None,
+    ) -> OwnMap:
         """Return the map of known cells with ``keys`` (n, 3) and ``states`` (n,)."""
         # An empty border spares the neighbourhood operations the edges.
         low = keys.min(axis=0) - 2 if len(keys) else np.zeros(3, np.int64)
         shape = keys.max(axis=0) - low + 3 if len(keys) else np.ones(3, np.int64)
         grid = np.zeros(shape, np.uint8)
         grid[tuple((keys - low).T)] = states
-        return cls(grid, low, resolution, num_classes)
+        return cls(grid, low, resolution, num_classes, means)
 
     @classmethod
-    def of_evidence(cls, evidence: SemanticOctree, *, hit: float, miss: float) -> OwnMap:
+    def of_evidence(
+        cls, evidence: SemanticOctree, *, hit: float, miss: float, means: CellMeans | None = None
+    ) -> OwnMap:
         """Return the map of a robot's evidence s_i, given the sensor model's increments [log-odds]."""
         spans = evidence.spans()
         keys = codes_to_keys(spans.cells_in(np.ones(spans.codes.size, np.bool_)))
@@ -85,8 +104,8 @@ class OwnMap:
         resolution = evidence.resolution
         while len(keys) and float(np.prod(keys.max(axis=0) - keys.min(axis=0) + 5.0)) > MAX_CELLS:
             keys, states = halved(keys, states)
-            resolution *= 2
-        return cls.of_cells(keys, states, resolution, evidence.num_classes)
+            resolution, means = resolution * 2, None
+        return cls.of_cells(keys, states, resolution, evidence.num_classes, means)
 
     @cached_property
     def is_occupied(self) -> BoolArray:
@@ -97,7 +116,9 @@ class OwnMap:
     def _occupied_cells(self) -> tuple[Int64Array, OccupiedCells]:
         """Indices (n, 3) of the occupied cells, and the cells."""
         indices = np.argwhere(self.is_occupied)
-        points = np.asarray((indices + self.low + 0.5) * self.resolution, np.float64)
+        keys = indices + self.low
+        means = CellMeans(self.resolution) if self._means is None else self._means
+        points = means.at(keys)
         return indices, OccupiedCells(points, self.states[tuple(indices.T)])
 
     @property

@@ -14,7 +14,6 @@ from octoreplay.registration.icp import Surface, icp
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.search import planar_candidates
 from octoreplay.registration.verify import Verification, verify
-from octoreplay.transforms import inverse
 
 TILT_SIGMA = math.radians(1.0)
 """Standard deviation of the angle between the vertical axes of two gravity-aligned robots [rad]."""
@@ -190,10 +189,11 @@ class _Matcher:
         return "" if agreement.score >= min_score else f"L {agreement.score:.0f} below {min_score:.0f}"
 
     def is_distinct(self, one: Float64Array, other: Float64Array) -> bool:
-        """True where two poses differ by more than four cells or 8 degrees."""
-        difference = inverse(one) @ other
-        angle = math.acos(min(1.0, max(-1.0, (float(np.trace(difference[:3, :3])) - 1) / 2)))
-        return float(np.linalg.norm(difference[:3, 3])) > 4 * self._first.resolution or angle > math.radians(8)
+        """True where two poses of the second map's centre differ by more than four cells, or 8 degrees."""
+        centre = np.append(self._second.occupied.points.mean(axis=0), 1.0)
+        shift = float(np.linalg.norm((one - other) @ centre))
+        turn = float(np.trace(one[:3, :3].T @ other[:3, :3]))
+        return shift > 4 * self._first.resolution or turn < 1 + 2 * math.cos(math.radians(8))
 
     def _candidates(self) -> list[Float64Array]:
         """Candidate poses (4, 4)."""

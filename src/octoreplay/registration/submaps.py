@@ -25,7 +25,7 @@ _LEAST_COSINE = 0.75
 _SIGMA, _CORRESPONDENCES_PER_SAMPLE = 0.75, 20.0
 _MIN_CORRESPONDENCES = 60
 # A registration is refused where fewer correspondences than this share are within the distance to the plane [voxel].
-_LEAST_CLOSE_SHARE, _CLOSE = 0.9, 0.6
+_LEAST_CLOSE_SHARE, _CLOSE = 0.95, 0.6
 # Directions without information stay within these deviations of the guess in each Gauss-Newton step [voxel], [rad].
 _NUM_STEPS = 2
 _STEP_SHIFT, _STEP_ANGLE = 25.0, 0.5
@@ -136,7 +136,7 @@ def register(
 
     Two Gauss-Newton steps on the distances between points of one submap and planes of equal class in the other, in both
     directions (point-to-plane: Chen and Medioni, Image and Vision Computing 1992), weighted by Geman and McClure's
-    function. Points correspond within ``gate`` [m]. Where ``is_final``, nine of ten correspondences must be close to
+    function. Points correspond within ``gate`` [m]. Where ``is_final``, 95 % of the correspondences must be close to
     their planes.
     """
     voxel, information = first.voxel, np.zeros((6, 6))
@@ -150,7 +150,7 @@ def register(
         weights = 1.0 / (1.0 + np.square(residuals * (3.0 / gate))) ** 2
         weights /= _CORRESPONDENCES_PER_SAMPLE * (_SIGMA * voxel) ** 2
         information = (jacobian * weights[:, None]).T @ jacobian
-        step = -np.linalg.solve(information + near_guess, jacobian.T @ (weights * residuals))
+        step = np.linalg.solve(information + near_guess, -jacobian.T @ (weights * residuals)).astype(np.float64)
         T_first_second = moved(T_first_second[None], step[None])[0]
     return Registration(T_first_second, information)
 

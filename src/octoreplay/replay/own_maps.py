@@ -6,6 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.run import RunConfig
@@ -14,23 +15,29 @@ from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
 from octoreplay.records import PairMetrics
+from octoreplay.registration.cell_means import CellMeans
 from octoreplay.registration.own_map import OwnMap
 
 _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class OwnEvidence(NamedTuple):
+    """Evidence of one robot in its own map frame, and the means of its measured points by cell."""
+
+    octree: SemanticOctree
+    means: CellMeans
 
 
 def own_maps(
     config: ResolvedRun, *, progress: Callable[[float], None] | None = None, num_threads: int | None = None
 ) -> list[OwnMap]:
     """Return the map of each robot in its own map frame, in the order of ``config.robots``; as ``own_evidences``."""
-    return [
-        own_map_of(config, evidence) for evidence in own_evidences(config, progress=progress, num_threads=num_threads)
-    ]
+    return [own_map_of(config, *own) for own in own_evidences(config, progress=progress, num_threads=num_threads)]
 
 
 def own_evidences(
     config: ResolvedRun, *, progress: Callable[[float], None] | None = None, num_threads: int | None = None
-) -> list[SemanticOctree]:
+) -> list[OwnEvidence]:
     """Return the evidence of each robot's scans in its own map frame, in the order of ``config.robots``.
 
     ``progress`` is called with the finished share, 0 to 1. A robot without usable frames has empty evidence. Raises
@@ -40,8 +47,8 @@ def own_evidences(
     with ThreadPoolExecutor(num_threads) as threads:
         evidence = []
         try:
-            for octree in threads.map(lambda robot: own_evidence(config, robot), config.robots):
-                evidence.append(octree)
+            for own in threads.map(lambda robot: own_evidence(config, robot), config.robots):
+                evidence.append(own)
                 if progress is not None:
                     progress(len(evidence) / len(config.robots))
         except BaseException:
@@ -50,10 +57,10 @@ def own_evidences(
     return evidence
 
 
-def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> SemanticOctree:
+def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     """Return the evidence of one robot's scans in the robot's own map frame, without ``bounds``."""
     num_classes = config.classes.num_classes
-    octree = SemanticOctree(config.map.resolution, num_classes)
+    own = OwnEvidence(SemanticOctree(config.map.resolution, num_classes), CellMeans(config.map.resolution))
     # The bounds are in the team's frame, which is not known yet.
     region = dataclasses.replace(config.map, bounds=())
     caster = ScanCaster(config.sensor, region, num_classes)
@@ -62,17 +69,18 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> SemanticOctree:
     reach = sensor_reach(config.sensor, region)
     with RobotLog(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
-            add_scan(octree, caster.cast(frame), increments, 0)
-    return octree
+            add_scan(own.octree, caster.cast(frame), increments, 0)
+            own.means.add_scan(frame, config.sensor)
+    return own
 
 
-def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[SemanticOctree]) -> tuple[PairMetrics, ...]:
+def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence]) -> tuple[PairMetrics, ...]:
     """Return the contradiction of the robots' evidence, each in its own map frame, as if these were one frame."""
     robot_ids = [robot.robot_id for robot in config.robots]
     comparer = EvidenceComparer(robot_ids, config.classes.num_classes, state_limits(config.sensor))
-    return comparer.compare(evidence, 0)
+    return comparer.compare([own.octree for own in evidence], 0)
 
 
-def own_map_of(config: RunConfig, evidence: SemanticOctree) -> OwnMap:
-    """Return the map for registration of a robot's evidence."""
-    return OwnMap.of_evidence(evidence, hit=config.sensor.hit, miss=config.sensor.miss)
+def own_map_of(config: RunConfig, evidence: SemanticOctree, means: CellMeans | None = None) -> OwnMap:
+    """Return the map for registration of a robot's evidence. ``means`` make its surfaces more accurate."""
+    return OwnMap.of_evidence(evidence, hit=config.sensor.hit, miss=config.sensor.miss, means=means)
