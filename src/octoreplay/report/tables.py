@@ -291,7 +291,7 @@ def _frame_origins(origins: Mapping[str, str]) -> str:
 def _joined(summary: RunSummary) -> str:
     """When the robots became one team, or the groups that they are in at the end."""
     if summary.last.num_components == 1:
-        return f"one from {summary.joins[-1].seconds:g} s on" if summary.joins else "one from the beginning"
+        return f"one from {summary.joins[-1].seconds:g} s on" if summary.joins else "one"
     groups = "; ".join(", ".join(component) for component in summary.last.components)
     return f"{summary.last.num_components} at the end, in different frames: {groups}"
 
