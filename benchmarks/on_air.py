@@ -53,10 +53,9 @@ def main() -> None:
 
 def measured(folder: Path, num_robots: int, seed: int, duration: float) -> list[str]:
     """Return the cells of one team's row."""
-    team_file = simulate_team(
-        folder / "logs", SimulationConfig(num_robots=num_robots, seed=seed, duration=duration, own_frames=True)
-    )
-    config = load_team_file(team_file).with_parameters({"rule": "bayes", "align": "on-air"})
+    logs = folder / "logs"
+    simulate_team(logs, SimulationConfig(num_robots=num_robots, seed=seed, duration=duration, own_frames=True))
+    config = load_team_file(logs / "team.yaml").with_parameters({"rule": "bayes", "align": "on-air"})
     started = time.process_time()
     summary = replay_team(config, folder / "air.mcap")
     seconds = time.process_time() - started
@@ -71,7 +70,7 @@ def measured(folder: Path, num_robots: int, seed: int, duration: float) -> list[
     started = time.process_time()
     plain = replay_team(given, None)
     plain_seconds = time.process_time() - started
-    shifts, angles = errors(places, load_frames_file(folder / "logs" / "frames.yaml"))
+    shifts, angles = errors(places, load_frames_file(logs / "frames.yaml"))
     together = [tick for tick in metrics if tick.num_components == 1]
     joined = f"{summary.joins[-1].seconds:g}" if together else "never"
     return [
