@@ -16,6 +16,7 @@ from octoreplay.commands.team_options import base_config, is_team_file, save_tea
 from octoreplay.config.alignment import ON_AIR
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
 
@@ -67,8 +68,8 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
 @click.option("--schedule", type=existing_path, metavar="FILE.yaml",
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
 @click.option("--align", type=click.Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
-              help="find the robots' frames first, as 'octoreplay align' does, and leave other robots out (before, also"
-              " without a value); or during the run, from the evidence that robots send (on-air)")  # fmt: skip
+              help=f"{PARAMETERS['align'].help}; before, also without a value: find the frames first, as 'octoreplay"
+              " align' does, and leave other robots out")  # fmt: skip
 @dof_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
