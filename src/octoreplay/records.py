@@ -24,6 +24,9 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Color: TypeAlias = tuple[int, int, int]
 ArrayT = TypeVar("ArrayT", bound=npt.NDArray[Any])
 
+TEAM = "team"
+"""Frame of all maps and poses in a result, except of robots that begin a run in their own frames."""
+
 CENTRAL = "central"
 """Name of the centralised map in a result: the sum of all robots' evidence."""
 
@@ -331,11 +334,25 @@ class PairTotals:
 
 
 @dataclass(frozen=True)
+class FramePlace:
+    """Frame of one robot's map and poses.
+
+    ``frame_id`` is the name of the frame: 'team', or '<robot>/map' for the map frame of a robot. ``T_frame_map`` maps
+    the robot's own map frame to it: x, y, z [m], qx, qy, qz, qw.
+    """
+
+    robot_id: str
+    frame_id: str
+    T_frame_map: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class TickMetrics(PairTotals):
     """Metrics of the team after one tick; docs/metrics.md defines them.
 
     ``pairs`` are the pairs of robots that share known cells, in the robots' order. They are empty in results that were
-    written before the contradiction of evidence was measured.
+    written before the contradiction of evidence was measured. ``places`` are the frames of all robots where they find
+    them during the run, else empty.
     """
 
     tick: int
@@ -351,6 +368,27 @@ class TickMetrics(PairTotals):
     robots: tuple[RobotMetrics, ...]
     links: tuple[LinkMetrics, ...]
     pairs: tuple[PairMetrics, ...] = ()
+    places: tuple[FramePlace, ...] = ()
+
+    @property
+    def components(self) -> tuple[tuple[str, ...], ...]:
+        """Robots with a common frame, the largest group first, then in the robots' order."""
+        groups: dict[str, list[str]] = {}
+        for robot in self.robots:
+            groups.setdefault(self.frame_of(robot.robot_id), []).append(robot.robot_id)
+        return tuple(tuple(group) for group in sorted(groups.values(), key=lambda group: -len(group)))
+
+    @property
+    def num_components(self) -> int:
+        """Number of groups of robots with a common frame."""
+        return len(self.components)
+
+    def frame_of(self, robot_id: str) -> str:
+        """Return the name of the frame of a robot's map, or of the centralised map."""
+        frames = {place.robot_id: place.frame_id for place in self.places}
+        if robot_id == CENTRAL and frames:
+            robot_id = self.components[0][0]
+        return frames.get(robot_id, TEAM)
 
     @property
     def counted_robots(self) -> tuple[RobotMetrics, ...]:
@@ -399,14 +437,45 @@ class MapState:
     base_sequence: int
     is_key_frame: bool
     data: bytes
+    frame_id: str = TEAM
 
 
 @dataclass(frozen=True, eq=False)
 class RobotPose:
-    """Pose of one robot's sensor in the team's frame: (4, 4) float64."""
+    """Pose of one robot's sensor in the team's frame, or in the robot's present frame ``frame_id``: (4, 4) float64."""
 
     robot_id: str
     T_team_sensor: Float64Array
+    frame_id: str = TEAM
+
+
+@dataclass(frozen=True)
+class Join:
+    """Event of a run in which two groups of robots got one frame.
+
+    Attributes
+    ----------
+    tick : int
+        First tick in the common frame.
+    seconds : float
+        Its log time since the run's start [s].
+    first, second : str
+        Robots between whose maps the pose was found; ``second`` is among those whose frame changed.
+    moved : tuple of str
+        Robots whose frame changed.
+    frame_id : str
+        The common frame.
+    score : float
+        Log-likelihood ratio L of the pose.
+    """
+
+    tick: int
+    seconds: float
+    first: str
+    second: str
+    moved: tuple[str, ...]
+    frame_id: str
+    score: float
 
 
 @dataclass(frozen=True)
@@ -414,7 +483,8 @@ class RunSummary:
     """Summary of a run.
 
     ``links`` are the directed links over all ticks. ``frame_origins`` are phrases on the origin of each robot's place
-    in the team's frame, by robot_id; empty in results without them. The wall time is not stored in the result.
+    in the team's frame, by robot_id; empty in results without them. ``joins`` are the events in which robots found a
+    common frame during the run. The wall time is not stored in the result.
     """
 
     num_ticks: int
@@ -433,6 +503,7 @@ class RunSummary:
     frame_counts: Mapping[str, FrameCounts]
     warnings: tuple[str, ...]
     frame_origins: Mapping[str, str] = field(default_factory=dict)
+    joins: tuple[Join, ...] = ()
 
     @property
     def lost_data(self) -> bool:

@@ -20,6 +20,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
@@ -28,11 +29,13 @@ from octoreplay.mapping.codec import apply_delta, decode_packet
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CENTRAL,
+    TEAM,
     BoolArray,
     ClassTable,
     Float32Array,
     Float64Array,
     FloatArray,
+    FramePlace,
     LeafTable,
     MapState,
     RunSummary,
@@ -69,18 +72,29 @@ class PointQuery:
 class StoredMap:
     """Map of one robot after one tick, or the centralised map (``robot_id`` 'central').
 
+    ``frame_id`` is the name of its frame: 'team', or '<robot>/map' for the map frame of a robot where robots find each
+    other's frames during the run.
+
     With ``team_posterior`` the methods return h_0 + N (h - h_0) instead of the robot's h: after consensus, the
     posterior of the evidence of all N robots.
     """
 
     def __init__(
-        self, octree: SemanticOctree, robot_id: str, tick: int, stamp_ns: int, prior: float, num_robots: int
+        self,
+        octree: SemanticOctree,
+        robot_id: str,
+        tick: int,
+        stamp_ns: int,
+        prior: float,
+        num_robots: int,
+        frame_id: str = TEAM,
     ) -> None:
         self.robot_id = robot_id
         self.tick = tick
         self.stamp_ns = stamp_ns
         self.prior = prior
         self.num_robots = num_robots
+        self.frame_id = frame_id
         self.octree = octree
 
     @property
@@ -273,8 +287,32 @@ class Result:
 
     def _stored_map(self, octree: SemanticOctree, state: MapState, *, is_posterior: bool = False) -> StoredMap:
         """Map after a stored state; N is 1 for a posterior: a robot's evidence, and the centralised map."""
-        num_robots = 1 if is_posterior or state.robot_id == CENTRAL else len(self.robots)
-        return StoredMap(octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots)
+        num_robots = 1 if is_posterior or state.robot_id == CENTRAL else self._num_averaged(state)
+        return StoredMap(
+            octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots, state.frame_id
+        )
+
+    def _num_averaged(self, state: MapState) -> int:
+        """Number of robots of which a robot's map is the mean: those in its frame, or all with rule 'flood'."""
+        places = self._places.get(state.tick, ())
+        if not places or self.config.consensus.traits.exchanges is Exchanged.EVIDENCE:
+            return len(self.robots)
+        return sum(place.frame_id == state.frame_id for place in places)
+
+    @cached_property
+    def places(self) -> dict[str, FramePlace]:
+        """Frame of each robot's last map with the place of the robot's own map frame in it, by robot_id."""
+        if self._places:
+            return {place.robot_id: place for place in self._places[max(self._places)]}
+        return {
+            robot.robot_id: FramePlace(robot.robot_id, TEAM, robot.T_team_map_or_identity)
+            for robot in self.config.robots
+        }
+
+    @cached_property
+    def _places(self) -> dict[int, tuple[FramePlace, ...]]:
+        """Frames of all robots by tick."""
+        return self._reader.places()
 
     def _stamp_of(self, robot_id: str, tick: int, *, evidence: bool) -> int:
         """Stamp of a robot's map or evidence stored at a tick."""

@@ -35,7 +35,8 @@ def test_csv_has_one_row_per_tick_with_exact_numbers() -> None:
 def test_csv_has_every_field_of_a_robot_and_of_a_tick() -> None:
     names = set(rows(plots.metrics_csv(METRICS))[0])
     tick, robot = METRICS[0], METRICS[0].robots[0]
-    of_tick = {item.name for item in dataclasses.fields(tick)} - {"robots", "links", "pairs"} | set(PAIR_SHARES)
+    of_tick = {item.name for item in dataclasses.fields(tick)} - {"robots", "links", "pairs", "places"}
+    of_tick |= {*PAIR_SHARES, "num_components"}
     of_robot = {f"alpha.{item.name}" for item in dataclasses.fields(robot)} - {"alpha.robot_id"}
     of_pair = {f"alpha&beta.{item.name}" for item in dataclasses.fields(PairMetrics)}
     assert names >= of_tick | of_robot | of_pair - {"alpha&beta.first", "alpha&beta.second"}

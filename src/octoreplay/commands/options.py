@@ -65,11 +65,15 @@ def _option(parameter: Parameter) -> _ParameterOption:
 
 
 def with_parameters(*sections: str) -> Callable[[click.Command], click.Command]:
-    """Decorator that adds an option for every configuration parameter of some sections (default: all) to a command."""
+    """Decorator that adds an option for every configuration parameter of some sections (default: all) to a command.
+
+    A parameter for which the command has an option of its own gets no other one.
+    """
 
     def add(command: click.Command) -> click.Command:
+        own = {option.name for option in command.params}
         chosen = (parameter for parameter in PARAMETERS.values() if not sections or parameter.section in sections)
-        command.params.extend(_option(parameter) for parameter in chosen)
+        command.params.extend(_option(parameter) for parameter in chosen if parameter.name not in own)
         return command
 
     return add

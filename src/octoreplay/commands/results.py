@@ -99,7 +99,7 @@ def query(
         names = ("free", *opened.class_table.names)
         out.print(
             f"map of {robot_id} {opened.seconds(stored.stamp_ns):.1f} s after the start"
-            f" ({'team posterior' if team_posterior else 'own map'})",
+            f" ({'team posterior' if team_posterior else 'own map'}, frame {stored.frame_id})",
             soft_wrap=True,
         )
         if points:

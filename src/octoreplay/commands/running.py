@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,10 @@ from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
 from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
+from octoreplay.config.alignment import ON_AIR
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.presets import PRESETS, with_options
 from octoreplay.errors import ConfigError
 
@@ -23,8 +25,35 @@ if TYPE_CHECKING:
     from octoreplay.config.run import RunConfig
 
 
+_BEFORE = "before"
+_ALIGN_VALUES = (_BEFORE, ON_AIR, "off")
+
+
+class _RunCommand(SectionedCommand):
+    """Command whose option ``--align`` may stand without a value."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments. ``--align`` before anything but one of its values means ``--align=before``."""
+        return super().parse_args(ctx, list(_with_align_values(args)))
+
+
+def _with_align_values(args: Sequence[str]) -> Iterator[str]:
+    """Arguments with a value for every ``--align``."""
+    words = iter(args)
+    for word in words:
+        if word == "--":
+            yield from (word, *words)
+        elif word != "--align":
+            yield word
+        else:
+            following = next(words, None)
+            yield f"--align={following}" if following in _ALIGN_VALUES else "--align=before"
+            if following is not None and following not in _ALIGN_VALUES:
+                yield from _with_align_values([following, *words])
+
+
 @with_parameters()
-@click.command(cls=SectionedCommand, short_help="Replay logs into maps and run a distributed consensus on them.")
+@click.command(cls=_RunCommand, short_help="Replay logs into maps and run a distributed consensus on them.")
 @click.argument("inputs", nargs=-1, type=existing_path, metavar="TEAM.yaml | LOG...")
 @click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="result to write")
 @click.option("--config-from", type=existing_path, metavar="RESULT.mcap",
@@ -38,16 +67,16 @@ if TYPE_CHECKING:
 @click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")
 @click.option("--schedule", type=existing_path, metavar="FILE.yaml",
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
-@click.option("--align", is_flag=True, default=None,
-              help="find the robots' frames first, as 'octoreplay align' does; other robots are left out")  # fmt: skip
+@click.option("--align", type=click.Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
+              help=f"{PARAMETERS['align'].help}; before, also without a value: find the frames first, as 'octoreplay"
+              " align' does, and leave other robots out")  # fmt: skip
 @dof_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
-    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: bool | None,
-    dof: str | None, classes: str | None,
-    **parameters: Any,
+    preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
+    dof: str | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
 
@@ -60,17 +89,21 @@ def run(
 
     if output is None and save_team is None:
         raise click.UsageError("name the result with -o OUT.mcap (or use --save-team TEAM.yaml to stop before the run)")
+    if dof is not None and align != _BEFORE:
+        raise click.UsageError("--dof goes with --align before; robots that align on air know their vertical axes")
     if output is not None:
         check_output(output, ".mcap")
     if save_team is not None:
         check_output(save_team, ".yaml", inputs)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     given = {name: value for name, value in parameters.items() if value is not None}
+    if align is not None:
+        given["align"] = "off" if align == _BEFORE else align
     with LogSurveys() as surveys:
         base = base_config(inputs, config_from, err, surveys)
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
-        if align:
+        if align == _BEFORE:
             config, alignment = aligned_run(chosen, int(dof or 4), surveys, out)
         else:
             config, alignment = discover.resolve(chosen, surveys), None
@@ -91,7 +124,7 @@ def run(
     tables.show(out, tables.results(summary))
     show_warnings(err, summary, shown=config.warnings)
     out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
-    is_whole = alignment is None or alignment.is_whole
+    is_whole = summary.last.num_components == 1 and (alignment is None or alignment.is_whole)
     return EXIT_DATA_LOST if summary.lost_data or not is_whole else 0
 
 

@@ -9,7 +9,8 @@ from octoreplay.config.fields import check_ranges, parameter
 from octoreplay.errors import ConfigError
 
 TOPOLOGIES = ("complete", "ring", "line", "star", "grid", "nearest", "range", "random", "edges")
-
+POSITION_TOPOLOGIES = ("nearest", "range")
+"""Topologies whose links depend on the robots' positions; the others are fixed over a run."""
 
 WEIGHTS = ("metropolis", "degree", "max-degree", "given")
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from octoreplay.config.alignment import AlignmentConfig
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.fields import as_number, is_number
 from octoreplay.config.network import LinkConfig, NetworkConfig
@@ -74,6 +75,7 @@ SECTIONS: Mapping[str, Section] = MappingProxyType(
         "network": Section(NetworkConfig, "Communication graph"),
         "link": Section(LinkConfig, "Links"),
         "packet": Section(PacketConfig, "Packets"),
+        "alignment": Section(AlignmentConfig, "Alignment during the run"),
         "time": Section(TimeConfig, "Time and pairing"),
         "output": Section(OutputConfig, "What the result holds"),
     }

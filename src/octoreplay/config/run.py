@@ -11,9 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
+from octoreplay.config.alignment import ON_AIR, AlignmentConfig
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.consensus import ConsensusConfig
-from octoreplay.config.network import LinkConfig, NetworkConfig
+from octoreplay.config.network import POSITION_TOPOLOGIES, LinkConfig, NetworkConfig
 from octoreplay.config.output import OutputConfig
 from octoreplay.config.packets import PacketConfig
 from octoreplay.config.parameters import coerced
@@ -53,6 +54,7 @@ class RunConfig:
     link: LinkConfig = field(default_factory=LinkConfig)
     packet: PacketConfig = field(default_factory=PacketConfig)
     link_overrides: tuple[tuple[str, str, tuple[tuple[str, Any], ...]], ...] = ()
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     time: TimeConfig = field(default_factory=TimeConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
 
@@ -72,6 +74,8 @@ class RunConfig:
         if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
             raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
         _check_rule(self)
+        if self.alignment.is_on_air:
+            _check_on_air(self)
 
     def _check_edges(self, ids: Sequence[str]) -> None:
         """Raise ConfigError for an edge with an unknown robot, to itself, or with an invalid weight."""
@@ -144,4 +148,26 @@ def _check_rule(config: RunConfig) -> None:
         raise ConfigError(
             f"rule: '{rule.name}' sends {rule.exchanges.value}, which receivers need whole and exact; use packets"
             f" '{rule.packets[0]}', content 'float32' and prune_tolerance 0, without budget and top_classes"
+        )
+
+
+def _check_on_air(config: RunConfig) -> None:
+    """Raise ConfigError for settings that need one frame of all robots from the beginning."""
+    if config.network.topology in POSITION_TOPOLOGIES:
+        raise ConfigError(
+            f"align: '{ON_AIR}' has no positions in one frame, which topology '{config.network.topology}' needs; use"
+            " another topology, or find the frames first with 'octoreplay align'"
+        )
+    if len(config.map.bounds) == 6:
+        raise ConfigError(
+            f"bounds: x and y are in the team's frame, which robots do not know with align '{ON_AIR}'; give ZMIN,ZMAX"
+        )
+    if config.sensor.hide_robots:
+        raise ConfigError(
+            f"hide_robots: needs the positions of all robots from the beginning, which align '{ON_AIR}' does not give;"
+            " find the frames first with 'octoreplay align'"
+        )
+    if any(entry.forget for entry in config.network.schedule):
+        raise ConfigError(
+            f"schedule: 'forget' does not go with align '{ON_AIR}', because a robot without memory has no frame"
         )

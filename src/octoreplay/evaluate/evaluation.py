@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
 from octoreplay.records import CENTRAL, BoolArray, PairMetrics, TickMetrics
-from octoreplay.replay.warnings import frame_warnings
+from octoreplay.replay.warnings import team_frame_warnings
 from octoreplay.result import Result, StoredMap, open_result
 
 
@@ -183,7 +184,10 @@ class _Evaluator:
             for name, octree in zip(self._result.robots, evidence, strict=True)
             if octree.num_cells
         }
-        self.warnings = frame_warnings(pairs, num_cells)
+        # Evidence in different frames is not compared.
+        metrics = self._metrics[tick]
+        pairs = tuple(pair for pair in pairs if metrics.frame_of(pair.first) == metrics.frame_of(pair.second))
+        self.warnings = team_frame_warnings(dataclasses.replace(metrics, pairs=pairs), num_cells)
         return pairs
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:
@@ -212,8 +216,12 @@ class _Evaluator:
         # Without a stored centralised map any other map takes its place; its agreements are not used below.
         compared = MapComparer(len(robots), self._prior).compare(robots, octrees[-1], [], 0)
         agreements = list(zip(compared.agreement.tolist(), compared.agreement_occupied.tolist(), strict=True))
-        if CENTRAL not in names:
+        disagreement = compared.label_disagreement
+        if CENTRAL not in names or metrics.num_components > 1:
             agreements = [(robot.agreement, robot.agreement_occupied) for robot in metrics.robots]
+        if metrics.num_components > 1:
+            # Maps in different frames are not compared; the run did that within each frame.
+            disagreement = metrics.label_disagreement
         counts = [
             _Counts(num_cells, entropy, *pair)
             for num_cells, entropy, pair in zip(
@@ -223,7 +231,7 @@ class _Evaluator:
         if CENTRAL in names:
             central = MapComparer(1, self._prior).compare(octrees[-1:], octrees[-1], [], 0)
             counts.append(_Counts(int(central.num_cells[0]), float(central.entropy_bits[0]), 1.0, 1.0))
-        return compared.label_disagreement, counts
+        return disagreement, counts
 
     def _agreements_with_other(
         self, other: Result, spans: Sequence[LeafSpans], seconds: float

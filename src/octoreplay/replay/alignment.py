@@ -84,8 +84,8 @@ class Alignment:
     maps : tuple of OwnMap
         The robots' own maps, each in the frame that ``T_map_own`` places in the robot's map frame.
     T_map_own : tuple of (4, 4) float64 arrays
-        The identity for maps from logs; for evidence of a result, which is in the team's frame of that run, the inverse
-        of its T_team_map.
+        The identity for maps from logs; for evidence of a result, which is in the robot's last frame of that run, the
+        inverse of its T_frame_map (``Result.places``).
     T_team_own_before : tuple of (4, 4) float64 arrays
         Poses of the maps before the alignment: as configured, or the identity that is assumed.
     pairs : tuple of PairAlignment
@@ -258,14 +258,15 @@ def stored_maps(
 ) -> tuple[list[OwnMap], list[Float64Array]]:
     """Return the maps of a result's robots from their stored evidence, and T_map_own (4, 4) of each.
 
-    The evidence is in the team's frame of the run. Raises InputError where the result holds none.
+    The evidence is in the frame that the robot had at the end of the run. Raises InputError where the result holds
+    none.
     """
     config, maps = result.config, []
     for number, robot in enumerate(config.robots, start=1):
         maps.append(own_map_of(config, result.evidence(robot.robot_id).octree))
         if progress is not None:
             progress(number / len(config.robots))
-    return maps, [inverse(transform_of(robot.T_team_map_or_identity)) for robot in config.robots]
+    return maps, [inverse(transform_of(result.places[robot.robot_id].T_frame_map)) for robot in config.robots]
 
 
 def aligned_config(config: _Config, team: Sequence[RobotFrame]) -> _Config:

@@ -6,15 +6,17 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import LinkMetrics, RobotMetrics, TickMetrics
+from octoreplay.records import LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.replay.exchange.messages import Receipt
 from octoreplay.replay.network.graph import CommunicationGraph, Link
 from octoreplay.replay.network.links import LinkCounts
@@ -30,26 +32,80 @@ class Traffic:
     receipts: Mapping[Link, Receipt]
 
 
-class TickMeasurer:
-    """Metrics tick by tick, updated where maps changed.
+class _Component:
+    """Comparison of the maps and of the evidence of robots in one frame; ``oracle`` is the sum of their evidence."""
 
-    ``oracle`` is the centralised map: the sum of the evidence of all robots, evidence from before restarts included.
-    """
-
-    def __init__(self, config: ResolvedRun, threads: Executor) -> None:
+    def __init__(self, config: ResolvedRun, members: Sequence[int], threads: Executor) -> None:
         num_classes = config.classes.num_classes
+        ids = [config.robots[index].robot_id for index in members]
         self.oracle = SemanticOctree(config.map.resolution, num_classes)
-        self._config = config
+        self.members = tuple(members)
         self._threads = threads
-        self._robot_ids = tuple(robot.robot_id for robot in config.robots)
-        self._comparer = MapComparer(len(self._robot_ids), config.map.prior(num_classes))
-        self._evidence_comparer = EvidenceComparer(self._robot_ids, num_classes, state_limits(config.sensor))
-        self._period_ns = round(config.network.publish_period * 1e9)
+        self._is_new = True
+        self._comparer = MapComparer(len(ids), config.map.prior(num_classes))
+        self._evidence_comparer = EvidenceComparer(ids, num_classes, state_limits(config.sensor))
 
     def forget(self) -> None:
         """Compare all bricks anew in the next tick: a robot's map and evidence were replaced."""
         self._comparer.forget()
         self._evidence_comparer.forget()
+
+    def compare(
+        self, number: int, team: Team[Robot], graph: CommunicationGraph
+    ) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
+        """Comparison of the maps after a tick, arrays over the members, and the metrics of the pairs of members."""
+        robots = [team.robots[index] for index in self.members]
+        evidence = [robot.evidence.octree for robot in robots]
+        if self._is_new:
+            changed = np.unique(np.concatenate([octree.codes for octree in evidence]))
+        else:
+            changed = np.unique(np.concatenate([robot.changed_evidence(number) for robot in robots]))
+        since = 0 if self._is_new else number
+        self._is_new = False
+        sum_of_evidence(self.oracle, team.evidence(self.members), changed, number)
+        position = {index: place for place, index in enumerate(self.members)}
+        links = [(position[i], position[j]) for i, j in graph.pairs if i in position and j in position]
+        comparison = self._comparer.compare([robot.map for robot in robots], self.oracle, links, since, self._threads)
+        return comparison, self._evidence_comparer.compare(evidence, since, self._threads)
+
+    def spread(self, values: npt.NDArray[Any], num_robots: int) -> npt.NDArray[Any]:
+        """Return values (M,) of the members as an array (N,) over the robots, 0 for other robots."""
+        spread = np.zeros(num_robots, values.dtype)
+        spread[list(self.members)] = values
+        return spread
+
+
+class TickMeasurer:
+    """Metrics tick by tick, updated where maps changed.
+
+    ``oracle`` is the centralised map: the sum of the evidence of all robots, evidence from before restarts included. Of
+    several components of robots, it is that of the first one.
+    """
+
+    def __init__(self, config: ResolvedRun, threads: Executor) -> None:
+        self._config = config
+        self._threads = threads
+        self._robot_ids = tuple(robot.robot_id for robot in config.robots)
+        self._period_ns = round(config.network.publish_period * 1e9)
+        self._components: list[_Component] = []
+        self.regroup([range(len(self._robot_ids))])
+
+    @property
+    def oracle(self) -> SemanticOctree:
+        """The centralised map."""
+        return self._components[0].oracle
+
+    def regroup(self, components: Sequence[Sequence[int]]) -> None:
+        """Compare robots with those of their component only from the next tick on; each has an oracle of its own."""
+        kept = {component.members: component for component in self._components}
+        self._components = [
+            kept.get(tuple(members)) or _Component(self._config, members, self._threads) for members in components
+        ]
+
+    def forget(self) -> None:
+        """Compare all bricks anew in the next tick: a robot's map and evidence were replaced."""
+        for component in self._components:
+            component.forget()
 
     def measure(
         self,
@@ -66,12 +122,8 @@ class TickMeasurer:
 
         ``max_change`` is the largest change of a log-odds in the tick.
         """
-        changed = np.unique(np.concatenate([robot.changed_evidence(number) for robot in team.robots]))
-        sum_of_evidence(self.oracle, team.evidence(), changed, number)
-        maps = [robot.map for robot in team.robots]
-        comparison = self._comparer.compare(maps, self.oracle, graph.pairs, number, self._threads)
-        evidence = [robot.evidence.octree for robot in team.robots]
-        pairs = self._evidence_comparer.compare(evidence, number, self._threads)
+        compared = [component.compare(number, team, graph) for component in self._components]
+        comparison = self._combined([of_maps for of_maps, _ in compared])
         links = self._link_metrics(graph, traffic)
         robots = tuple(
             self._robot_metrics(robot, robot.index in graph.active, traffic.published[robot.index], links, comparison)
@@ -91,7 +143,30 @@ class TickMeasurer:
             max_change=max_change,
             robots=robots,
             links=links,
-            pairs=pairs,
+            pairs=tuple(pair for _, pairs in compared for pair in pairs),
+        )
+
+    def _combined(self, comparisons: Sequence[MapComparison]) -> MapComparison:
+        """Comparison of the whole team: sums over the components, and the robots' numbers within theirs."""
+        if len(comparisons) == 1:
+            return comparisons[0]
+        num_robots, num_cells = len(self._robot_ids), [c.num_known_cells for c in comparisons]
+        parts = list(zip(self._components, comparisons, strict=True))
+        disagreeing = sum(c.label_disagreement * c.num_known_cells for c in comparisons)
+
+        def joined(name: str) -> Any:
+            return sum(component.spread(getattr(c, name), num_robots) for component, c in parts)
+
+        return MapComparison(
+            total_distance=sum(c.total_distance for c in comparisons),
+            total_distance_all=sum(c.total_distance_all for c in comparisons),
+            num_known_cells=sum(num_cells),
+            label_disagreement=disagreeing / max(sum(num_cells), 1),
+            num_link_cells=sum(c.num_link_cells for c in comparisons),
+            num_cells=joined("num_cells"),
+            agreement=joined("agreement"),
+            agreement_occupied=joined("agreement_occupied"),
+            entropy_bits=joined("entropy_bits"),
         )
 
     def _robot_metrics(
@@ -108,7 +183,7 @@ class TickMeasurer:
         sent_bytes = sum(link.sent_bytes for link in links if link.sender == robot.robot_id)
         if published and self._config.packet.cast == "broadcast":
             # One packet reaches all its receivers.
-            sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.outbox)
+            sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.messages)
         return RobotMetrics(
             robot_id=robot.robot_id,
             active=active,

@@ -17,11 +17,12 @@ from octoreplay.records import (
     LeafTable,
     LinkTotals,
     MapState,
-    PairMetrics,
     RunSummary,
     TickMetrics,
 )
+from octoreplay.replay.joining import Joining
 from octoreplay.replay.tick import Tick, falls_due
+from octoreplay.replay.warnings import team_frame_warnings
 
 STATES_PER_KEY_FRAME = 12
 """Number of stored states of a robot from one key frame to the next."""
@@ -50,7 +51,8 @@ class _StateSeries:
             else:
                 data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self.last_tick))
             base = sequence if is_key_frame else sequence - 1
-            return MapState(names[index], tick.stamp_ns, tick.number, sequence, base, is_key_frame, data)
+            frame_id = tick.metrics.frame_of(names[index])
+            return MapState(names[index], tick.stamp_ns, tick.number, sequence, base, is_key_frame, data, frame_id)
 
         for state in self._threads.map(encode, range(len(names))):
             self._write(state)
@@ -81,13 +83,13 @@ class Recorder:
         self._sent_bytes = 0
         self._links = LinkTotals()
 
-    @property
-    def last_pairs(self) -> tuple[tuple[PairMetrics, ...], dict[str, int]]:
-        """Pairs of robots after the last tick, and the known cells of each robot with evidence."""
+    def frame_warnings(self) -> tuple[str, ...]:
+        """Sentences on the frames of the robots with evidence after the last tick; empty before the first tick."""
         if self.last is None:
-            return (), {}
+            return ()
         evidence = zip(self.last.graph.robot_ids, self.last.evidence, strict=True)
-        return self.last.metrics.pairs, {name: octree.num_cells for name, octree in evidence if octree.num_cells}
+        num_cells = {name: octree.num_cells for name, octree in evidence if octree.num_cells}
+        return team_frame_warnings(self.last.metrics, num_cells)
 
     def record(self, tick: Tick) -> None:
         """Record one tick."""
@@ -103,7 +105,7 @@ class Recorder:
         self._writer.write_graph(tick.stamp_ns, [(ids[a], ids[b]) for a, b in tick.graph.pairs], tick.poses)
         if self._config.output.keep_packets:
             for robot_id, published in zip(ids, tick.published, strict=True):
-                for _, message in published.outbox if published else ():
+                for _, message in published.messages if published else ():
                     data = b"".join(part.data for part in message.parts)
                     self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, data)
         if self._is_due(tick, self._config.output.state_every):
@@ -114,9 +116,17 @@ class Recorder:
             self._write_views(tick)
 
     def finish(
-        self, stop_reason: str, counts: Mapping[str, FrameCounts], warnings: tuple[str, ...], wall_seconds: float
+        self,
+        stop_reason: str,
+        counts: Mapping[str, FrameCounts],
+        warnings: tuple[str, ...],
+        wall_seconds: float,
+        joining: Joining | None = None,
     ) -> RunSummary:
-        """Store the last maps and evidence and return the summary; at least one tick was recorded."""
+        """Store the last maps and evidence and return the summary; at least one tick was recorded.
+
+        ``joining`` has the frames that robots found during the run.
+        """
         tick = self.last
         assert tick is not None
         if self._writer is not None:
@@ -144,7 +154,10 @@ class Recorder:
             links=self._links.totals(),
             frame_counts=counts,
             warnings=warnings,
-            frame_origins={robot.robot_id: robot.frame_origin for robot in self._config.robots},
+            frame_origins=joining.origins()
+            if joining
+            else {robot.robot_id: robot.frame_origin for robot in self._config.robots},
+            joins=tuple(joining.joins) if joining else (),
         )
 
     def _add_up(self, metrics: TickMetrics) -> None:
@@ -182,5 +195,5 @@ class Recorder:
             return octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True)
 
         for robot_id, leaves in zip(tick.graph.robot_ids, self._threads.map(occupied, tick.maps), strict=True):
-            self._writer.write_view(robot_id, tick.stamp_ns, leaves)
+            self._writer.write_view(robot_id, tick.stamp_ns, leaves, tick.metrics.frame_of(robot_id))
         self._view_tick = tick.number

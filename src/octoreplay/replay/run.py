@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -15,16 +15,15 @@ from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
-from octoreplay.io.robots.read_ahead import ReadAhead
-from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.io.robots.team_bodies import TeamBodies
-from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.mapping.warm_up import second_compiler
 from octoreplay.records import FrameCounts, RunSummary
+from octoreplay.replay.frames import without_computed_frames
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import MAX_TICKS, Session
-from octoreplay.replay.warnings import frame_warnings, map_warnings, rule_warnings
+from octoreplay.replay.sources import TeamSources
+from octoreplay.replay.warnings import map_warnings, rule_warnings
 
 
 @dataclass(frozen=True)
@@ -58,19 +57,16 @@ def replay_team(
     """
     started = time.monotonic()
     config = resolve(config)
+    if config.alignment.is_on_air:
+        config = without_computed_frames(config)
     num_threads = num_threads or min(len(config.robots), os.cpu_count() or 1)
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
-        reach = sensor_reach(config.sensor, config.map)
-        logs = [
-            stack.enter_context(RobotLog(robot, config.time, config.classes, reach=reach)) for robot in config.robots
-        ]
-        team_start_ns = min(log.first_stamp_ns for log in logs)
-        sources = [stack.enter_context(ReadAhead(log, team_start_ns)) for log in logs]
+        team = stack.enter_context(TeamSources(config))
         hides = config.sensor.hide_robots
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
         threads = stack.enter_context(ThreadPoolExecutor(num_threads))
-        session = Session(config, sources, threads, bodies=bodies)
+        session = Session(config, team.sources, threads, bodies=bodies, reopen=team.reopen)
         writer = stack.enter_context(ResultWriter(output, config)) if output else None
         recorder = Recorder(config, writer, threads)
         total_ns = config.total_ns
@@ -85,16 +81,17 @@ def replay_team(
                     deliver_interrupts()
             except InputError as error:
                 if recorder.last is None:
-                    raise InputError(f"{error}: {_causes(logs, config.time)}") from error
+                    raise InputError(f"{error}: {_causes(team.counts, config.time)}") from error
                 raise
-            counts = {log.robot_id: log.counts for log in logs}
             warnings = (
                 *config.warnings,
                 *rule_warnings(config, session.is_symmetric),
                 *map_warnings(recorder.num_known_cells),
-                *frame_warnings(*recorder.last_pairs),
+                *recorder.frame_warnings(),
             )
-            summary = recorder.finish(session.stop_reason, counts, warnings, time.monotonic() - started)
+            summary = recorder.finish(
+                session.stop_reason, team.counts, warnings, time.monotonic() - started, session.joining
+            )
             if writer is not None:
                 writer.complete(summary)
         return summary
@@ -110,17 +107,17 @@ def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
         )
 
 
-def _causes(logs: Sequence[RobotLog], time: TimeConfig) -> str:
+def _causes(counts: Mapping[str, FrameCounts], time: TimeConfig) -> str:
     """Causes for which frames were not used, robot by robot, with the remedy."""
 
-    def text(counts: FrameCounts) -> str:
+    def text(of_robot: FrameCounts) -> str:
         causes = {
-            "without a label": counts.no_label, "without a pose": counts.no_pose,
-            "late": counts.late, "unreadable": counts.undecodable,
+            "without a label": of_robot.no_label, "without a pose": of_robot.no_pose,
+            "late": of_robot.late, "unreadable": of_robot.undecodable,
         }  # fmt: skip
         return ", ".join(f"{number} {cause}" for cause, number in causes.items() if number) or "no frames"
 
-    found = "; ".join(f"{log.robot_id}: {text(log.counts)}" for log in logs)
+    found = "; ".join(f"{robot_id}: {text(of_robot)}" for robot_id, of_robot in counts.items())
     if time.start > 0 or time.duration is not None:
         return f"{found}; start and duration may leave none of them"
     return f"{found}; compare sensor and poses in 'octoreplay info', or try clock 'log' or a larger pose_gap"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import TypeVar
@@ -11,12 +12,14 @@ from octoreplay.config.rules import Exchanged
 from octoreplay.errors import InputError
 from octoreplay.records import Frame, RobotPose
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
+from octoreplay.replay.exchange.neighbours import Exchange
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import check_budget
+from octoreplay.replay.joining import Joining
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
 from octoreplay.replay.network.links import Links
-from octoreplay.replay.robots.robot import Publication, Turn
+from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Turn
 from octoreplay.replay.robots.team import make_team
 from octoreplay.replay.settling import NO_SETTLING, Settling
 from octoreplay.replay.tick import Tick, falls_due
@@ -42,6 +45,9 @@ class Session:
         Threads for the work of a tick. The result does not depend on them.
     bodies : Bodies, optional
         Boxes of the robots' bodies; points inside them do not become part of the map.
+    reopen : function, optional
+        New source of the frames of a robot, given by its index, with another ``T_team_map`` (7 numbers); needed where
+        robots begin in their own frames (``align: on-air``). ``sources`` are then in the frames of ``joining``.
 
     Attributes
     ----------
@@ -51,6 +57,8 @@ class Session:
         Reason for the end, set after the last tick.
     is_symmetric : bool
         True while every link of all graphs so far carried both ways with the same weight.
+    joining : Joining or None
+        Frames that robots find during the run; None where they begin in the team's frame.
 
     Raises
     ------
@@ -67,6 +75,7 @@ class Session:
         threads: Executor,
         *,
         bodies: Bodies | None = None,
+        reopen: Callable[[int, tuple[float, ...]], FrameSource] | None = None,
     ) -> None:
         self.config = config
         self.stop_reason = ""
@@ -80,8 +89,12 @@ class Session:
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
         self._packet_codec = PacketCodec(config.packet)
         self.team = make_team(config, self._packet_codec)
+        self.joining = Joining(config, self._packet_codec, threads) if config.alignment.is_on_air else None
+        self._reopen = reopen
         self._links: Links[Content] = Links(config)
         self._measurer = TickMeasurer(config, threads)
+        if self.joining is not None:
+            self._measurer.regroup(self.joining.frames.components)
         self._period_ns = round(config.network.publish_period * 1e9)
         self._graph = self._network.at(0.0, [False] * len(robot_ids), self.team.positions())
 
@@ -91,9 +104,10 @@ class Session:
         if start_ns is None:
             raise InputError("no robot has a frame that can be used")
         number = 0
-        while not self._timeline.exhausted or number == 0:
+        while not self._timeline.exhausted or number == 0 or self._may_join(number):
             self._check_next_frame(start_ns)
             stamp_ns = start_ns + number * self._period_ns
+            self._join(number)
             self._integrate(number, stamp_ns)
             yield self._exchange(number, stamp_ns)
             number += 1
@@ -122,14 +136,36 @@ class Session:
         max_change = self._iterate(graph, gamma_factor, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
         metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
+        if self.joining is not None:
+            metrics = dataclasses.replace(metrics, places=self.joining.frames.places)
+            if not settling:
+                self.joining.search(robots, is_last=self._timeline.exhausted)
         self._packet_codec.end_tick()
+        poses = (
+            RobotPose(robot.robot_id, robot.T_team_sensor, metrics.frame_of(robot.robot_id))
+            for robot in robots
+            if robot.T_team_sensor is not None
+        )
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots),
-            tuple(robot.evidence.octree for robot in robots), self._measurer.oracle,
-            tuple(RobotPose(r.robot_id, r.T_team_sensor) for r in robots if r.T_team_sensor is not None), metrics,
+            tuple(robot.evidence.octree for robot in robots), self._measurer.oracle, tuple(poses), metrics,
         )  # fmt: skip
 
     # --- the steps of a tick ------------------------------------------------------------------------------------------
+
+    def _join(self, number: int) -> None:
+        """Give robots the frames that the last tick found for them; they integrate all their scans again."""
+        if self.joining is None or self._reopen is None:
+            return
+        moved = self.joining.join(number, number * self._period_ns / 1e9)
+        if not moved:
+            return
+        for index in moved:
+            self.team.change_frame(index)
+            self._timeline.rewind(index, self._reopen(index, self.joining.frames.T_frame_map(index)))
+        # What is on the air is in a frame that one of its ends has left.
+        self._links.lose(set(moved))
+        self._measurer.regroup(self.joining.frames.components)
 
     def _integrate(self, number: int, stamp_ns: int) -> None:
         """Add every scan with a stamp before the tick to its robot's evidence, and take the graph of the tick.
@@ -152,7 +188,8 @@ class Session:
         self._each(integrate, range(len(self.team.robots)))
         leaves = self.config.network.after_end == "leave"
         active = self._timeline.active(stamp_ns - self._period_ns if leaves else None)
-        self._graph = self._network.at(elapsed, active, self.team.positions())
+        in_one_frame = None if self.joining is None else self.joining.frames.in_one_frame
+        self._graph = self._network.at(elapsed, active, self.team.positions(), in_one_frame)
 
     def _with_bodies(self, index: int, frame: Frame) -> Frame:
         """A robot's frame with the boxes of the other robots."""
@@ -162,7 +199,7 @@ class Session:
 
     def _publish(self, graph: CommunicationGraph, number: int, stamp_ns: int) -> tuple[Publication | None, ...]:
         """Publication of each robot that is active and due in this tick; its packets are handed to the links."""
-        self._links.cut(graph.links)
+        self._links.cut(self._network.radio_links)
         robots = self.team.robots
         publishes = self.config.consensus.traits.exchanges is not Exchanged.NOTHING
         due = [index for index in graph.active if publishes and robots[index].is_due(number)]
@@ -172,28 +209,48 @@ class Session:
             return robots[index].publication(graph.receivers(index), number, with_unpruned=with_unpruned)
 
         published = dict(zip(due, self._each(publish, due), strict=True))
-        for sender, publication in published.items():
-            for receivers, message in publication.outbox:
+        self._add_own_evidence(published, graph, number)
+        for sender, publication in sorted(published.items()):
+            for receivers, message in publication.messages:
                 for receiver in receivers:
                     self._links.send(sender, receiver, message, stamp_ns)
         return tuple(published.get(index) for index in range(len(robots)))
 
+    def _add_own_evidence(self, published: dict[int, Publication], graph: CommunicationGraph, number: int) -> None:
+        """Add the messages to robots in other frames to the publications of a tick."""
+        if self.joining is None:
+            return
+        outbox, robots = self.joining.outbox, self.team.robots
+        receivers = {index: [b for a, b in self._network.radio_links if a == index] for index in graph.active}
+        messages = self._each(lambda index: outbox(robots[index], receivers[index], number), graph.active)
+        for index, own_evidence in zip(graph.active, messages, strict=True):
+            if own_evidence:
+                others = published.get(index, Publication((), MapSizes()))
+                published[index] = dataclasses.replace(others, own_evidence=own_evidence)
+
     def _deliver(self, graph: CommunicationGraph, stamp_ns: int) -> dict[Link, Receipt]:
         """Deliver the packets that are due and send the acknowledgements; receipts by (sender, receiver)."""
         receipts: dict[Link, Receipt] = {}
+        radio_links = set(self._network.radio_links)
         # Acknowledgements without latency arrive in the same tick, so the links are asked until nothing is due.
         while deliveries := self._links.deliver(stamp_ns, graph.active):
             for delivery in deliveries:
                 sender, receiver, content = delivery.sender, delivery.receiver, delivery.content
-                robot = self.team.robots[receiver]
+                end = self._end(sender, receiver)
                 if isinstance(content, Acknowledgement):
-                    robot.exchange.acknowledged(sender, content)
+                    end.acknowledged(sender, content)
                     continue
-                receipt, answer = robot.receive(sender, content)
+                receipt, answer = end.receive(sender, content)
                 receipts.setdefault((sender, receiver), Receipt()).add(receipt)
-                if answer is not None and sender in graph.receivers(receiver):
+                if answer is not None and (receiver, sender) in radio_links:
                     self._links.send(receiver, sender, answer, stamp_ns)
         return receipts
+
+    def _end(self, sender: int, receiver: int) -> Robot | Exchange:
+        """The receiving end of a link: the robot, or what it holds of robots in other frames."""
+        if self.joining is not None and sender not in self.joining.frames.members(receiver):
+            return self.joining.exchange(receiver)
+        return self.team.robots[receiver]
 
     def _iterate(self, graph: CommunicationGraph, gamma_factor: float, number: int) -> float:
         """Iterate at every active robot with the maps that arrived; the largest change of a log-odds."""
@@ -203,6 +260,10 @@ class Session:
         return max(self.team.iterate(turns, gamma_factor, number, self._threads), default=0.0)
 
     # --- helpers ------------------------------------------------------------------------------------------------------
+
+    def _may_join(self, number: int) -> bool:
+        """True where robots may still find each other's frames after the last scan."""
+        return self.joining is not None and self._reopen is not None and self.joining.is_open(number)
 
     def _check_next_frame(self, start_ns: int) -> None:
         """Raise InputError where the next frame is more ticks away than a run may have."""

@@ -39,6 +39,11 @@ class Timeline:
         self.first_stamp_ns = min(stamps, default=None)
         """Stamp of the team's first frame; None without frames."""
 
+    def rewind(self, robot_index: int, source: FrameSource) -> None:
+        """Continue a robot with another source, from its first frame on."""
+        self._streams[robot_index] = source.frames()
+        self._next[robot_index] = next(self._streams[robot_index], None)
+
     @property
     def exhausted(self) -> bool:
         """True when all frames of all robots have been taken."""

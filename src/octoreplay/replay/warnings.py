@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
 from octoreplay.mapping.contradiction import LABEL_LIMIT, MIN_OVERLAP, contradicting_pairs
-from octoreplay.records import MIN_COMPARED_CELLS, PairMetrics, ranked_pairs
+from octoreplay.records import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -54,6 +54,24 @@ def map_warnings(num_known_cells: int) -> tuple[str, ...]:
     if num_known_cells > 0:
         return ()
     return ("the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses",)
+
+
+def team_frame_warnings(metrics: TickMetrics, num_cells: Mapping[str, int]) -> tuple[str, ...]:
+    """Sentences on the frames after the last tick: ``frame_warnings`` of each component, and the components.
+
+    ``num_cells`` are the known cells of each robot's evidence, of robots with at least one.
+    """
+    sentences: list[str] = []
+    for component in metrics.components:
+        pairs = [pair for pair in metrics.pairs if pair.first in component]
+        sentences += frame_warnings(pairs, {name: num_cells[name] for name in component if name in num_cells})
+    if metrics.num_components > 1:
+        names = "; ".join(_listed(component) for component in metrics.components)
+        sentences.append(
+            f"the robots are in {metrics.num_components} frames at the end, because no pair between them was accepted"
+            f" ({names}): 'octoreplay align' on the result shows the numbers"
+        )
+    return tuple(sentences)
 
 
 def frame_warnings(pairs: Sequence[PairMetrics], num_cells: Mapping[str, int]) -> tuple[str, ...]:

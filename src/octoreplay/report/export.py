@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from octoreplay.config.class_tables.palette import PALETTE
-from octoreplay.errors import ConfigError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results import ply
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import BoolArray, ClassTable, Float64Array, FloatArray, LeafTable, UInt8Array
 from octoreplay.result import Result, StoredMap, open_result
 
 COLORS = ("label", "robot", "disagreement", "probability")
+_OF_ALL_ROBOTS = ("robot", "disagreement")
+"""Colours that are computed from the maps of all robots."""
 FREE_COLOR = (225, 225, 225)
 
 _RAMP = np.array(
@@ -57,7 +59,7 @@ def export_ply(
     ConfigError
         ``what`` or ``color`` is unknown.
     InputError
-        The result cannot be read, or has no such map.
+        The result cannot be read, has no such map, or has maps in several frames that the options put together.
     OutputError
         The PLY file cannot be written.
     """
@@ -70,12 +72,25 @@ def export_ply(
         together = robot is None and color == "robot"
         chosen = result.robots if together else (result.robots[0] if robot is None else robot,)
         shown = [result.map(robot_id, at_ns=at_ns) for robot_id in chosen]
+        if together or color in _OF_ALL_ROBOTS:
+            _check_one_frame(result, at_ns)
         leaves = _leaves(shown, team_posterior, free)
         colors, scale = _colors(result, shown, leaves, color, at_ns)
         comments = _comments(result, shown, color, scale, team_posterior)
     write = ply.write_voxels if what == "voxels" else ply.write_points
     write(output, leaves, colors, comments)
     return len(leaves)
+
+
+def _check_one_frame(result: Result, at_ns: int | None) -> None:
+    """Raise InputError where the robots' maps are in several frames."""
+    maps = [result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
+    if len({stored.frame_id for stored in maps}) > 1:
+        frames = ", ".join(f"{stored.robot_id} in {stored.frame_id}" for stored in maps)
+        raise InputError(
+            f"{result.path}: the robots' maps are in different frames ({frames}); name a robot and color 'label' or"
+            " 'probability', or a later time"
+        )
 
 
 def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTable:
@@ -161,6 +176,7 @@ def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, te
     lines = [
         f"octoreplay map of {', '.join(stored.robot_id for stored in shown)} at {when}",
         f"resolution {last.resolution:g} m, N = {last.num_robots} robots, log-odds: {evidence}",
+        f"frame: {last.frame_id}",
         f"classes: 0 free, {names}",
         f"color: {color} ({scale})",
     ]

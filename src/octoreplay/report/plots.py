@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _TEAM_COLUMNS = (
     "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
     "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change",
-    *PAIR_SHARES,
+    *PAIR_SHARES, "num_components",
 )  # fmt: skip
 _ROBOT_COLUMNS = (
     "active", "num_scans", "num_iterations", "agreement", "agreement_occupied", "num_leaves", "num_cells",
@@ -58,12 +58,15 @@ def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
     empty.
     """
     robots = list(dict.fromkeys(robot.robot_id for tick in metrics for robot in tick.robots))
+    # Frames are columns only where robots find them during the run.
+    framed = robots if any(tick.places for tick in metrics) else []
     links = list(dict.fromkeys((link.sender, link.receiver) for tick in metrics for link in tick.links))
     pairs = list(dict.fromkeys((pair.first, pair.second) for tick in metrics for pair in tick.pairs))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(
-        [*_TEAM_COLUMNS, *(f"{robot}.{name}" for robot in robots for name in _ROBOT_COLUMNS),
+        [*_TEAM_COLUMNS, *(f"{robot}.frame" for robot in framed),
+         *(f"{robot}.{name}" for robot in robots for name in _ROBOT_COLUMNS),
          *(f"{a}>{b}.{name}" for a, b in links for name in _LINK_COLUMNS),
          *(f"{a}&{b}.{name}" for a, b in pairs for name in _PAIR_COLUMNS)]
     )  # fmt: skip
@@ -72,7 +75,8 @@ def metrics_csv(metrics: Sequence[TickMetrics]) -> str:
         of_link: dict[Any, Any] = {(link.sender, link.receiver): link for link in tick.links}
         of_pair: dict[Any, Any] = {(pair.first, pair.second): pair for pair in tick.pairs}
         writer.writerow(
-            [*_cells(tick, _TEAM_COLUMNS), *(v for r in robots for v in _cells(of_robot.get(r), _ROBOT_COLUMNS)),
+            [*_cells(tick, _TEAM_COLUMNS), *(tick.frame_of(robot) for robot in framed),
+             *(v for r in robots for v in _cells(of_robot.get(r), _ROBOT_COLUMNS)),
              *(v for key in links for v in _cells(of_link.get(key), _LINK_COLUMNS)),
              *(v for key in pairs for v in _cells(of_pair.get(key), _PAIR_COLUMNS))]
         )  # fmt: skip

@@ -9,7 +9,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
-from octoreplay.io.results.result_writer import ResultWriter, _quaternion, partial_path
+from octoreplay.io.results.geometry_messages import quaternion
+from octoreplay.io.results.result_writer import ResultWriter, partial_path
 from support.result_factory import (
     SECOND,
     START,
@@ -145,7 +146,7 @@ def test_quaternions_are_those_of_scipy(seed: int) -> None:
     rotation = Rotation.random(rng=np.random.default_rng(seed))
     transform = np.eye(4)
     transform[:3, :3] = rotation.as_matrix()
-    q = _quaternion(transform)
+    q = quaternion(transform)
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], rotation.as_quat(canonical=True), atol=1e-12)
 
 
@@ -153,7 +154,7 @@ def test_quaternions_are_those_of_scipy(seed: int) -> None:
 def test_quaternions_of_half_turns(axis: tuple[int, int, int]) -> None:
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
-    q = _quaternion(transform)
+    q = quaternion(transform)
     np.testing.assert_allclose(np.abs([q.x, q.y, q.z, q.w]), [*axis, 0], atol=1e-12)
 
 

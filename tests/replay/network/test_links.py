@@ -215,3 +215,14 @@ def test_every_packet_is_delivered_lost_or_dropped_once(sends, rate, queue, loss
 def test_jitter_above_the_latency_is_refused():
     with pytest.raises(ConfigError, match=r"jitter: 0.2 is above latency 0.1; a delay cannot be negative"):
         _links(latency=0.1, jitter=0.2)
+
+
+def test_content_from_and_to_some_robots_is_lost():
+    links = _links(latency=1.0, rate=100.0)
+    for number, (sender, receiver) in enumerate([(0, 1), (1, 0), (2, 0), (0, 2), (0, 2)]):
+        links.send(sender, receiver, Content(number), 0)
+    links.lose({1})
+    assert sorted(_numbers(links.deliver(10 * SECOND, EVERYBODY))) == [2, 3, 4]
+    counts = links.take_counts()
+    assert (counts[0, 1].num_lost, counts[1, 0].num_lost) == (1, 1)
+    assert (counts[0, 2].num_delivered, counts[2, 0].num_delivered) == (2, 1)

@@ -100,6 +100,18 @@ float64 clear_contradiction
 float64 label_contradiction
 octoreplay_msgs/PairMetrics[] pairs
 """,
+    "octoreplay_msgs/msg/RobotFrame": """\
+# Frame of a robot's map and poses after one tick, and the pose of the robot's own map frame in it.
+string robot_id
+string frame_id
+geometry_msgs/Pose pose
+""",
+    "octoreplay_msgs/msg/Frames": """\
+# Frames of robots that find them during the run, after one tick.
+std_msgs/Header header
+uint32 tick
+octoreplay_msgs/RobotFrame[] robots
+""",
     "octoreplay_msgs/msg/TickMetrics": """\
 # The team after one consensus tick; the definitions are in docs/metrics.md.
 std_msgs/Header header

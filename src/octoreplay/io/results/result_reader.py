@@ -25,6 +25,7 @@ from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
 from octoreplay.io.results.result_writer import (
     CONTRADICTION_TOPIC,
     FORMAT_VERSION,
+    FRAMES_TOPIC,
     METRICS_TOPIC,
     evidence_topic,
     map_state_topic,
@@ -35,6 +36,8 @@ from octoreplay.records import (
     ClassTable,
     Float64Array,
     FrameCounts,
+    FramePlace,
+    Join,
     LinkMetrics,
     LinkTotals,
     MapState,
@@ -117,7 +120,18 @@ class ResultReader:
             int(value.tick): tuple(PairMetrics(**_fields(PairMetrics, pair)) for pair in value.pairs)
             for _, value in self._messages(CONTRADICTION_TOPIC)
         }
-        return [_tick_metrics(value, pairs.get(int(value.tick), ())) for _, value in self._messages(METRICS_TOPIC)]
+        places = self.places()
+        return [
+            _tick_metrics(value, pairs.get(int(value.tick), ()), places.get(int(value.tick), ()))
+            for _, value in self._messages(METRICS_TOPIC)
+        ]
+
+    def places(self) -> dict[int, tuple[FramePlace, ...]]:
+        """Return the frames of all robots by tick; empty where all maps are in the team's frame."""
+        return {
+            int(value.tick): tuple(_frame_place(robot) for robot in value.robots)
+            for _, value in self._messages(FRAMES_TOPIC)
+        }
 
     def summary(self, metrics: Sequence[TickMetrics]) -> RunSummary:
         """Return the summary of the run. The wall time is not stored and is NaN.
@@ -135,6 +149,7 @@ class ResultReader:
             name: text if name == "stop_reason" else json.loads(text) for name, text in stored.items() if name in names
         }
         values["warnings"] = tuple(values["warnings"])
+        values["joins"] = tuple(Join(**{**join, "moved": tuple(join["moved"])}) for join in values.get("joins", ()))
         values["links"] = tuple(LinkMetrics(**link) for link in values["links"])
         values["frame_counts"] = {robot: _frame_counts(count) for robot, count in values["frame_counts"].items()}
         return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
@@ -285,8 +300,15 @@ def is_result(path: Path) -> bool:
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
 
 
-def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...]) -> TickMetrics:
-    """Return TickMetrics from its message and the metrics of the pairs."""
+def _frame_place(value: Any) -> FramePlace:
+    """Return a FramePlace from its message."""
+    position, turn = value.pose.position, value.pose.orientation
+    numbers = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+    return FramePlace(value.robot_id, value.frame_id, tuple(float(number) for number in numbers))
+
+
+def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...], places: tuple[FramePlace, ...]) -> TickMetrics:
+    """Return TickMetrics from its message, the metrics of the pairs and the frames of the robots."""
     plain = ("tick", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
              "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change")  # fmt: skip
     return TickMetrics(
@@ -294,6 +316,7 @@ def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...]) -> TickMetrics:
         robots=tuple(RobotMetrics(**_fields(RobotMetrics, robot)) for robot in value.robots),
         links=tuple(LinkMetrics(**_fields(LinkMetrics, link)) for link in value.links),
         pairs=pairs,
+        places=places,
         **{name: getattr(value, name) for name in plain},
     )
 
@@ -313,6 +336,7 @@ def _map_state(value: Any) -> MapState:
         base_sequence=int(value.base_sequence),
         is_key_frame=bool(value.is_key_frame),
         data=value.data.tobytes(),
+        frame_id=value.header.frame_id,
     )
 
 

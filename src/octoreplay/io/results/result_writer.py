@@ -14,23 +14,32 @@ import numpy as np
 
 from octoreplay._version import __version__
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.config.robot import RobotConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import header, message
+from octoreplay.io.results.geometry_messages import (
+    ADD,
+    DELETE,
+    LINE_LIST,
+    TEXT_VIEW_FACING,
+    marker,
+    point,
+    quaternion,
+    static_transform,
+    transform,
+    vector,
+)
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import PAIR_SHARES, Float64Array, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
-from octoreplay.transforms import rotation_to_quaternion
+from octoreplay.records import PAIR_SHARES, TEAM, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.transforms import transform_of
 
 FORMAT_VERSION = "2"
 """Version of the result format; it increases with each incompatible change."""
-TEAM_FRAME = "team"
-"""Frame of all maps and poses in a result."""
-
 METRICS_TOPIC = "/metrics"
 CONTRADICTION_TOPIC = "/contradiction"
+FRAMES_TOPIC = "/frames"
 GRAPH_TOPIC = "/graph"
 TF_TOPIC = "/tf"
 STATIC_TF_TOPIC = "/tf_static"
@@ -56,9 +65,6 @@ VIEW_DTYPE = np.dtype(
         "itemsize": 28,
     }
 )
-
-_LINE_LIST, _TEXT_VIEW_FACING, _ADD, _DELETE = 5, 9, 0, 2
-"""visualization_msgs/Marker types and actions."""
 
 
 def map_state_topic(robot_id: str) -> str:
@@ -144,7 +150,7 @@ class ResultWriter:
         self._start(state.stamp_ns)
         type_name = "octoreplay_msgs/msg/MapState"
         value = message(
-            type_name, header=header(state.stamp_ns, TEAM_FRAME), robot_id=state.robot_id, tick=state.tick,
+            type_name, header=header(state.stamp_ns, state.frame_id), robot_id=state.robot_id, tick=state.tick,
             sequence=state.sequence, base_sequence=state.base_sequence, is_key_frame=state.is_key_frame,
             data=np.frombuffer(state.data, dtype=np.uint8),
         )  # fmt: skip
@@ -154,7 +160,7 @@ class ResultWriter:
         """Write the team's metrics after one tick to ``/metrics``, those of pairs to ``/contradiction``."""
         self._start(metrics.stamp_ns)
         fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
-        del fields["stamp_ns"], fields["pairs"]
+        del fields["stamp_ns"], fields["pairs"], fields["places"]
         fields["robots"] = [
             message("octoreplay_msgs/msg/RobotMetrics", **dataclasses.asdict(robot)) for robot in metrics.robots
         ]
@@ -162,17 +168,38 @@ class ResultWriter:
             message("octoreplay_msgs/msg/LinkMetrics", **dataclasses.asdict(link)) for link in metrics.links
         ]
         type_name = "octoreplay_msgs/msg/TickMetrics"
-        value = message(type_name, header=header(metrics.stamp_ns, TEAM_FRAME), **fields)
+        value = message(type_name, header=header(metrics.stamp_ns, TEAM), **fields)
         self._writer.write(METRICS_TOPIC, type_name, value, metrics.stamp_ns)
         pairs = [message("octoreplay_msgs/msg/PairMetrics", **dataclasses.asdict(pair)) for pair in metrics.pairs]
         type_name = "octoreplay_msgs/msg/Contradiction"
         value = message(
-            type_name, header=header(metrics.stamp_ns, TEAM_FRAME), tick=metrics.tick,
+            type_name, header=header(metrics.stamp_ns, TEAM), tick=metrics.tick,
             **{name: getattr(metrics, name) for name in PAIR_SHARES}, pairs=pairs,
         )  # fmt: skip
         self._writer.write(CONTRADICTION_TOPIC, type_name, value, metrics.stamp_ns)
+        if metrics.places:
+            self._write_places(metrics)
 
-    def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable) -> None:
+    def _write_places(self, metrics: TickMetrics) -> None:
+        """Write the frames of all robots to ``/frames``, and those of joined robots to ``/tf``."""
+        robots, transforms = [], []
+        for place in metrics.places:
+            T = transform_of(place.T_frame_map)
+            position, rotation = vector(T), quaternion(T)
+            pose = message("geometry_msgs/msg/Pose", position=point(position), orientation=rotation)
+            robots.append(
+                message("octoreplay_msgs/msg/RobotFrame", robot_id=place.robot_id, frame_id=place.frame_id, pose=pose)
+            )
+            own = f"{place.robot_id}/map"
+            if place.frame_id != own:
+                transforms.append(transform(metrics.stamp_ns, place.frame_id, own, position, rotation))
+        type_name = "octoreplay_msgs/msg/Frames"
+        value = message(type_name, header=header(metrics.stamp_ns, TEAM), tick=metrics.tick, robots=robots)
+        self._writer.write(FRAMES_TOPIC, type_name, value, metrics.stamp_ns)
+        if transforms:
+            self._write_transforms(TF_TOPIC, metrics.stamp_ns, transforms)
+
+    def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable, frame_id: str = TEAM) -> None:
         """Write the occupied leaves of one robot's map as a point cloud for viewers to ``/<robot>/map``."""
         self._start(stamp_ns)
         points = self._view_points(leaves)
@@ -182,54 +209,67 @@ class ResultWriter:
             for name, _, offset, datatype in VIEW_FIELDS
         ]
         value = message(
-            type_name, header=header(stamp_ns, TEAM_FRAME), height=1, width=len(points), fields=fields,
+            type_name, header=header(stamp_ns, frame_id), height=1, width=len(points), fields=fields,
             is_bigendian=False, point_step=VIEW_DTYPE.itemsize, row_step=VIEW_DTYPE.itemsize * len(points),
             data=points.view(np.uint8).reshape(-1), is_dense=True,
         )  # fmt: skip
         self._writer.write(map_view_topic(robot_id), type_name, value, stamp_ns)
 
     def write_poses(self, stamp_ns: int, poses: Sequence[RobotPose]) -> None:
-        """Write the robots' sensor poses to ``/<robot>/pose`` and ``/tf`` (team -> ``<robot>/sensor``)."""
+        """Write the robots' sensor poses to ``/<robot>/pose`` and ``/tf`` (frame -> ``<robot>/sensor``)."""
         self._start(stamp_ns)
         transforms = []
         for pose in poses:
-            position, rotation = _vector(pose.T_team_sensor), _quaternion(pose.T_team_sensor)
+            position, rotation = vector(pose.T_team_sensor), quaternion(pose.T_team_sensor)
             type_name = "geometry_msgs/msg/PoseStamped"
             value = message(
                 type_name,
-                header=header(stamp_ns, TEAM_FRAME),
-                pose=message("geometry_msgs/msg/Pose", position=_point(position), orientation=rotation),
+                header=header(stamp_ns, pose.frame_id),
+                pose=message("geometry_msgs/msg/Pose", position=point(position), orientation=rotation),
             )
             self._writer.write(pose_topic(pose.robot_id), type_name, value, stamp_ns)
-            transforms.append(_transform(stamp_ns, f"{pose.robot_id}/sensor", position, rotation))
+            transforms.append(transform(stamp_ns, pose.frame_id, f"{pose.robot_id}/sensor", position, rotation))
         if transforms:
             self._write_transforms(TF_TOPIC, stamp_ns, transforms)
 
     def write_graph(self, stamp_ns: int, links: Sequence[tuple[str, str]], poses: Sequence[RobotPose]) -> None:
         """Write the tick's links (pairs of robots, each once) as lines and the robots' names to ``/graph``."""
         self._start(stamp_ns)
-        positions = {pose.robot_id: _vector(pose.T_team_sensor) for pose in poses}
-        points = [_point(positions[end]) for link in links if positions.keys() >= set(link) for end in link]
-        lines = _marker(
-            stamp_ns, "links", 0, _LINE_LIST, action=_ADD if points else _DELETE, points=points, scale=(0.08, 0.0, 0.0)
-        )
+        positions = {pose.robot_id: vector(pose.T_team_sensor) for pose in poses}
+        frames = {pose.robot_id: pose.frame_id for pose in poses}
+        lines = []
+        # A link joins robots in one frame; a frame without links deletes the lines of an earlier tick.
+        for number, frame_id in enumerate(dict.fromkeys(frames.values()) or [TEAM]):
+            ends = [end for link in links if positions.keys() >= set(link) for end in link if frames[end] == frame_id]
+            lines.append(
+                marker(
+                    stamp_ns,
+                    "links",
+                    number,
+                    LINE_LIST,
+                    action=ADD if ends else DELETE,
+                    points=[point(positions[end]) for end in ends],
+                    scale=(0.08, 0.0, 0.0),
+                    frame_id=frame_id,
+                )
+            )
         names = [
-            _marker(
-                stamp_ns, "robots", index, _TEXT_VIEW_FACING, text=robot_id, scale=(0.0, 0.0, 0.6),
-                position=positions[robot_id] + (0.0, 0.0, 0.8),
+            marker(
+                stamp_ns, "robots", index, TEXT_VIEW_FACING, text=robot_id, scale=(0.0, 0.0, 0.6),
+                position=positions[robot_id] + (0.0, 0.0, 0.8), frame_id=frames[robot_id],
             )
             for index, robot_id in enumerate(robot.robot_id for robot in self._config.robots)
             if robot_id in positions
         ]  # fmt: skip
         type_name = "visualization_msgs/msg/MarkerArray"
-        self._writer.write(GRAPH_TOPIC, type_name, message(type_name, markers=[lines, *names]), stamp_ns)
+        self._writer.write(GRAPH_TOPIC, type_name, message(type_name, markers=[*lines, *names]), stamp_ns)
 
     def write_packet(self, robot_id: str, stamp_ns: int, tick: int, data: bytes) -> None:
         """Write one packet as sent to ``/<robot>/packet``."""
         self._start(stamp_ns)
         type_name = "octoreplay_msgs/msg/Packet"
         value = message(
-            type_name, header=header(stamp_ns, TEAM_FRAME), sender=robot_id, tick=tick,
+            type_name, header=header(stamp_ns, TEAM), sender=robot_id, tick=tick,
             data=np.frombuffer(data, dtype=np.uint8),
         )  # fmt: skip
         self._writer.write(packet_topic(robot_id), type_name, value, stamp_ns)
@@ -285,7 +325,7 @@ class ResultWriter:
             {
                 "version": __version__,
                 "format_version": FORMAT_VERSION,
-                "frame": TEAM_FRAME,
+                "frame": TEAM,
                 "robots": json.dumps([robot.robot_id for robot in robots]),
                 "resolution": repr(config.map.resolution),
                 "prior": repr(config.map.prior(self._class_table.num_classes)),
@@ -313,8 +353,9 @@ class ResultWriter:
         if self._started:
             return
         self._started = True
-        transforms = [_static_transform(stamp_ns, robot) for robot in self._config.robots]
-        self._write_transforms(STATIC_TF_TOPIC, stamp_ns, transforms)
+        if not self._config.alignment.is_on_air:
+            transforms = [static_transform(stamp_ns, robot) for robot in self._config.robots]
+            self._write_transforms(STATIC_TF_TOPIC, stamp_ns, transforms)
 
     def _write_transforms(self, topic: str, stamp_ns: int, transforms: list[Any]) -> None:
         type_name = "tf2_msgs/msg/TFMessage"
@@ -345,78 +386,13 @@ def _summary_values(summary: RunSummary) -> dict[str, str]:
     """Return a summary as metadata, with numbers and lists as JSON; without the wall time, which differs by run."""
     values = {"complete": "true"}
     for item in dataclasses.fields(summary):
-        if item.name in ("wall_seconds", "last", "links", "frame_counts"):
+        if item.name in ("wall_seconds", "last", "links", "frame_counts", "joins"):
             continue
         value = getattr(summary, item.name)
         values[item.name] = value if isinstance(value, str) else json.dumps(value)
+    if summary.joins:
+        values["joins"] = json.dumps([dataclasses.asdict(join) for join in summary.joins])
     values["links"] = json.dumps([dataclasses.asdict(link) for link in summary.links])
     counts = {robot_id: dataclasses.asdict(count) for robot_id, count in summary.frame_counts.items()}
     values["frame_counts"] = json.dumps(counts)
     return values
-
-
-def _static_transform(stamp_ns: int, robot: RobotConfig) -> Any:
-    """Return the transform from the team's frame to ``<robot>/map``, the frame of the poses in the robot's log."""
-    x, y, z, *rotation = robot.T_team_map_or_identity
-    quaternion = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", rotation, strict=True)))
-    return _transform(stamp_ns, f"{robot.robot_id}/map", np.array([x, y, z]), quaternion)
-
-
-def _transform(stamp_ns: int, child_frame: str, position: Float64Array, rotation: Any) -> Any:
-    """Return a geometry_msgs/TransformStamped from the team's frame."""
-    return message(
-        "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, TEAM_FRAME), child_frame_id=child_frame,
-        transform=message(
-            "geometry_msgs/msg/Transform",
-            translation=message("geometry_msgs/msg/Vector3", **_xyz(position)),
-            rotation=rotation,
-        ),
-    )  # fmt: skip
-
-
-def _marker(
-    stamp_ns: int,
-    namespace: str,
-    marker_id: int,
-    kind: int,
-    *,
-    scale: tuple[float, float, float],
-    action: int = _ADD,
-    points: Sequence[Any] = (),
-    text: str = "",
-    position: Float64Array | None = None,
-) -> Any:
-    """Return a visualization_msgs/Marker in the team's frame; fields unused by lines and texts are empty."""
-    point = _point(np.zeros(3) if position is None else position)
-    identity = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    empty_bytes = np.zeros(0, dtype=np.uint8)
-    return message(
-        "visualization_msgs/msg/Marker", header=header(stamp_ns, TEAM_FRAME), ns=namespace, id=marker_id, type=kind,
-        action=action, pose=message("geometry_msgs/msg/Pose", position=point, orientation=identity),
-        scale=message("geometry_msgs/msg/Vector3", **_xyz(np.array(scale))),
-        color=message("std_msgs/msg/ColorRGBA", r=1.0, g=1.0, b=1.0, a=1.0),
-        lifetime=message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False, points=list(points),
-        colors=[], texture_resource="",
-        texture=message("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=empty_bytes),
-        uv_coordinates=[], text=text, mesh_resource="",
-        mesh_file=message("visualization_msgs/msg/MeshFile", filename="", data=empty_bytes),
-        mesh_use_embedded_materials=False,
-    )  # fmt: skip
-
-
-def _xyz(vector: Float64Array) -> dict[str, float]:
-    return {"x": float(vector[0]), "y": float(vector[1]), "z": float(vector[2])}
-
-
-def _point(vector: Float64Array) -> Any:
-    return message("geometry_msgs/msg/Point", **_xyz(vector))
-
-
-def _vector(transform: Float64Array) -> Float64Array:
-    return transform[:3, 3]
-
-
-def _quaternion(transform: Float64Array) -> Any:
-    """Return the geometry_msgs/Quaternion of a transform's rotation."""
-    x, y, z, w = rotation_to_quaternion(transform[:3, :3])
-    return message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

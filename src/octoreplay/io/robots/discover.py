@@ -54,7 +54,8 @@ def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun
         if classes is None:
             classes = edited(team_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
     check_labelled(classes, robots, labelled)
-    warnings = check_team(members, strict_frames=config.time.strict_frames)
+    on_air = config.alignment.is_on_air
+    warnings = check_team(members, strict_frames=config.time.strict_frames, need_common_frame=not on_air)
     origins = team_frame_origins(members)
     robots = [dataclasses.replace(robot, frame_origin=origins[robot.robot_id]) for robot in robots]
     return ResolvedRun.from_config(config, robots, classes, warnings)

@@ -34,12 +34,16 @@ def team_member(robot: RobotConfig, group: LogGroup, *, use_log_time: bool = Fal
     return TeamMember(robot, frame, clock_of(robot, group, use_log_time=use_log_time))
 
 
-def check_team(members: Sequence[TeamMember], *, strict_frames: bool) -> tuple[str, ...]:
+def check_team(
+    members: Sequence[TeamMember], *, strict_frames: bool, need_common_frame: bool = True
+) -> tuple[str, ...]:
     """Return a sentence for each way in which the robots of a team do not fit together.
 
-    Raises ConfigError with ``strict_frames`` where nothing relates the map frames of two robots.
+    Without ``need_common_frame`` the robots may begin in frames that nothing relates. Raises ConfigError with
+    ``strict_frames`` where nothing relates the map frames of two robots that need a common one.
     """
-    unrelated = frames_warning([(m.robot, m.frame) for m in members if m.frame is not None])
+    frames = [(m.robot, m.frame) for m in members if m.frame is not None]
+    unrelated = frames_warning(frames) if need_common_frame else None
     if unrelated is not None and strict_frames:
         raise ConfigError(f"strict_frames: {unrelated}")
     clocks = clock_warning({m.robot.robot_id: m.clock for m in members if m.clock is not None})

@@ -57,6 +57,21 @@ def frame_origins(robots: Sequence[tuple[RobotConfig, MapFrame | None]]) -> dict
     return origins
 
 
+def frame_groups(robots: Sequence[RobotConfig], frames: Sequence[MapFrame | None]) -> list[list[int]]:
+    """Return the robots, by position, in groups with one frame from the beginning; the placed robots are the first one.
+
+    A robot is placed by its ``T_team_map``. The logs relate others as ``frames_warning`` says; a robot with an unknown
+    frame is a group of its own.
+    """
+    placed = [i for i, robot in enumerate(robots) if robot.T_team_map is not None]
+    others = [i for i in range(len(robots)) if i not in placed]
+    position = {robots[i].robot_id: i for i in others}
+    known = [(robots[i], frame) for i in others if (frame := frames[i]) is not None]
+    groups = [[position[robot.robot_id] for robot, _ in group] for group in _groups(known)]
+    groups += [[i] for i in others if frames[i] is None]
+    return [group for group in (placed, *sorted(groups)) if group]
+
+
 def _described(frame: MapFrame) -> str:
     """Map frame as a warning names it."""
     if frame.name is None:

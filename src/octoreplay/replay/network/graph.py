@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.config.consensus import ConsensusConfig
-from octoreplay.config.network import NetworkConfig
+from octoreplay.config.network import POSITION_TOPOLOGIES, NetworkConfig
 from octoreplay.errors import ConfigError
 from octoreplay.records import BoolArray, Float64Array, read_only
 from octoreplay.replay.network.schedule import Availability, Schedule
-from octoreplay.replay.network.topology import POSITION_TOPOLOGIES, Topology
+from octoreplay.replay.network.topology import Topology
 
 Link: TypeAlias = tuple[int, int]
 
@@ -125,6 +125,8 @@ class TeamNetwork:
 
     The topology is restricted to the robots that are active and on. One-way pairs lose their other direction. Then the
     schedule applies: its links_up are bidirectional, its links_down are removed, silent robots do not send.
+    ``radio_links`` are the links of the last graph together with those between robots in different frames, which mix no
+    maps.
 
     Raises ConfigError where the schedule contradicts itself, or adds a link that has no weight.
     """
@@ -137,21 +139,32 @@ class TeamNetwork:
         self._topology = Topology(network, robot_ids)
         self._blocked = _one_way_block(network, robot_ids)
         self._graph: CommunicationGraph | None = None
+        self.radio_links: tuple[Link, ...] = ()
         if network.weights == "given":
             _check_given_weights(network)
 
-    def at(self, elapsed_s: float, active: Sequence[bool] | BoolArray, positions: Float64Array) -> CommunicationGraph:
+    def at(
+        self,
+        elapsed_s: float,
+        active: Sequence[bool] | BoolArray,
+        positions: Float64Array,
+        in_one_frame: BoolArray | None = None,
+    ) -> CommunicationGraph:
         """Graph at a time since the run's start; the same object as before if nothing has changed.
 
         ``active`` (N,) bool are the robots that take part, including those that the schedule has off. ``positions``
-        (N, 3) float64 are in metres in the team's frame, NaN for robots without a pose. Call it in the order of time,
-        once a tick: topology 'range' keeps its links for the hysteresis.
+        (N, 3) float64 are in metres in the team's frame, NaN for robots without a pose. ``in_one_frame`` (N, N) bool
+        are the pairs of robots that may mix their maps (default: all). Call it in the order of time, once a tick:
+        topology 'range' keeps its links for the hysteresis.
 
         Raises ConfigError where a robot's weights sum to more than 1, or epsilon is not below the graph's bound.
         """
         available = self.schedule.at(elapsed_s)
         present = np.asarray(active, dtype=bool) & ~available.robots_off
         hears = self._hears(present, positions, available)
+        self.radio_links = _links(hears)
+        if in_one_frame is not None:
+            hears = hears & in_one_frame
         indices = tuple(np.flatnonzero(present).tolist())
         links = _links(hears)
         if self._graph is None or (self._graph.active, self._graph.links) != (indices, links):

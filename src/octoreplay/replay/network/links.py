@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Set
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, Self, TypeVar
 
@@ -135,6 +135,19 @@ class Links(Generic[T]):
             if ends not in standing:
                 link.counts.num_dropped += len(link.waiting)
                 link.waiting.clear()
+
+    def lose(self, robots: Set[int]) -> None:
+        """Lose all content that is on the air or waits, from and to some robots."""
+        kept = []
+        for entry in self._on_air:
+            delivery = entry[-1]
+            if delivery.sender in robots or delivery.receiver in robots:
+                self._link(delivery.sender, delivery.receiver).counts.num_lost += delivery.content.waits
+            else:
+                kept.append(entry)
+        self._on_air = kept
+        heapq.heapify(self._on_air)
+        self.cut(ends for ends in self._links if not robots & set(ends))
 
     def take_counts(self) -> dict[tuple[int, int], LinkCounts]:
         """Counts of each direction of each link since the last call."""

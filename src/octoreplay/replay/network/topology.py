@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from octoreplay.config.network import NetworkConfig
+from octoreplay.config.network import POSITION_TOPOLOGIES, NetworkConfig
 from octoreplay.records import BoolArray, Float64Array
 
 if TYPE_CHECKING:
     import networkx as nx
-
-POSITION_TOPOLOGIES = ("nearest", "range")
-"""Topologies whose links depend on the robots' positions; the others are fixed over a run."""
 
 
 class Topology:

@@ -62,7 +62,7 @@ class RatioRobot(Robot):
         for source, new in sorted(dict(arrived).items()):
             old = self._taken.get(source)
             self._taken[source] = new
-            if old is None and self.source.epoch > 0:
+            if old is None and self.has_lost_messages:
                 # Shares that were sent to an earlier restart epoch are lost with it.
                 continue
             self._weight += new.weight - (old.weight if old else 0)

@@ -64,14 +64,23 @@ class MapSizes:
 
 @dataclass(frozen=True, eq=False)
 class Publication:
-    """Messages of a robot in one tick, each with its receivers, and the sizes of the robot's map."""
+    """Messages of a robot in one tick, each with its receivers, and the sizes of the robot's map.
+
+    ``outbox`` are the messages of the rule, ``own_evidence`` those to robots in other frames.
+    """
 
     outbox: Sequence[tuple[tuple[int, ...], MapMessage]]
     sizes: MapSizes
+    own_evidence: Sequence[tuple[tuple[int, ...], MapMessage]] = ()
+
+    @property
+    def messages(self) -> Sequence[tuple[tuple[int, ...], MapMessage]]:
+        """All messages."""
+        return (*self.outbox, *self.own_evidence)
 
     @property
     def packet_bytes(self) -> int:
-        """Mean number of bytes sent to a receiver; 0 without receivers."""
+        """Mean number of bytes that the rule sent to a receiver; 0 without receivers."""
         sizes = [message.num_bytes for receivers, message in self.outbox for _ in receivers]
         return round(sum(sizes) / len(sizes)) if sizes else 0
 
@@ -96,6 +105,8 @@ class Robot(ABC):
         Pose of the sensor at the last scan; None before the first.
     num_scans, num_iterations : int
         Scans and iterations in this restart epoch.
+    has_lost_messages : bool
+        True where an earlier restart epoch took what others sent.
     """
 
     def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
@@ -103,6 +114,7 @@ class Robot(ABC):
         self.robot_id = config.robots[index].robot_id
         self.index = index
         self.source = Source(index, epoch)
+        self.has_lost_messages = epoch > 0
         self.num_scans = 0
         self.num_iterations = 0
         self.T_team_sensor: Float64Array | None = None
@@ -210,6 +222,10 @@ class Robot(ABC):
         self._arrived += [Arrival(source, self.exchange.held[source]) for source in receipt.fresh]
         return receipt, answer
 
+    def acknowledged(self, sender: int, answer: Acknowledgement) -> None:
+        """Note the versions that a neighbour holds."""
+        self.exchange.acknowledged(sender, answer)
+
     def take_arrivals(self) -> list[Arrival]:
         """States that arrived since the last call, in the order of arrival."""
         arrived, self._arrived = self._arrived, []
@@ -245,9 +261,18 @@ class Team(ABC, Generic[RobotT]):
         self.robots[index] = self._new_robot(index, old.source.epoch + 1)
         self.robots[index].T_team_sensor = old.T_team_sensor
 
-    def evidence(self) -> list[Evidence]:
-        """Evidence of all robots, that of earlier restart epochs included."""
-        return [*(robot.evidence for robot in self.robots), *self._past_evidence]
+    def change_frame(self, index: int) -> None:
+        """Replace a robot by one without evidence that integrates all its scans again in another frame.
+
+        Its restart epoch is the next one, since its map gets a new history. Nothing that others sent it is lost: robots
+        in different frames do not exchange maps.
+        """
+        self.robots[index] = self._new_robot(index, self.robots[index].source.epoch + 1)
+        self.robots[index].has_lost_messages = False
+
+    def evidence(self, members: Sequence[int]) -> list[Evidence]:
+        """Evidence of some robots, and that of earlier restart epochs."""
+        return [*(self.robots[index].evidence for index in members), *self._past_evidence]
 
     def positions(self) -> Float64Array:
         """Sensor positions, (N, 3) float64 in metres in the team's frame; NaN before a robot's first scan."""
