@@ -1,9 +1,14 @@
+"""Robust pose graphs with known solutions."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 from octoreplay.registration.pose_graph import PoseGraphEdge, PosePrior, solve
 from octoreplay.registration.rigid import inverses, moved, rotation_logs
 from octoreplay.transforms import inverse
+from support.long_suite import long
 
 
 def random_poses(rng, num_poses):
@@ -124,6 +129,7 @@ def test_a_prior_sets_the_frame_and_its_weight_counts():
     )
 
 
+@long
 def test_covariances_are_those_of_repeated_measurements():
     rng = np.random.default_rng(9)
     truth, _ = chain_with_loops(rng, 6, 0)
