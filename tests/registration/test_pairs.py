@@ -68,10 +68,11 @@ def test_other_worlds_are_refused():
     assert pair.refusal
 
 
-def test_the_mirror_image_is_refused():
+@pytest.mark.parametrize("dof", [4, 6])
+def test_the_mirror_image_is_refused(dof):
     own = _view(0, 0.0, 0.0, 0.0)
     mirrored = OwnMap(own.states[::-1].copy(), own.low, own.resolution, own.num_classes)
-    assert not _aligned(own, mirrored).is_accepted
+    assert not _aligned(own, mirrored, dof=dof).is_accepted
 
 
 def test_a_robot_upside_down_is_refused():
