@@ -12,7 +12,7 @@ import itertools
 import math
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,7 @@ from octoreplay.simulate.exploration import explore
 from octoreplay.simulate.odometry import drift_corrections
 from octoreplay.simulate.team import T_BODY_CAMERA, body_poses
 from octoreplay.simulate.village import make_village
+from octoreplay.simulate.world import World
 from octoreplay.transforms import inverse
 
 CAMERA = CameraModel(160, 120, 65.25, 65.25, 79.5, 59.5)
@@ -168,8 +169,8 @@ def make_team(seed: int, condition: Condition, num_robots: int, world_size: floa
 class Lidar(MeshCamera):
     """Rotating scanner with the interface of the camera: depths are ranges."""
 
-    def __init__(self, world: object, camera: CameraModel) -> None:
-        super().__init__(world, camera)  # type: ignore[arg-type]
+    def __init__(self, world: World, camera: CameraModel) -> None:
+        super().__init__(world, camera)
         up, around = np.meshgrid(
             np.radians(np.linspace(-25, 15, LIDAR_RINGS)), np.arange(LIDAR_COLUMNS) * (2 * math.pi / LIDAR_COLUMNS),
             indexing="ij",
@@ -407,8 +408,6 @@ def _report_across(report: Report, condition: Condition, outcomes: list[Outcome]
 def _report_large_team(report: Report, seed: int) -> None:
     """Time of a team of 16 robots."""
     team = make_team(seed, PLAIN, 16, world_size=110.0)
-    from concurrent.futures import ThreadPoolExecutor
-
     started = time.monotonic()
     with ThreadPoolExecutor(2) as threads:
         result = align_team([frame.own for frame in team], run=threads.map)

@@ -78,6 +78,13 @@ def inverse(transform: Float64Array) -> Float64Array:
     return result
 
 
+def pose_difference(one: Float64Array, other: Float64Array) -> tuple[float, float]:
+    """Return the distance [m] and the angle [rad] between two poses (4, 4)."""
+    difference = inverse(one) @ other
+    cosine = (float(np.trace(difference[:3, :3])) - 1) / 2
+    return float(np.linalg.norm(difference[:3, 3])), math.acos(min(1.0, max(-1.0, cosine)))
+
+
 def transform_of(numbers: Sequence[float]) -> Float64Array:
     """Return the transform (4, 4) of seven numbers x, y, z, qx, qy, qz, qw; the quaternion is normalised.
 

@@ -10,10 +10,9 @@ import pytest
 
 from octoreplay.config.frames_file import load_frames_file
 from octoreplay.config.team_file import load_team_file
-from octoreplay.registration.placing import pose_difference
 from octoreplay.result import open_result
 from octoreplay.simulate.team import SimulationConfig, simulate_team
-from octoreplay.transforms import inverse, transform_of
+from octoreplay.transforms import inverse, pose_difference, transform_of
 from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import PAIR_TEAM
 from support.long_suite import long

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.registration.covariance import chained_frames
 from octoreplay.registration.pairs import PairAlignment
-from octoreplay.registration.placing import place_robots, pose_difference
+from octoreplay.registration.placing import place_robots
 from octoreplay.registration.team import TeamAlignment
 from octoreplay.registration.verify import verify
-from octoreplay.transforms import inverse
+from octoreplay.transforms import inverse, pose_difference
 from support.village_maps import T_village_map, empty_map, village_map
 
 

@@ -14,13 +14,12 @@ import pytest
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.registration.placing import pose_difference
 from octoreplay.replay.alignment import Alignment, align_robots, aligned_config, check_aligned
 from octoreplay.report.alignment_files import PAIR_COLUMNS, write_alignment
 from octoreplay.report.alignment_plots import write_alignment_figures
 from octoreplay.report.alignment_tables import alignment_tables
 from octoreplay.report.tables import terminal
-from octoreplay.transforms import inverse, numbers_of
+from octoreplay.transforms import inverse, numbers_of, pose_difference
 from support.village_maps import T_village_map, empty_map, team_config, village_map
 
 PLACES = {"ant": ((-2.0, 0.0), 0), "bee": ((3.0, 3.0), 1), "cow": ((2.0, -4.0), 2)}

@@ -19,6 +19,7 @@ import numpy as np
 
 from octoreplay.records import Float64Array
 from octoreplay.registration.pairs import PairAlignment
+from octoreplay.registration.rigid import cross_matrix
 from octoreplay.registration.team import TeamAlignment
 from octoreplay.transforms import inverse
 
@@ -72,7 +73,7 @@ def adjoint(T: Float64Array) -> Float64Array:
     """Return Ad(T) (6, 6) of a transform (4, 4), for motions (rotation, translation)."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = T[:3, :3]
-    result[3:, :3] = _cross(T[:3, 3]) @ T[:3, :3]
+    result[3:, :3] = cross_matrix(T[:3, 3]) @ T[:3, :3]
     return result
 
 
@@ -88,11 +89,6 @@ def _covariance(pair: PairAlignment, *, to: int) -> Float64Array:
 def about_point(covariance: Float64Array, arm: Float64Array) -> Float64Array:
     """Return the covariance (6, 6) of a motion with the translation of a point at ``arm`` (3,) [m] from the origin."""
     shift = np.eye(6)
-    shift[3:, :3] = -_cross(arm)
+    shift[3:, :3] = -cross_matrix(arm)
     result: Float64Array = shift @ covariance @ shift.T
     return result
-
-
-def _cross(v: Float64Array) -> Float64Array:
-    """Matrix [v]x of the cross product with v."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -6,18 +6,15 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from octoreplay.mapping.octree import Run
 from octoreplay.records import Float64Array, Int64Array
 from octoreplay.registration.pose_graph import Bias, PoseGraphEdge, PosePrior, solve
 from octoreplay.registration.rigid import inverses, rotation_exps, rotation_logs
 from octoreplay.registration.submaps import Submap, overlapping_pairs, register
 from octoreplay.transforms import inverse
-
-Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""Function that calls another one with each of some items: ``map``, or the ``map`` of an executor."""
 
 # Largest distances between corresponding points, one round each [voxel].
 _GATES = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 3.0, 3.0)

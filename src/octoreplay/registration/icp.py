@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from octoreplay.records import BoolArray, Float64Array, Int64Array
+from octoreplay.registration.rigid import cross_matrix
 
 # Distance between neighbouring codes in the tree's fourth coordinate [m]; no gate reaches it.
 _CODE_DISTANCE = 1e4
@@ -138,7 +139,7 @@ def icp(
             if shift < _RELATIVE_STEP * gate and angle < _RELATIVE_STEP * gate / _LEVER:
                 break
     about_origin = np.eye(6)
-    about_origin[3:, :3] = -_cross_matrix(centre)
+    about_origin[3:, :3] = -cross_matrix(centre)
     return IcpResult(T, about_origin.T @ hessian @ about_origin / _CORRESPONDENCES_PER_SAMPLE, num)
 
 
@@ -213,11 +214,6 @@ def _moved(T: Float64Array, motion: Float64Array, centre: Float64Array) -> Float
     result[:3, :3] = rotation @ T[:3, :3]
     result[:3, 3] = rotation @ (T[:3, 3] - centre) + centre + motion[3:]
     return result
-
-
-def _cross_matrix(v: Float64Array) -> Float64Array:
-    """The matrix (3, 3) of the cross product with v."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _inverse_symmetric(m: Float64Array) -> Float64Array:

@@ -14,7 +14,7 @@ from octoreplay.registration.covariance import chained_frames
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import AcceptLimits
 from octoreplay.registration.team import TeamAlignment, worst_contradiction
-from octoreplay.transforms import inverse
+from octoreplay.transforms import inverse, pose_difference
 
 LARGEST_SURVEY_SHIFT, LARGEST_SURVEY_ANGLE = 1.0, math.radians(3.0)
 """Largest difference [m, rad] between a surveyed pose and the pose that the maps give, up to which both agree."""
@@ -110,13 +110,6 @@ def place_robots(
     if together:
         teams.insert(0, tuple(sorted(together, key=lambda robot: robot.index)))
     return Placement(tuple(sorted(teams, key=lambda team: -len(team))), tuple(refusals))
-
-
-def pose_difference(one: Float64Array, other: Float64Array) -> tuple[float, float]:
-    """Return the distance [m] and the angle [rad] between two poses (4, 4)."""
-    difference = inverse(one) @ other
-    cosine = (float(np.trace(difference[:3, :3])) - 1) / 2
-    return float(np.linalg.norm(difference[:3, 3])), math.acos(min(1.0, max(-1.0, cosine)))
 
 
 def _placed(alignment: TeamAlignment, anchors: Mapping[int, Float64Array]) -> tuple[PlacedRobot, ...]:

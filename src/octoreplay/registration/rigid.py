@@ -18,6 +18,11 @@ def inverses(transforms: Float64Array) -> Float64Array:
     return result
 
 
+def cross_matrix(v: Float64Array) -> Float64Array:
+    """Return the matrix [v]x (3, 3) of the cross product with v (3,)."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
 def rotation_exps(vectors: Float64Array) -> Float64Array:
     """Return the rotations (n, 3, 3) of rotation vectors (n, 3) [rad]."""
     return np.asarray(Rotation.from_rotvec(vectors).as_matrix())

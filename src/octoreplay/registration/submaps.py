@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
 from octoreplay.records import BoolArray, Float64Array, Int64Array, UInt8Array
-from octoreplay.registration.rigid import moved
+from octoreplay.registration.rigid import cross_matrix, moved
 from octoreplay.transforms import inverse
 
 # Distance between neighbouring classes in the tree's fourth coordinate, in voxels; no gate reaches it.
@@ -186,9 +186,8 @@ def _residuals(moving: Submap, fixed: Submap, T: Float64Array, gate: float) -> t
 def _adjoint(T: Float64Array) -> Float64Array:
     """Matrix (6, 6) that maps a step (translation, rotation) in the second frame to the first frame."""
     adjoint = np.zeros((6, 6))
-    x, y, z = T[:3, 3]
     adjoint[:3, :3] = adjoint[3:, 3:] = T[:3, :3]
-    adjoint[:3, 3:] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ T[:3, :3]
+    adjoint[:3, 3:] = cross_matrix(T[:3, 3]) @ T[:3, :3]
     return adjoint
 
 

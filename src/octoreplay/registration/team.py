@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
+from octoreplay.mapping.octree import Run
 from octoreplay.records import Float64Array
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import AcceptLimits, PairAlignment, align_pair
 from octoreplay.registration.verify import verify
-from octoreplay.transforms import inverse
+from octoreplay.transforms import inverse, pose_difference
 
-Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""Function that calls another one with each of some items: ``map``, or the ``map`` of an executor."""
-
-# Largest difference between two chains of poses that join the same robots.
-_LARGEST_LOOP_SHIFT, _LARGEST_LOOP_ANGLE = 1.0, 3.0
+# Largest difference between two chains of poses that join the same robots [m], [rad].
+_LARGEST_LOOP_SHIFT, _LARGEST_LOOP_ANGLE = 1.0, math.radians(3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +121,10 @@ def join_pairs(
 
 def _loop_refusal(one: Float64Array, other: Float64Array) -> str:
     """Reason to refuse a pair that closes a loop; empty where both poses (4, 4) agree."""
-    difference = inverse(one) @ other
-    shift = float(np.linalg.norm(difference[:3, 3]))
-    angle = np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
+    shift, angle = pose_difference(one, other)
     if shift <= _LARGEST_LOOP_SHIFT and angle <= _LARGEST_LOOP_ANGLE:
         return ""
-    return f"differs from the chain of better pairs by {shift:.1f} m and {angle:.1f} degrees"
+    return f"differs from the chain of better pairs by {shift:.1f} m and {math.degrees(angle):.1f} degrees"
 
 
 def worst_contradiction(

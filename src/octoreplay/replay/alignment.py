@@ -22,11 +22,11 @@ from octoreplay.records import Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
-from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots, pose_difference
+from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots
 from octoreplay.registration.team import TeamAlignment, align_team
 from octoreplay.replay.own_maps import own_map_of, own_maps
 from octoreplay.result import Result
-from octoreplay.transforms import inverse, numbers_of, transform_of
+from octoreplay.transforms import inverse, numbers_of, pose_difference, transform_of
 
 Frames = Mapping[str, Sequence[float]]
 """T_team_map (x, y, z, qx, qy, qz, qw) by robot_id."""
