@@ -35,6 +35,10 @@ class OccupiedCells:
         """Return the cells where ``chosen`` (n,) is True."""
         return OccupiedCells(self.points[chosen], self.class_ids[chosen])
 
+    def thinned(self, step: int) -> OccupiedCells:
+        """Return every ``step``-th cell."""
+        return OccupiedCells(self.points[::step], self.class_ids[::step])
+
 
 def class_bits(class_ids: UInt8Array) -> UInt64Array:
     """Return the bit of each class_id."""

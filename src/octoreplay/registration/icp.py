@@ -28,8 +28,9 @@ _FLATNESS = 0.25
 # Squared Mahalanobis distance at which Geman and McClure's weight is 1/4.
 _ROBUST_SCALE = 4.0
 _NUM_ITERATIONS = 12
-# Iterations of a stage end where a step is below this share of its gate; a rotation is measured at this distance [m].
-_RELATIVE_STEP, _LEVER = 0.005, 10.0
+# Iterations of a stage end where a step is below this share of its gate: of the last stage, and of others. A rotation is
+# measured at a distance [m].
+_RELATIVE_STEP, _COARSE_STEP, _LEVER = 0.005, 0.03, 10.0
 # Number of neighbouring correspondences that carry the information of one independent measurement.
 _CORRESPONDENCES_PER_SAMPLE = 50.0
 
@@ -136,7 +137,8 @@ def icp(
             motion = -np.linalg.solve(hessian + damping, gradient)
             T = _moved(T, motion, centre)
             shift, angle = np.linalg.norm(motion[3:]), np.linalg.norm(motion[:3])
-            if shift < _RELATIVE_STEP * gate and angle < _RELATIVE_STEP * gate / _LEVER:
+            least = (_RELATIVE_STEP if gate == gates[-1] else _COARSE_STEP) * gate
+            if shift < least and angle < least / _LEVER:
                 break
     about_origin = np.eye(6)
     about_origin[3:, :3] = -cross_matrix(centre)

@@ -19,16 +19,18 @@ TILT_SIGMA = math.radians(1.0)
 """Standard deviation of the angle between the vertical axes of two gravity-aligned robots [rad]."""
 
 # Gates of the refinement [cell]: of every candidate, and of those that are not excluded by then.
-_COARSE_GATES, _FINE_GATES = (5.0, 3.0, 2.0), (2.0, 1.2)
+_COARSE_GATES, _FINE_GATES = (5.0, 3.0), (2.0, 1.2)
 _NUM_REFINED = 4
 # Candidates are refined with one point in this many.
 _THINNING = 3
+# Two poses are one up to this shift [cell] and angle [degree]: after the first refinement, and as rivals.
+_SAME_POSE, _RIVAL_POSE = (1.0, 1.0), (4.0, 8.0)
 _UPWARDS = np.zeros((4, 4))
 _UPWARDS[2, 3] = 1.0
-# Shares of the same cells under a right pose, and the score that a pose needs more for each share less, for each share
-# of contradicting obstacles, and for each squared standard deviation of tilt.
-_USUAL_SAME, _USUAL_GROUND_SAME = 0.97, 0.985
-_PER_UNLIKE_OBSTACLE, _PER_UNLIKE_GROUND, _PER_CONTRA, _PER_TILT = 3000.0, 5000.0, 2500.0, 25.0
+# Share of the same ground cells under a right pose, and the score that a pose needs more for each share less, for each
+# share of contradicting obstacles, and for each squared standard deviation of tilt.
+_USUAL_GROUND_SAME = 0.985
+_PER_UNLIKE_GROUND, _PER_CONTRA, _PER_TILT = 500.0, 1100.0, 57.0
 # Edge of the cells for which the least score holds [m].
 _SCORE_RESOLUTION = 0.3
 # A refined candidate with more contradicting obstacles than this is wrong.
@@ -50,9 +52,6 @@ class AcceptLimits:
         Largest share q_c of obstacle cells that contradict.
     max_tilt : float
         Largest angle between the vertical axes [rad].
-    max_rival : float
-        Largest evidence of another pose that is accepted by itself, relative to the best one: L, or cells without a
-        vertical axis.
     min_shape_cells : int
         Least number of cells of each map that count, without a vertical axis.
     min_shape_same : float
@@ -61,11 +60,10 @@ class AcceptLimits:
         Least spread of the normals of these cells (``verify.spread_of_normals``): parallel planes fix no pose.
     """
 
-    min_score: float = 200.0
+    min_score: float = 160.0
     min_cells: int = 150
     max_contra: float = 0.1
     max_tilt: float = math.radians(2.5)
-    max_rival: float = 0.5
     min_shape_cells: int = 800
     min_shape_same: float = 0.96
     min_shape_spread: float = 0.1
@@ -138,10 +136,9 @@ def align_pair(
     poses.sort(key=lambda pose: (not pose.is_accepted, -matcher.evidence(pose.verification)))
     best = poses[0]
     for rival in poses[1:]:
-        if best.is_accepted and rival.is_accepted and matcher.is_distinct(best.T_first_second, rival.T_first_second):
+        if rival.is_accepted and matcher.is_distinct(best.T_first_second, rival.T_first_second, *_RIVAL_POSE):
             share = matcher.evidence(rival.verification) / matcher.evidence(best.verification)
-            if share > limits.max_rival:
-                return replace(best, refusal=f"ambiguous: another pose has {share:.0%} of the evidence")
+            return replace(best, refusal=f"ambiguous: another pose fits with {share:.0%} of the evidence")
     return best
 
 
@@ -165,13 +162,14 @@ class _Matcher:
     def refined_candidates(
         self, guesses: Sequence[Float64Array]
     ) -> list[tuple[Float64Array, Float64Array, Verification]]:
-        """Poses with their information and verification: the best candidates after refinement."""
-        candidates = [*self._candidates(), *guesses]
-        ranked = sorted(candidates, key=lambda T: -self._rank(T))
+        """Poses with their information and verification: the best candidates and the guesses after refinement."""
+        ranked = sorted(self._candidates(), key=lambda T: -self._rank(T))
         thin = [_thinned(surface) for surface in self._surfaces]
         refined = []
-        for candidate in ranked[:_NUM_REFINED]:
+        for candidate in (*ranked[:_NUM_REFINED], *guesses):
             T, information = self._refine(thin, candidate, _COARSE_GATES)
+            if any(not self.is_distinct(T, other, *_SAME_POSE) for other, _, _ in refined):
+                continue
             agreement = self.verify(T)
             if agreement.obstacles.share_contra <= _EXCLUDING_CONTRA:
                 T, information = self._refine(self._surfaces, T, _FINE_GATES)
@@ -196,10 +194,8 @@ class _Matcher:
 
     def _min_score(self, agreement: Verification, T: Float64Array) -> float:
         """Least score of a pose: the more cells disagree and the more it tilts, the more evidence it needs."""
-        obstacles, ground = agreement.obstacles, agreement.ground
-        doubt = _PER_UNLIKE_OBSTACLE * max(0.0, _USUAL_SAME - obstacles.share_same)
-        doubt += _PER_UNLIKE_GROUND * max(0.0, _USUAL_GROUND_SAME - ground.share_same)
-        doubt += _PER_CONTRA * obstacles.share_contra + (tilt(T) / TILT_SIGMA) ** 2 * _PER_TILT
+        doubt = _PER_UNLIKE_GROUND * max(0.0, _USUAL_GROUND_SAME - agreement.ground.share_same)
+        doubt += _PER_CONTRA * agreement.obstacles.share_contra + (tilt(T) / TILT_SIGMA) ** 2 * _PER_TILT
         return (self._limits.min_score + doubt) * (_SCORE_RESOLUTION / self._first.resolution) ** 2
 
     def _shape_refusal(self, agreement: Verification, T: Float64Array) -> str:
@@ -213,12 +209,12 @@ class _Matcher:
             "" if is_fixed else f"shared surfaces are parallel: spread {spread:.3f} below {limits.min_shape_spread:g}"
         )
 
-    def is_distinct(self, one: Float64Array, other: Float64Array) -> bool:
-        """True where two poses of the second map's centre differ by more than four cells, or 8 degrees."""
+    def is_distinct(self, one: Float64Array, other: Float64Array, num_cells: float, degrees: float) -> bool:
+        """True where two poses differ by more than a shift of the second map's centre or an angle."""
         centre = np.append(self._second.occupied.points.mean(axis=0), 1.0)
         shift = float(np.linalg.norm((one - other) @ centre))
         turn = float(np.trace(one[:3, :3].T @ other[:3, :3]))
-        return shift > 4 * self._first.resolution or turn < 1 + 2 * math.cos(math.radians(8))
+        return shift > num_cells * self._first.resolution or turn < 1 + 2 * math.cos(math.radians(degrees))
 
     def _rank(self, T: Float64Array) -> float:
         """Number by which candidates are ranked before their refinement."""

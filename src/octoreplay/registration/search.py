@@ -24,6 +24,8 @@ _COARSE = 2
 # Steps of the hill climbing: yaw [degree], shift [column].
 _STEPS = ((5.0, 2.0), (2.5, 1.0), (1.0, 0.5))
 _MAX_CLIMB = 8
+# Candidates climb with one column in this many.
+_CLIMB_THINNING = 2
 # Two poses are one where they are closer than this: yaw [degree], shift [column].
 _SAME_YAW, _SAME_SHIFT = 8.0, 4.0
 
@@ -154,7 +156,7 @@ def _layers(
 
 def _climbed(a: Columns, b: Columns, table: Float64Array, planar: _Planar) -> _Planar:
     """The pose after hill climbing on the columns."""
-    points, codes = b.known[0], b.known[1].astype(np.int32)
+    points, codes = b.known[0][::_CLIMB_THINNING], b.known[1][::_CLIMB_THINNING].astype(np.int32)
     moves = np.array([(u, v, w) for u in (-1, 0, 1) for v in (-1, 0, 1) for w in (-1, 0, 1) if (u, v, w) != (0, 0, 0)])
     # Every position outside of the map is clipped to an unknown border.
     padded = np.pad(a.codes, 1).astype(np.int32)
