@@ -1,5 +1,6 @@
 """Import contracts: they hold, and a breach of each is reported."""
 
+import functools
 import importlib.util
 import os
 import re
@@ -106,6 +107,7 @@ def test_reference_twin_shares_no_code_with_the_package(breach: str, tmp_path: P
     assert ("reference is not allowed to import octoreplay.mapping" in done.stdout) == bool(breach)
 
 
+@functools.cache
 def tool(name: str) -> ModuleType:
     """A script of docs/tools."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "tools" / f"{name}.py")
