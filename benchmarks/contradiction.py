@@ -35,7 +35,8 @@ from octoreplay.mapping.contradiction import (
 )
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
-from octoreplay.records import MIN_COMPARED_CELLS, PAIR_SHARES, Float64Array, Frame, PairMetrics
+from octoreplay.records import Float64Array, Frame
+from octoreplay.run_metrics import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 SENSOR = SensorConfig()

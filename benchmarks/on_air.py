@@ -20,12 +20,11 @@ import numpy as np
 
 from octoreplay.config.frames_file import load_frames_file
 from octoreplay.config.team_file import load_team_file
-from octoreplay.records import FramePlace, TickMetrics
-from octoreplay.registration.placing import pose_difference
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
+from octoreplay.run_metrics import FramePlace, TickMetrics
 from octoreplay.simulate.team import SimulationConfig, simulate_team
-from octoreplay.transforms import inverse, transform_of
+from octoreplay.transforms import inverse, pose_difference, transform_of
 
 COLUMNS = (
     "robots", "seed", "first join [s]", "one team from [s]", "frame error, median", "frame error, largest",

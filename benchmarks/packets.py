@@ -46,9 +46,10 @@ from octoreplay.mapping.codec import PacketFormat
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
-from octoreplay.records import Int64Array, TickMetrics
+from octoreplay.records import Int64Array
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
+from octoreplay.run_metrics import TickMetrics
 
 PACKET_RESOLUTION = 0.3
 """Edge of the finest cells in the measurements of packets, as in the demo [m]."""

@@ -100,17 +100,13 @@ def _outcome(seed: int, team: tuple[int, int, int], frames: str) -> Outcome:
 def _with_noisy_frames(config: RunConfig, folder: Path, seed: int) -> RunConfig:
     """Give each robot its true frame with a random error, as large as an alignment's."""
     frames, rng = load_frames_file(folder / "frames.yaml"), np.random.default_rng([seed, 99])
-    sigmas = np.repeat([FRAME_SHIFT, FRAME_ANGLE], 3) / math.sqrt(3.0)
-    robots = tuple(
-        dataclasses.replace(
-            robot,
-            T_team_map=numbers_of(
-                moved(transform_of(frames[robot.robot_id])[None], rng.normal(size=(1, 6)) * sigmas)[0]
-            ),
-        )
-        for robot in config.robots
-    )
-    return dataclasses.replace(config, robots=robots)
+    robots = []
+    for robot in config.robots:
+        shift, turn = rng.normal(size=(2, 3)) * [[FRAME_SHIFT], [FRAME_ANGLE]] / math.sqrt(3.0)
+        error = moved(np.eye(4)[None], np.concatenate([turn, shift])[None])[0]
+        T_team_map = transform_of(frames[robot.robot_id]) @ error
+        robots.append(dataclasses.replace(robot, T_team_map=numbers_of(T_team_map)))
+    return dataclasses.replace(config, robots=tuple(robots))
 
 
 def _aligned(config: RunConfig) -> RunConfig:

@@ -27,11 +27,11 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.contradiction import EvidenceComparer
-from octoreplay.records import RunSummary
 from octoreplay.replay.measure import TickMeasurer
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.run import Progress, replay_team
 from octoreplay.replay.session import Session
+from octoreplay.run_metrics import RunSummary
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 NUM_THREADS = 2

@@ -22,9 +22,10 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.octree import KEY_BITS, SemanticOctree
 from octoreplay.mapping.streams import leaf_list, leaf_values
-from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array, TickMetrics
+from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
+from octoreplay.run_metrics import TickMetrics
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
 NUM_ROBOTS = 6

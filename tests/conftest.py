@@ -19,14 +19,12 @@ if not IS_COMPILED:
 
     plain_intrinsics.install()
 
-# Imported after the intrinsics, because it imports kernels.
-from octoreplay.mapping.warm_up import compile_if_needed  # noqa: E402
-from octoreplay.replay.exchange.packet_codec import PacketCodec  # noqa: E402
-
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    from octoreplay.replay.exchange.packet_codec import PacketCodec
+
     long_suite.is_long_suite = config.getoption("markexpr") == "long"
     # Receivers decode every packet in the default suite, so that an error in the encoder changes a run. In the long
     # suite they share the sender's maps, as they do by default.
@@ -39,6 +37,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, before the workers start: each of them would compile its own."""
     if IS_COMPILED and session.config.getoption("numprocesses", None):
+        from octoreplay.mapping.warm_up import compile_if_needed
+
         compile_if_needed()
 
 

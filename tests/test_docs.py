@@ -15,8 +15,8 @@ from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.result_writer import VIEW_DTYPE
-from octoreplay.records import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.report.experiment_tables import answer_tables
+from octoreplay.run_metrics import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 
 DOCS = Path(__file__).parents[1] / "docs"

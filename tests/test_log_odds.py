@@ -10,12 +10,14 @@ from octoreplay.log_odds import (
     shifted_exp_sum,
     team_log_odds,
 )
+from support.long_suite import examples
 
 tables = st.tuples(st.integers(1, 6), st.integers(1, 5)).flatmap(
     lambda shape: arrays(np.float64, shape, elements=st.floats(-800, 800))
 )
 
 
+@examples(100)
 @given(tables)
 def test_probabilities_sum_to_one_and_have_the_log_odds(log_odds: np.ndarray) -> None:
     prob = class_probabilities(log_odds)
@@ -25,6 +27,7 @@ def test_probabilities_sum_to_one_and_have_the_log_odds(log_odds: np.ndarray) ->
     np.testing.assert_allclose(ratio[likely], log_odds[likely], atol=1e-9)
 
 
+@examples(100)
 @given(tables)
 def test_labels_and_label_probabilities_are_those_of_the_most_probable_class(log_odds: np.ndarray) -> None:
     full = np.concatenate([np.zeros((len(log_odds), 1)), log_odds], axis=1)

@@ -16,6 +16,7 @@ from octoreplay.transforms import (
     slerp,
     transform_of,
 )
+from support.long_suite import examples
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
@@ -27,6 +28,7 @@ quaternions = (
 positions = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
 
 
+@examples(100)
 @given(quaternions, positions)
 def test_pose_matrix_equals_scipy(quaternion, position):
     matrix = pose_matrix(position, quaternion)
@@ -35,6 +37,7 @@ def test_pose_matrix_equals_scipy(quaternion, position):
     np.testing.assert_allclose(matrix @ inverse(matrix), np.eye(4), atol=1e-9)
 
 
+@examples(100)
 @given(quaternions, quaternions, st.floats(0, 1))
 def test_slerp_equals_scipy(first, second, fraction):
     # Half a turn apart, both arcs are equally short.
@@ -53,6 +56,7 @@ def test_slerp_takes_the_shorter_arc():
     assert angle == pytest.approx(np.pi / 4)
 
 
+@examples(100)
 @given(quaternions, quaternions, positions, positions, st.floats(0, 1))
 def test_interpolation_is_linear_in_position_and_slerp_in_rotation(first, second, start, end, fraction):
     position, quaternion = interpolate((start, first), (end, second), fraction)
@@ -67,12 +71,14 @@ def test_quaternions_of_length_0_and_not_finite_ones_are_refused(bad):
         transform_of((0, 0, 0, *bad))
 
 
+@examples(100)
 @given(quaternions, positions, st.floats(1e-2, 1e2))
 def test_transform_of_seven_numbers_normalises_the_quaternion(quaternion, position, length):
     found = transform_of((*position, *(length * value for value in quaternion)))
     np.testing.assert_allclose(found, pose_matrix(position, quaternion), atol=1e-12)
 
 
+@examples(100)
 @given(quaternions)
 def test_rotation_to_quaternion_inverts_the_conversion_to_a_matrix(quaternion):
     rotation = Rotation.from_quat(quaternion).as_matrix()

@@ -7,6 +7,7 @@ into ``docs/architecture/rooms.svg`` as a drawing. ``tick.svg`` beside it shows 
 from __future__ import annotations
 
 import ast
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -35,6 +36,7 @@ SHORTCUTS = ((TICK[1], TICK[4]), (TICK[2], TICK[6]))
 """Evidence goes from the integration to the iteration; published packets go to the recorder."""
 
 
+@functools.cache
 def rooms() -> dict[str, set[str]]:
     """Return the rooms that each room imports, lowest rooms included with an empty set."""
     found: dict[str, set[str]] = {}

@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation
     from octoreplay.io.containers.logs import open_log
     from octoreplay.io.robots.discover import discover, resolve
-    from octoreplay.records import ClassTable, LeafTable, RunSummary, SemanticClass, TickMetrics
+    from octoreplay.records import ClassTable, LeafTable, SemanticClass
     from octoreplay.replay.alignment import Alignment, RobotFrame, align_logs, aligned_config
     from octoreplay.replay.run import Progress, replay_team
     from octoreplay.report.export import export_ply
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
+    from octoreplay.run_metrics import RunSummary, TickMetrics
     from octoreplay.simulate.team import SimulationConfig, simulate_team
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
 
@@ -47,13 +48,13 @@ _MODULES = {
     "RobotConfig": "config.robot",
     "RobotFrame": "replay.alignment",
     "RunConfig": "config.run",
-    "RunSummary": "records",
+    "RunSummary": "run_metrics",
     "SemanticClass": "records",
     "SimulationConfig": "simulate.team",
     "StoredMap": "result",
     "Sweep": "study.sweep",
     "SweepProgress": "study.sweep",
-    "TickMetrics": "records",
+    "TickMetrics": "run_metrics",
     "align_logs": "replay.alignment",
     "aligned_config": "replay.alignment",
     "check_result": "evaluate.checks",

@@ -35,13 +35,11 @@ from octoreplay.records import (
     Float32Array,
     Float64Array,
     FloatArray,
-    FramePlace,
     LeafTable,
     MapState,
-    RunSummary,
-    TickMetrics,
     UInt8Array,
 )
+from octoreplay.run_metrics import FramePlace, RunSummary, TickMetrics
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,8 @@ from octoreplay.evaluate.checks import LIMITS, CheckRow, check_result, ticks_to_
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.text_files import json_text
-from octoreplay.records import CENTRAL, CONVERGED, FrameCounts, PairMetrics, RobotMetrics, RunSummary, TickMetrics
+from octoreplay.records import CENTRAL, CONVERGED, FrameCounts
+from octoreplay.run_metrics import PairMetrics, RobotMetrics, RunSummary, TickMetrics
 from support.result_factory import CLASSES, summary, team, tick_metrics, write_until
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -6,10 +6,12 @@ from hypothesis import strategies as st
 
 from octoreplay.evaluate.morton_intervals import bounding_box, common_intervals
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys, keys_to_codes
+from support.long_suite import examples
 
 cell_intervals = st.lists(st.tuples(st.integers(0, 300), st.integers(1, 200)), min_size=1, max_size=5)
 
 
+@examples(100)
 @given(
     intervals=cell_intervals,
     offset=st.sampled_from([0, 64, 512 * 7, int(keys_to_codes(np.zeros((1, 3), np.int64))[0])]),

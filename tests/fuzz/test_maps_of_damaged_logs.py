@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from support.hostile_logs import (
     LOGS,
     MCAP_LOGS,
     MESSAGE_MUTATIONS,
+    MapOutcome,
     bytes_of,
     map_of_log,
     rows_of,
@@ -27,10 +29,16 @@ from support.long_suite import one_in
 CASES = [pytest.param(range(2), id="few"), pytest.param(range(2, 30), id="many", marks=pytest.mark.long)]
 
 
+@cache
+def map_of_fixture(name: str) -> MapOutcome:
+    """Outcome of a committed log."""
+    return map_of_log(FIXTURES / name, is_run=False)
+
+
 @pytest.mark.parametrize("cases", CASES)
 @pytest.mark.parametrize("name", one_in(2, LOGS))
 def test_a_damaged_log_gives_a_map_or_a_sentence(tmp_path, name, cases):
-    good = map_of_log(FIXTURES / name, is_run=False)
+    good = map_of_fixture(name)
     assert good.refusal is None
     assert good.num_frames >= 4
     num_maps = 0
@@ -58,7 +66,7 @@ def test_every_change_of_messages_changes_some_log(mutation):
 def test_rewriting_a_log_changes_nothing(tmp_path):
     for name in MCAP_LOGS:
         path = write_rows(tmp_path / "again.mcap", rows_of(name))
-        assert map_of_log(path, is_run=False) == map_of_log(FIXTURES / name, is_run=False)
+        assert map_of_log(path, is_run=False) == map_of_fixture(name)
 
 
 def test_one_broken_pose_does_not_end_a_run(tmp_path):

@@ -119,6 +119,7 @@ def test_base_of_a_delta_is_not_later_than_its_version():
         codec.encode_packet(octree, map_version=MapVersion(version=5, base=1))
 
 
+@examples(100)
 @given(
     map_version=st.builds(
         MapVersion, *(st.integers(0, 2**bits - 1) for bits in (16, 32, 32)), base=st.just(0),

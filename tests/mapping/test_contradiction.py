@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import MIN_COMPARED_CELLS, ranked_pairs
+from octoreplay.run_metrics import MIN_COMPARED_CELLS, ranked_pairs
 from reference.contradiction import cell_states, pair_metrics
 from support.long_suite import examples
 from support.octree_factory import cube, octree_of

@@ -48,6 +48,7 @@ def test_float16_against_the_standard_library(values):
     assert through(values, "float16").tobytes() == np.array(expected, np.float32).tobytes()
 
 
+@examples(100)
 @given(values=st.lists(FINITE), step=STEPS)
 def test_int8_against_integers(values, step):
     step32 = np.float32(step)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from octoreplay.mapping import surface
 from octoreplay.mapping.surface import CellVotes, num_cuts, points_on_triangles
+from support.long_suite import examples
 
 
 def barycentric(point, corners):
@@ -47,6 +48,7 @@ def test_number_of_cuts_follows_from_the_longest_edge():
     assert num_cuts(corners, 0.3).tolist() == [4, 1]
 
 
+@examples(100)
 @given(st.lists(st.tuples(st.integers(-5, 5), st.integers(0, 4)), max_size=60), st.integers(1, 20))
 def test_majority_wins_and_ties_go_to_the_lower_id(votes, batch):
     counted = CellVotes()

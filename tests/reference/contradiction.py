@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from octoreplay.records import BoolArray, Float32Array, Int64Array, PairMetrics
+from octoreplay.records import BoolArray, Float32Array, Int64Array
+from octoreplay.run_metrics import PairMetrics
 
 UNKNOWN, FIRM, FREE, UNDECIDED = -4, -3, -2, -1
 """States of cells that are not occupied; an occupied cell has its class, counted from 0, as its state."""

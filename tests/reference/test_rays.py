@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reference.rays import cells_before_end, coord_to_key, key_to_coord
+from support.long_suite import examples
 
 coordinate = st.floats(-3.0, 3.0, allow_nan=False).map(lambda value: round(value, 6))
 point = st.tuples(coordinate, coordinate, coordinate)
@@ -77,6 +78,7 @@ def test_every_passed_cell_touches_the_segment(origin, target, resolution):
     assert (entry <= exit_ + 1e-9).all()
 
 
+@examples(100)
 @given(origin=point, target=point)
 def test_cells_of_dense_samples_are_passed(origin, target):
     passed = {*_walk(origin, target, 0.25), coord_to_key(target, 0.25)}

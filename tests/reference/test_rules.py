@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from reference import rules
+from support.long_suite import examples
 
 log_odds = arrays(np.float64, (3, 5), elements=st.floats(-6.0, 6.0)).map(rules.free_is_zero)
 
@@ -42,6 +43,7 @@ def test_gradient_step_by_hand():
     assert step[0, 1] == pytest.approx(np.log(3.0) - 2.0 * 3.0 / 16.0 * (np.log(3.0) - 1.0))
 
 
+@examples(100)
 @given(mixed=log_odds, log_q=log_odds)
 def test_gradient_step_is_the_papers_alpha_beta_form(mixed, log_q):
     np.testing.assert_allclose(
@@ -49,6 +51,7 @@ def test_gradient_step_is_the_papers_alpha_beta_form(mixed, log_q):
     )
 
 
+@examples(100)
 @given(mixed=log_odds, log_q=log_odds)
 def test_gradient_step_follows_the_derivative_of_the_objective(mixed, log_q):
     step = (rules.gradient_step(mixed, log_q, 1.0) - mixed)[0]

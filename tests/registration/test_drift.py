@@ -43,7 +43,7 @@ def test_drift_of_two_robots_is_repaired(team: DriftingTeam, repair: Repair) -> 
 
 
 def test_the_repair_moves_with_the_team_frame(team: DriftingTeam, repair: Repair) -> None:
-    T_other = moved(np.eye(4)[None], np.array([[20.0, -7.0, 2.0, 0.0, 0.0, 0.8]]))[0]
+    T_other = moved(np.eye(4)[None], np.array([[0.0, 0.0, 0.8, 20.0, -7.0, 2.0]]))[0]
     submaps = [replace(submap, T_team_anchor=T_other @ submap.T_team_anchor) for submap in team.submaps]
     tracks = [replace(track, poses=T_other @ track.poses) for track in team.tracks]
     there = repair_drift(submaps, tracks, MODEL)

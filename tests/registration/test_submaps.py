@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from octoreplay.registration.rigid import moved, rotation_logs
-from octoreplay.registration.submaps import Submap, overlapping_pairs, register
+from octoreplay.registration.submaps import Submap, _both_residuals, overlapping_pairs, register
 from octoreplay.transforms import inverse
 from support.drifting_team import VOXEL, yard
 
@@ -23,11 +23,11 @@ def submap(T_world_anchor: np.ndarray, seed: int, *, robot: int = 0, classes_plu
 
 
 def at(*step: float) -> np.ndarray:
-    """Pose after a step (translation, rotation vector) from the origin."""
+    """Pose after a step (rotation vector, translation) from the origin."""
     return moved(np.eye(4)[None], np.array([step], np.float64))[0]
 
 
-FIRST, SECOND = at(0, 0, 1, 0, 0, 0.3), at(2, 1, 1, 0, 0, -1.2)
+FIRST, SECOND = at(0, 0, 0.3, 0, 0, 1), at(0, 0, -1.2, 2, 1, 1)
 TRUE = inverse(FIRST) @ SECOND
 
 
@@ -41,7 +41,7 @@ def registered(first: Submap, second: Submap, guess: np.ndarray) -> np.ndarray |
     return guess
 
 
-@pytest.mark.parametrize("step", [(0, 0, 0, 0, 0, 0), (0.4, -0.3, 0.1, 0.01, -0.01, 0.06)])
+@pytest.mark.parametrize("step", [(0, 0, 0, 0, 0, 0), (0.01, -0.01, 0.06, 0.4, -0.3, 0.1)])
 def test_two_views_are_registered(step: tuple[float, ...]) -> None:
     guess = moved(TRUE[None], np.array([step], np.float64))[0]
     found = registered(submap(FIRST, 1), submap(SECOND, 2), guess)
@@ -53,7 +53,7 @@ def test_two_views_are_registered(step: tuple[float, ...]) -> None:
 
 def test_swapping_the_submaps_inverts_the_step() -> None:
     first, second = submap(FIRST, 1), submap(SECOND, 2)
-    guess = moved(TRUE[None], np.array([[0.05, -0.02, 0.02, 0.0, 0.0, 0.01]]))[0]
+    guess = moved(TRUE[None], np.array([[0.0, 0.0, 0.01, 0.05, -0.02, 0.02]]))[0]
     forward = register(first, second, guess, 0.4, is_final=False)
     backward = register(second, first, inverse(guess), 0.4, is_final=False)
     assert forward is not None
@@ -66,7 +66,7 @@ def test_surfaces_of_other_classes_do_not_match() -> None:
 
 
 def test_a_wrong_guess_is_refused() -> None:
-    guess = moved(TRUE[None], np.array([[2.5, 2.0, 0.0, 0.0, 0.0, 0.7]]))[0]
+    guess = moved(TRUE[None], np.array([[0.0, 0.0, 0.7, 2.5, 2.0, 0.0]]))[0]
     assert registered(submap(FIRST, 1), submap(SECOND, 2), guess) is None
 
 
@@ -77,7 +77,7 @@ def test_ground_alone_gives_no_information_along_itself() -> None:
     other = Submap.of_points(1, 0, np.eye(4), ground[1::2], classes[1::2], VOXEL)
     found = register(one, other, np.eye(4), 0.4, is_final=True)
     assert found is not None
-    assert found.information[[0, 1, 5], [0, 1, 5]].max() < 1e-6 * found.information[2, 2]
+    assert found.information[[2, 3, 4], [2, 3, 4]].max() < 1e-6 * found.information[5, 5]
 
 
 def test_a_voxel_has_its_most_frequent_class_and_points_without_class_are_left_out() -> None:
@@ -98,5 +98,15 @@ def test_an_empty_submap_has_no_overlap(num_points: int) -> None:
 
 def test_pairs_are_those_with_common_cells() -> None:
     submaps = [submap(FIRST, 1), submap(SECOND, 2), submap(FIRST, 3)]
-    poses = np.array([FIRST, SECOND, at(100, 0, 1, 0, 0, 0)])
+    poses = np.array([FIRST, SECOND, at(0, 0, 0, 100, 0, 1)])
     assert overlapping_pairs(submaps, poses) == [(0, 1)]
+
+
+def test_the_derivatives_of_the_distances_are_those_of_finite_differences() -> None:
+    first, second = submap(FIRST, 1), submap(SECOND, 2)
+    guess = moved(TRUE[None], np.array([[0.0, 0.0, 0.01, 0.05, -0.02, 0.02]]))[0]
+    _, jacobian = _both_residuals(first, second, guess, 0.5)
+    for axis, step in enumerate(np.eye(6) * 1e-7):
+        ahead, _ = _both_residuals(first, second, moved(guess[None], step[None])[0], 0.5)
+        behind, _ = _both_residuals(first, second, moved(guess[None], -step[None])[0], 0.5)
+        np.testing.assert_allclose((ahead - behind) / 2e-7, jacobian[:, axis], atol=1e-5)

@@ -16,10 +16,10 @@ from octoreplay.mapping.contradiction import (
     EvidenceComparer,
     state_limits,
 )
-from octoreplay.records import PairMetrics
 from octoreplay.replay.run import replay_team
 from octoreplay.replay.warnings import frame_warnings
 from octoreplay.result import open_result
+from octoreplay.run_metrics import PairMetrics
 from support.faulty_team import configured, session_of
 from support.fixture_paths import PAIR_TEAM
 

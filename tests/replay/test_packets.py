@@ -62,7 +62,7 @@ def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
 @pytest.mark.parametrize(
     ("topology", "packets", "radio"),
     one_in(
-        3, ["complete", "line"], [{"budget": 2200}, {"budget": 640, "content": "int8", "int8_step": 0.1}],
+        7, ["complete", "line"], [{"budget": 2200}, {"budget": 640, "content": "int8", "int8_step": 0.1}],
         [{}, {"loss": 0.4, "network_seed": 2}],
     ),
     ids=str,
@@ -84,7 +84,7 @@ def test_flood_ends_with_the_oracle_within_a_budget(topology, packets, radio):
 
 @pytest.mark.parametrize(
     ("packets", "rule"),
-    one_in(2, [{"budget": 2200}, {"budget": 640, "content": "int8"}], ["bayes", "natural", "gradient"]),
+    one_in(4, [{"budget": 2200}, {"budget": 640, "content": "int8"}], ["bayes", "natural", "gradient"]),
     ids=str,
 )
 def test_maps_converge_within_a_budget(packets, rule):

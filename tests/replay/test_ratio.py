@@ -35,23 +35,23 @@ def test_ratio_equals_bayes_without_faults():
 
 GROUPS = (("robot_0", "robot_1"), ("robot_2", "robot_3"))
 RATIO_FAULTS = {
+    "partition, loss and latency": {
+        "topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, groups=GROUPS),), "loss": 0.2, "latency": 0.6,
+        "network_seed": 1,
+    },
     "loss and latency": {"topology": "ring", "loss": 0.3, "latency": 0.6, "network_seed": 1},
     "bursts and jitter": {"topology": "line", "burst_start": 0.2, "latency": 0.5, "jitter": 0.5, "network_seed": 2},
     "rate": {"topology": "ring", "rate": 8000.0},
     "broadcast": {"topology": "ring", "cast": "broadcast", "loss": 0.3, "network_seed": 1},
     "one-way ring": {"topology": "ring", "one_way": ONE_WAY_RING},
+    "silence": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, robots_silent=("robot_1",)),)},
     "partition": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, groups=GROUPS),)},
-    "partition, loss and latency": {
-        "topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, groups=GROUPS),), "loss": 0.2, "latency": 0.6,
-        "network_seed": 1,
-    },
     "links that come and go": {
         "topology": "ring", "loss": 0.2, "schedule": (
             ScheduleEntry(3.0, 6.0, links_down=(("robot_0", "robot_1"),)),
             ScheduleEntry(5.0, 9.0, links_up=(("robot_0", "robot_2"),)),
             ScheduleEntry(7.0, 10.0, links_down=(("robot_0", "robot_1"), ("robot_2", "robot_3"))),),
     },
-    "silence": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, robots_silent=("robot_1",)),)},
     "a robot was off": {"topology": "ring", "schedule": (ScheduleEntry(4.0, 9.0, robots_off=("robot_1",)),)},
     "newcomer": {"topology": "ring", "schedule": (ScheduleEntry(0.0, 9.0, robots_off=("robot_3",)),)},
     "different periods": {"topology": "ring", "robots": {"robot_1": {"publish_period": 3.0, "publish_phase": 1.0}}},

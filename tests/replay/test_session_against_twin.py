@@ -186,14 +186,14 @@ def test_threads_do_not_change_a_byte(rule, mode):
     scenario = scenario_of(1, SMALL)
     config = scenario.config(rule=rule, mode=mode, topology="ring", settle=2)
     runs = []
-    for num_threads in (1, 2, 4):
+    for num_threads in (1, 4):
         session = Session(config, sources_of(config, scenario.frames), ThreadPoolExecutor(num_threads))
         run = []
         for tick in session.ticks():
             run.append((tick.metrics, sent_packets(tick)))
         runs.append((run, [octree.leaves().log_odds.tobytes() for octree in tick.maps]))
     assert any(packets for _, packets in runs[0][0]) == (rule != "local")
-    assert runs[0] == runs[1] == runs[2]
+    assert runs[0] == runs[1]
 
 
 @pytest.mark.parametrize(("rule", "topology"), one_in(3, ["gradient", "bayes", "natural"], ["complete", "line"]))

@@ -13,8 +13,9 @@ import pytest
 
 from octoreplay.errors import OutputError
 from octoreplay.evaluate.records import SCORES, MapScores, TruthScores
-from octoreplay.records import CENTRAL, PAIR_SHARES
+from octoreplay.records import CENTRAL
 from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json, write_evaluation
+from octoreplay.run_metrics import PAIR_SHARES
 from support.evaluation_factory import evaluation
 
 

@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 from octoreplay.errors import InputError, OutputError
-from octoreplay.records import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics, TickMetrics
 from octoreplay.report import plots
 from octoreplay.report.contradiction_plots import MAX_COLORED, contradiction_figure
+from octoreplay.run_metrics import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics, TickMetrics
 from support.result_factory import tick_metrics
 
 METRICS = [tick_metrics(tick, settling=tick > 6) for tick in range(1, 9)]

@@ -10,9 +10,9 @@ from rich.console import RenderableType
 from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.describe import LogDescription, LogSummary, RobotSummary, TopicSummary
-from octoreplay.records import RobotMetrics
 from octoreplay.report import tables
 from octoreplay.result import PointQuery
+from octoreplay.run_metrics import RobotMetrics
 from support.result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
 
 

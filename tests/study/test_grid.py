@@ -13,6 +13,7 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError
 from octoreplay.study.grid import Variation, check_variations, combinations, parse_variation
+from support.long_suite import examples
 
 BASE = RunConfig(robots=tuple(RobotConfig(name, (Path(f"{name}.mcap"),)) for name in ("a", "b")))
 VALUES = {
@@ -35,6 +36,7 @@ def grids(draw: st.DrawFn) -> dict[str, list[str]]:
     return {name: draw(st.lists(st.sampled_from(VALUES[name]), unique=True, min_size=1)) for name in names}
 
 
+@examples(100)
 @given(grid=grids(), num_seeds=st.none() | st.integers(1, 3))
 def test_every_combination_occurs_once_and_in_order(grid: dict[str, list[str]], num_seeds: int | None) -> None:
     variations = [parse_variation(f"{name}={','.join(values)}") for name, values in grid.items()]

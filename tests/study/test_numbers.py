@@ -10,9 +10,9 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.records import SCORES, EvaluatedTick, Evaluation, MapScores, TruthScores
-from octoreplay.records import RunSummary, TickMetrics
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
+from octoreplay.run_metrics import RunSummary, TickMetrics
 from octoreplay.study import numbers
 from octoreplay.study.numbers import (
     RUN_COLUMNS,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
-from octoreplay.records import CENTRAL, PairMetrics
+from octoreplay.records import CENTRAL
+from octoreplay.run_metrics import PairMetrics
 
 
 def map_scores(robot_id: str, start: float, *, is_active: bool = True, has_truth: bool = True) -> MapScores:

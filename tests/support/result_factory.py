@@ -10,18 +10,8 @@ import numpy as np
 from octoreplay.config.class_file import class_table
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
-from octoreplay.records import (
-    FrameCounts,
-    LeafTable,
-    LinkMetrics,
-    LinkTotals,
-    MapState,
-    PairMetrics,
-    RobotMetrics,
-    RobotPose,
-    RunSummary,
-    TickMetrics,
-)
+from octoreplay.records import FrameCounts, LeafTable, MapState, RobotPose
+from octoreplay.run_metrics import LinkMetrics, LinkTotals, PairMetrics, RobotMetrics, RunSummary, TickMetrics
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from octoreplay.config.resolved import ResolvedRun
-    from octoreplay.records import PairMetrics
     from octoreplay.replay.alignment import Alignment
+    from octoreplay.run_metrics import PairMetrics
 
 
 @click.command(short_help="Simulate a team, find its frames, replay it and export its map.")
@@ -96,8 +96,8 @@ def _aligned(team_file: Path, folder: Path, out: Console) -> tuple[ResolvedRun, 
 
 def _clear(pairs: tuple[PairMetrics, ...]) -> str:
     """Clear contradiction of the worst pair as a title."""
-    from octoreplay.records import ranked_pairs
     from octoreplay.report.tables import share
+    from octoreplay.run_metrics import ranked_pairs
 
     ranked = ranked_pairs(pairs, "clear_contradiction")
     return f"{share(ranked[0].clear_contradiction)} clear contradiction, worst pair" if ranked else "no common space"

@@ -14,8 +14,9 @@ from octoreplay.config.run import RunConfig
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from octoreplay.records import FrameCounts, RunSummary
+    from octoreplay.records import FrameCounts
     from octoreplay.replay.run import Progress
+    from octoreplay.run_metrics import RunSummary
 
 
 def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:

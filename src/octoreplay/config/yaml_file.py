@@ -40,8 +40,7 @@ def dump_yaml(content: Mapping[str, Any]) -> str:
     buffer = io.StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
-    # The library's type annotation allows only None.
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.representer.sort_base_mapping_type_on_output = False
     yaml.width = 110
     yaml.dump(content, buffer)
     return buffer.getvalue()

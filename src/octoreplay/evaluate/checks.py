@@ -13,14 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.records import (
-    CONVERGED,
-    MIN_COMPARED_CELLS,
-    RobotMetrics,
-    RunSummary,
-    TickMetrics,
-    ranked_pairs,
-)
+from octoreplay.records import CONVERGED
+from octoreplay.run_metrics import MIN_COMPARED_CELLS, RobotMetrics, RunSummary, TickMetrics, ranked_pairs
 
 if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation

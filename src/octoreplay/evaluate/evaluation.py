@@ -19,9 +19,10 @@ from octoreplay.evaluate.truth import WORLD_FILE, Truth, load_truth
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
-from octoreplay.records import CENTRAL, BoolArray, PairMetrics, TickMetrics
+from octoreplay.records import CENTRAL, BoolArray
 from octoreplay.replay.warnings import team_frame_warnings
 from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.run_metrics import PairMetrics, TickMetrics
 
 
 def evaluate_result(

@@ -6,7 +6,8 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-from octoreplay.records import CENTRAL, PairMetrics, PairTotals
+from octoreplay.records import CENTRAL
+from octoreplay.run_metrics import PairMetrics, PairTotals
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import numpy as np
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import ArrayT, Int32Array, Int64Array, PairMetrics, UInt8Array, UInt64Array, ranked_pairs
+from octoreplay.records import ArrayT, Int32Array, Int64Array, UInt8Array, UInt64Array
+from octoreplay.run_metrics import PairMetrics, ranked_pairs
 
 CLEAR_LIMIT, LABEL_LIMIT = 0.035, 0.25
 """Clear contradiction and label contradiction of a pair above which a run warns.

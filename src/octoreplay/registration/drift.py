@@ -121,7 +121,7 @@ def _groups(submaps: Sequence[Submap], edges: Sequence[PoseGraphEdge]) -> tuple[
 
 def _frame_priors(submaps: Sequence[Submap], model: DriftModel) -> list[PosePrior]:
     """Prior of each robot's first anchor."""
-    sigmas = np.repeat([model.frame_shift, math.radians(model.frame_angle)], 3)
+    sigmas = np.repeat([math.radians(model.frame_angle), model.frame_shift], 3)
     firsts = {submap.robot: index for index, submap in reversed(list(enumerate(submaps)))}
     return [PosePrior(index, submaps[index].T_team_anchor, np.diag(sigmas**-2.0)) for index in firsts.values()]
 
@@ -145,16 +145,16 @@ def _odometry_edge(index: int, first: Submap, second: Submap, track: Track, mode
     # Height, roll and pitch are bounded by a barometer and an inertial unit.
     bounded = min(1.0, math.sqrt(2.0 * way / _VERTICAL_WAY))
     height, tilt = per_metre * _VERTICAL_WAY * bounded * (1.0, 0.2)
-    sigmas = np.array([shift, shift, height, tilt, tilt, angle]) + np.repeat([_SHIFT_FLOOR, _ANGLE_FLOOR], 3)
-    rotation = second.T_team_anchor[:3, :3]
+    sigmas = np.array([tilt, tilt, angle, shift, shift, height]) + np.repeat([_ANGLE_FLOOR, _SHIFT_FLOOR], 3)
+    rotation = first.T_team_anchor[:3, :3]
     to_team = np.kron(np.eye(2), rotation)
     information = to_team.T @ np.diag(sigmas**-2.0) @ to_team
     # Effects of a scale error and of a turn per metre on the last pose, for one standard deviation each.
     arms = positions[-1] - (positions[1:] + positions[:-1]) / 2
     turned = (np.cross([0.0, 0.0, 1.0], arms) * ways[:, None]).sum(axis=0)
     effects = np.zeros((6, 2))
-    effects[:3, 0] = rotation.T @ (positions[-1] - positions[0])
-    effects[:3, 1], effects[3:, 1] = rotation.T @ turned, rotation.T @ [0.0, 0.0, ways.sum()]
+    effects[3:, 0] = rotation.T @ (positions[-1] - positions[0])
+    effects[:3, 1], effects[3:, 1] = rotation.T @ [0.0, 0.0, ways.sum()], rotation.T @ turned
     bias = Bias(first.robot, -effects * per_metre * math.sqrt(_SYSTEMATIC_SHARE))
     measured = inverse(first.T_team_anchor) @ second.T_team_anchor
     return PoseGraphEdge(index, index + 1, measured, information, is_trusted=True, bias=bias)

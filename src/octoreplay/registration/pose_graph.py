@@ -4,9 +4,11 @@ Poses are found by Levenberg-Marquardt on the manifold. Wrong edges get the weig
 truncated least squares (Yang, Antonante, Tzoumas and Carlone, Graduated Non-Convexity for Robust Spatial Perception,
 RA-L 2020).
 
-A pose T = (R, t) is changed by a step (rho, phi) to (R Exp(phi), t + R rho). The error of an edge with the measurement
-Z = T_first_second is (R_Z^T (R_i^T (t_j - t_i) - t_Z), Log(R_Z^T R_i^T R_j)): translation [m] and rotation [rad], both
-in the second pose's frame. Information matrices have the same order of components.
+Small motions are (rotation phi [rad], translation rho [m]) on the left, about the pose's own origin: a step changes
+T = (R, t) to (Exp(phi) R, t + rho), and no step depends on the distance from the world's origin. The error of an edge
+with the measurement Z = T_first_second is (Log(R_i^T R_j R_Z^T), R_i^T (t_j - t_i) - t_Z), along the axes of the first
+pose; that of a prior is along the world's axes. Information matrices and covariances have the same components. Those
+of ``icp`` are about the origin of the target's frame instead; ``covariance.about_point`` converts covariances.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from octoreplay.records import BoolArray, Float64Array, Int64Array
-from octoreplay.registration.rigid import cross_matrices, inverse_right_jacobians, inverses, moved, rotation_logs
+from octoreplay.registration.rigid import cross_matrices, inverse_left_jacobians, inverses, moved, rotation_logs
 
 INLIER_THRESHOLD = 16.81
 """Largest squared Mahalanobis error of an inlier: the 99 % quantile of the chi-square distribution with 6 degrees."""
@@ -79,8 +81,8 @@ class PoseGraphSolution:
     - ``weights`` (m,) float64: weight of each edge, 0 for a rejected and 1 for an accepted edge.
     - ``squared_errors`` (m,) float64: squared Mahalanobis error of each edge.
     - ``components`` (n,) int64: number of the connected component of each pose, over the edges with a weight above 0.
-    - ``covariances`` (c, 6, 6) float64: marginal covariances of the chosen poses. Without a prior in a pose's
-      component, they are relative to the component's held pose.
+    - ``covariances`` (c, 6, 6) float64: marginal covariances of the chosen poses, along the world's axes. Without a
+      prior in a pose's component, they are relative to the component's held pose.
     """
 
     poses: Float64Array
@@ -255,19 +257,18 @@ class _Graph:
         is_free[(6 * lowest[~has_prior, None] + np.arange(6)).ravel()] = False
         return np.flatnonzero(is_free)
 
-    def errors(self, state: _State) -> tuple[Float64Array, Float64Array]:
-        """Errors (m, 6), and the transforms (m, 4, 4) from the second to the first poses."""
+    def errors(self, state: _State) -> Float64Array:
+        """Errors (m, 6)."""
         with_world = np.concatenate([state.poses, np.eye(4)[None]])
         relative = inverses(with_world[self.first]) @ with_world[self.second]
-        rotation_z = self.measured[:, :3, :3].transpose(0, 2, 1)
-        shift = np.einsum("mij,mj->mi", rotation_z, relative[:, :3, 3] - self.measured[:, :3, 3])
-        errors = np.concatenate([shift, rotation_logs(rotation_z @ relative[:, :3, :3])], axis=1)
+        turns = rotation_logs(relative[:, :3, :3] @ self.measured[:, :3, :3].transpose(0, 2, 1))
+        errors = np.concatenate([turns, relative[:, :3, 3] - self.measured[:, :3, 3]], axis=1)
         errors[self.bias_edges] -= np.einsum("eij,ej->ei", self.bias_jacobians, state.biases[self.bias_of])
-        return errors, relative
+        return errors
 
     def squared_errors(self, state: _State) -> Float64Array:
         """Squared Mahalanobis errors (m,)."""
-        whitened = np.einsum("mij,mj->mi", self.roots, self.errors(state)[0])
+        whitened = np.einsum("mij,mj->mi", self.roots, self.errors(state))
         return np.asarray(np.square(whitened).sum(axis=1))
 
     def cost(self, state: _State, weights: Float64Array) -> float:
@@ -279,10 +280,9 @@ class _Graph:
         self, state: _State, weights: Float64Array, columns: Int64Array
     ) -> tuple[csc_matrix, Float64Array]:
         """Hessian (c, c) and gradient (c,) of the cost by some unknowns (c,), with the Gauss-Newton approximation."""
-        errors, relative = self.errors(state)
+        errors = self.errors(state)
         roots = self.roots * np.sqrt(weights)[:, None, None]
-        first, second = self._jacobians(errors, relative)
-        jacobian = self._rows(roots, first, second)[:, columns]
+        jacobian = self._rows(roots, *self.jacobians(state, errors))[:, columns]
         biases = np.einsum("bij,bj->bi", self.bias_roots, state.biases)
         whitened = np.concatenate([np.einsum("mij,mj->mi", roots, errors).ravel(), biases.ravel()])
         return (jacobian.T @ jacobian).tocsc(), jacobian.T @ whitened
@@ -308,17 +308,17 @@ class _Graph:
         shape = (num_rows + size * num_biases, self.num_columns)
         return coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
 
-    def _jacobians(self, errors: Float64Array, relative: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Derivatives (m, 6, 6) of the errors by the steps of the first and of the second poses."""
+    def jacobians(self, state: _State, errors: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Derivatives (m, 6, 6) of the errors (m, 6) by the steps of the first and of the second poses."""
+        with_world = np.concatenate([state.poses, np.eye(4)[None]])
+        to_first = with_world[self.first, :3, :3].transpose(0, 2, 1)
+        arms = with_world[self.second, :3, 3] - with_world[self.first, :3, 3]
         first, second = np.zeros((2, len(errors), 6, 6))
-        rotation_z = self.measured[:, :3, :3].transpose(0, 2, 1)
         # The systematic error is subtracted after the logarithm and small.
-        inverse_right = inverse_right_jacobians(errors[:, 3:])
-        first[:, :3, :3] = -rotation_z
-        first[:, :3, 3:] = rotation_z @ cross_matrices(relative[:, :3, 3])
-        first[:, 3:, 3:] = -inverse_right @ relative[:, :3, :3].transpose(0, 2, 1)
-        second[:, :3, :3] = rotation_z @ relative[:, :3, :3]
-        second[:, 3:, 3:] = inverse_right
+        second[:, :3, :3] = inverse_left_jacobians(errors[:, :3]) @ to_first
+        second[:, 3:, 3:] = to_first
+        first[:] = -second
+        first[:, 3:, :3] = to_first @ cross_matrices(arms)
         return first, second
 
     def covariances(self, state: _State, weights: Float64Array, chosen: Sequence[int]) -> Float64Array:

@@ -42,25 +42,25 @@ def cross_matrices(vectors: Float64Array) -> Float64Array:
     return result
 
 
-def inverse_right_jacobians(vectors: Float64Array) -> Float64Array:
-    """Return Jr^-1 (n, 3, 3) of rotation vectors (n, 3): Log(Exp(v) Exp(d)) = v + Jr^-1 d to first order.
+def inverse_left_jacobians(vectors: Float64Array) -> Float64Array:
+    """Return Jl^-1 (n, 3, 3) of rotation vectors (n, 3): Log(Exp(d) Exp(v)) = v + Jl^-1 d to first order.
 
-    Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, eq. 10.86.
+    Solà, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018, eq. 146.
     """
     cross = cross_matrices(vectors)
     angles = np.linalg.norm(vectors, axis=1)
     small = angles < 1e-4
     safe = np.where(small, 1.0, angles)
     quadratic = np.where(small, 1.0 / 12.0, 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe)))
-    return np.asarray(np.eye(3) + 0.5 * cross + quadratic[:, None, None] * (cross @ cross))
+    return np.asarray(np.eye(3) - 0.5 * cross + quadratic[:, None, None] * (cross @ cross))
 
 
 def moved(transforms: Float64Array, steps: Float64Array) -> Float64Array:
-    """Return transforms (n, 4, 4) after steps (n, 6) of translation rho [m] and rotation phi [rad] in their own frames.
+    """Return transforms (n, 4, 4) after steps (n, 6) of rotation phi [rad] and translation rho [m] on the left.
 
-    (R, t) becomes (R Exp(phi), t + R rho).
+    Each transform turns about its own origin: (R, t) becomes (Exp(phi) R, t + rho).
     """
     result = transforms.copy()
-    result[:, :3, 3] += np.einsum("nij,nj->ni", transforms[:, :3, :3], steps[:, :3])
-    result[:, :3, :3] = transforms[:, :3, :3] @ rotation_exps(steps[:, 3:])
+    result[:, :3, :3] = rotation_exps(steps[:, :3]) @ transforms[:, :3, :3]
+    result[:, :3, 3] += steps[:, 3:]
     return result

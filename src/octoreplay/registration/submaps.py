@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
 from octoreplay.records import BoolArray, Float64Array, Int64Array, UInt8Array
-from octoreplay.registration.rigid import cross_matrix, moved
+from octoreplay.registration.rigid import moved
 from octoreplay.transforms import inverse
 
 # Distance between neighbouring classes in the tree's fourth coordinate, in voxels; no gate reaches it.
@@ -140,7 +140,7 @@ def register(
     their planes.
     """
     voxel, information = first.voxel, np.zeros((6, 6))
-    near_guess = np.diag([(_STEP_SHIFT * voxel) ** -2.0] * 3 + [_STEP_ANGLE**-2.0] * 3)
+    near_guess = np.diag([_STEP_ANGLE**-2.0] * 3 + [(_STEP_SHIFT * voxel) ** -2.0] * 3)
     for _ in range(_NUM_STEPS):
         residuals, jacobian = _both_residuals(first, second, T_first_second, gate)
         if residuals.size < _MIN_CORRESPONDENCES:
@@ -158,16 +158,23 @@ def register(
 def _both_residuals(
     first: Submap, second: Submap, T_first_second: Float64Array, gate: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Distances (k,) to planes of either submap, and derivatives (k, 6) by a step of the transform."""
-    forward = _residuals(second, first, T_first_second, gate)
-    backward = _residuals(first, second, inverse(T_first_second), gate)
-    # A step of T_first_second in the second's frame is the opposite step of its inverse, seen in the first's frame.
-    residuals = np.concatenate([forward[0], backward[0]])
-    return residuals, np.concatenate([forward[1], -backward[1] @ _adjoint(T_first_second)])
+    """Distances (k,) to planes of either submap, and derivatives (k, 6) by a step of the transform on the left."""
+    rotation, origin = T_first_second[:3, :3], T_first_second[:3, 3]
+    forward, moved_points, planes = _residuals(second, first, T_first_second, gate)
+    backward, fixed_points, moved_planes = _residuals(first, second, inverse(T_first_second), gate)
+    # The step moves the second's points towards planes of the first, or planes of the second away from the first.
+    arms = np.concatenate([moved_points @ rotation.T, fixed_points - origin])
+    normals = np.concatenate([planes, -moved_planes @ rotation.T])
+    return np.concatenate([forward, backward]), np.concatenate([np.cross(arms, normals), normals], axis=1)
 
 
-def _residuals(moving: Submap, fixed: Submap, T: Float64Array, gate: float) -> tuple[Float64Array, Float64Array]:
-    """Distances (k,) of moving samples to planes under T = T_fixed_moving [m], and derivatives (k, 6) by its step."""
+def _residuals(
+    moving: Submap, fixed: Submap, T: Float64Array, gate: float
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Distances (k,) of moving samples to planes under T = T_fixed_moving [m], the samples, and the planes' normals.
+
+    Samples (k, 3) are in the moving submap's frame, normals (k, 3) in the fixed one's.
+    """
     points, class_ids = moving.points[moving.samples], moving.class_ids[moving.samples]
     rotation = T[:3, :3]
     in_fixed = points @ rotation.T + T[:3, 3]
@@ -179,16 +186,7 @@ def _residuals(moving: Submap, fixed: Submap, T: Float64Array, gate: float) -> t
     agrees = np.abs(np.einsum("ki,ki->k", planes, own)) > _LEAST_COSINE
     found, planes = found[agrees], planes[agrees]
     residuals = np.einsum("ki,ki->k", planes, in_fixed[found] - fixed.points[nearest[found]])
-    in_moving = planes @ rotation
-    return residuals, np.concatenate([in_moving, np.cross(points[found], in_moving)], axis=1)
-
-
-def _adjoint(T: Float64Array) -> Float64Array:
-    """Matrix (6, 6) that maps a step (translation, rotation) in the second frame to the first frame."""
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = T[:3, :3]
-    adjoint[:3, 3:] = cross_matrix(T[:3, 3]) @ T[:3, :3]
-    return adjoint
+    return residuals, points[found], planes
 
 
 def overlapping_pairs(submaps: Sequence[Submap], poses: Float64Array) -> list[tuple[int, int]]:

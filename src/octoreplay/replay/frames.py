@@ -8,7 +8,8 @@ import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.robots.team_frames import frame_groups
-from octoreplay.records import TEAM, BoolArray, Float64Array, FramePlace
+from octoreplay.records import TEAM, BoolArray, Float64Array
+from octoreplay.run_metrics import FramePlace
 from octoreplay.transforms import inverse, numbers_of, transform_of
 
 

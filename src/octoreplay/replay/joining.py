@@ -18,7 +18,7 @@ import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import TEAM, Join
+from octoreplay.records import TEAM
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import AcceptLimits, PairAlignment, align_pair
 from octoreplay.registration.team import worst_contradiction
@@ -29,6 +29,7 @@ from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.frames import TeamFrames
 from octoreplay.replay.own_maps import own_map_of
 from octoreplay.replay.robots.robot import Robot
+from octoreplay.run_metrics import Join
 from octoreplay.transforms import inverse
 
 

@@ -16,11 +16,11 @@ from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.replay.exchange.messages import Receipt
 from octoreplay.replay.network.graph import CommunicationGraph, Link
 from octoreplay.replay.network.links import LinkCounts
 from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Team
+from octoreplay.run_metrics import LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
-from octoreplay.records import PairMetrics
 from octoreplay.registration.cell_means import CellMeans
 from octoreplay.registration.own_map import OwnMap
+from octoreplay.run_metrics import PairMetrics
 
 _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 

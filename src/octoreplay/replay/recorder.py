@@ -11,18 +11,11 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import (
-    CENTRAL,
-    FrameCounts,
-    LeafTable,
-    LinkTotals,
-    MapState,
-    RunSummary,
-    TickMetrics,
-)
+from octoreplay.records import CENTRAL, FrameCounts, LeafTable, MapState
 from octoreplay.replay.joining import Joining
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.warnings import team_frame_warnings
+from octoreplay.run_metrics import LinkTotals, RunSummary, TickMetrics
 
 STATES_PER_KEY_FRAME = 12
 """Number of stored states of a robot from one key frame to the next."""

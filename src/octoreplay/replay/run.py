@@ -17,13 +17,14 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.mapping.warm_up import second_compiler
-from octoreplay.records import FrameCounts, RunSummary
+from octoreplay.records import FrameCounts
 from octoreplay.replay.frames import without_computed_frames
 from octoreplay.replay.interrupt import deferred_interrupts
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import MAX_TICKS, Session
 from octoreplay.replay.sources import TeamSources
 from octoreplay.replay.warnings import map_warnings, rule_warnings
+from octoreplay.run_metrics import RunSummary
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import RobotPose, TickMetrics
+from octoreplay.records import RobotPose
 from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.robots.robot import Publication
+from octoreplay.run_metrics import TickMetrics
 
 
 @dataclass(frozen=True, eq=False)

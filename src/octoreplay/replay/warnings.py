@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
 from octoreplay.mapping.contradiction import LABEL_LIMIT, MIN_OVERLAP, contradicting_pairs
-from octoreplay.records import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
+from octoreplay.run_metrics import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:

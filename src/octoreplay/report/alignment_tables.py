@@ -9,10 +9,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.records import PAIR_SHARES, PairMetrics
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.replay.alignment import Alignment, RobotFrame
 from octoreplay.report.tables import share, styled_table, worst_pair
+from octoreplay.run_metrics import PAIR_SHARES, PairMetrics
 
 MAX_PAIRS = 30
 """Largest number of rows of the table of pairs."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from octoreplay.mapping.contradiction import CLEAR_LIMIT, LABEL_LIMIT
-from octoreplay.records import TickMetrics, ranked_pairs
 from octoreplay.report.figures import COLORS, GREY, new_figure, style
+from octoreplay.run_metrics import TickMetrics, ranked_pairs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,8 @@ from typing import Any
 
 from octoreplay.evaluate.records import MAP_SCORES, SCORES, EvaluatedTick, Evaluation, MapScores
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.records import CENTRAL, PAIR_SHARES
+from octoreplay.records import CENTRAL
+from octoreplay.run_metrics import PAIR_SHARES
 
 _TICK_COLUMNS = ("label_disagreement", *PAIR_SHARES)
 """Scores of the team in every row of the CSV."""

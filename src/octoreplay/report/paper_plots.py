@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from octoreplay.records import ClassTable, Color, TickMetrics, UInt8Array
+from octoreplay.records import ClassTable, Color, UInt8Array
 from octoreplay.report.figures import BLUE, GREEN, GREY, ORANGE, over_log_time
 from octoreplay.report.map_view import BACKGROUND, opacities
 from octoreplay.report.plots import log_seconds, over_robots
+from octoreplay.run_metrics import TickMetrics
 
 PAPER_RATIO = 4.0
 """Ratio of uniform grid to octree in the paper, 'more than four times'."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
-from octoreplay.records import PAIR_SHARES, TickMetrics
 from octoreplay.report.contradiction_plots import contradiction_figure
 from octoreplay.report.figures import (
     BLUE,
@@ -24,6 +23,7 @@ from octoreplay.report.figures import (
     over_log_time,
     save_figures,
 )
+from octoreplay.run_metrics import PAIR_SHARES, TickMetrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,12 +20,10 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.team_clocks import instant
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.mapping.contradiction import contradicting_pairs
-from octoreplay.records import (
+from octoreplay.records import ClassTable, FrameCounts, LeafTable
+from octoreplay.run_metrics import (
     MIN_COMPARED_CELLS,
     PAIR_SHARES,
-    ClassTable,
-    FrameCounts,
-    LeafTable,
     LinkMetrics,
     PairMetrics,
     RunSummary,

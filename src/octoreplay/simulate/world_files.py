@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from octoreplay.errors import OutputError
+from octoreplay.io.results import ply
 from octoreplay.mapping.surface import CellVotes
 from octoreplay.records import ClassTable, Int32Array, UInt8Array
 from octoreplay.simulate.world import World
@@ -24,9 +25,11 @@ def labelled_cells(world: World, resolution: float) -> tuple[Int32Array, UInt8Ar
     """
     votes = CellVotes()
     for points, class_ids in world.surface_points(resolution / 3):
-        buried = ~world.is_ground(class_ids) & (points[:, 2] < world.terrain.height(points[:, :2]) - 0.05)
-        keys = np.floor(points[~buried] / resolution).astype(np.int64) + _KEY_OFFSET
-        votes.add(((keys[:, 0] << _KEY_BITS) + keys[:, 1] << _KEY_BITS) + keys[:, 2], class_ids[~buried])
+        is_visible = world.is_ground(class_ids)
+        above = np.flatnonzero(~is_visible)
+        is_visible[above] = points[above, 2] >= world.terrain.height(points[above, :2]) - 0.05
+        keys = np.floor(points[is_visible] / resolution).astype(np.int64) + _KEY_OFFSET
+        votes.add(((keys[:, 0] << _KEY_BITS) + keys[:, 1] << _KEY_BITS) + keys[:, 2], class_ids[is_visible])
     cells, winners = votes.winners()
     mask = (1 << _KEY_BITS) - 1
     keys = np.stack([cells >> 2 * _KEY_BITS, (cells >> _KEY_BITS) & mask, cells & mask], axis=1) - _KEY_OFFSET
@@ -58,8 +61,6 @@ def write_mesh(path: Path, world: World, class_table: ClassTable) -> None:
 
     Raises OutputError if the file cannot be written.
     """
-    from plyfile import PlyData, PlyElement
-
     vertices = np.empty(len(world.vertices), dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     for axis, name in enumerate("xyz"):
         vertices[name] = world.vertices[:, axis]
@@ -73,8 +74,4 @@ def write_mesh(path: Path, world: World, class_table: ClassTable) -> None:
     for channel, name in enumerate(("red", "green", "blue")):
         faces[name] = colors[:, channel]
     names = ", ".join(f"{c.class_id} {c.name}" for c in class_table.classes)
-    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    try:
-        PlyData(elements, byte_order="<", comments=[f"labels: {names}"]).write(str(path))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    ply.write_mesh(path, vertices, faces, [f"labels: {names}"])

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from octoreplay.evaluate.checks import ticks_to_consensus
-from octoreplay.records import RunSummary, TickMetrics
+from octoreplay.run_metrics import RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation

@@ -21,11 +21,12 @@ from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.text_files import json_text, write_whole
-from octoreplay.records import TickMetrics, UInt8Array
+from octoreplay.records import UInt8Array
 from octoreplay.replay.run import Progress
 from octoreplay.report import map_view, paper_plots, plots
 from octoreplay.report.figures import save_figures
 from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.run_metrics import TickMetrics
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import World

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from octoreplay.errors import OctoreplayError
-from octoreplay.records import FrameCounts, RunSummary
+from octoreplay.records import FrameCounts
+from octoreplay.run_metrics import RunSummary
 
 Row = dict[str, Any]
 """Numbers and texts of one run by column."""

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from octoreplay.config.class_tables.edits import MAX_CLASSES, edited
 from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable, SemanticClass
+from support.long_suite import examples
 
 NAMES = ("road", "car", "tree", "truck", "sky", "person")
 TABLE = ClassTable(
@@ -35,6 +36,7 @@ def test_without_edits_the_table_is_unchanged():
     assert edited(TABLE, (), ()) == TABLE
 
 
+@examples(100)
 @given(st.lists(st.lists(st.sampled_from(NAMES), min_size=1), max_size=4), st.sets(st.sampled_from(NAMES), max_size=5))
 def test_every_raw_label_has_a_class_or_is_ignored(groups, ignore):
     taken: set[str] = set()

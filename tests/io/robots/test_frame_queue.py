@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
+from support.long_suite import examples
 
 
 class FakePoses:
@@ -68,6 +69,7 @@ def arrivals_within(draw, window: int):
     return list(unique)
 
 
+@examples(100)
 @given(arrivals_within(60), st.integers(0, 30))
 def test_a_window_gives_the_result_of_reading_everything_first(arrivals, tolerance):
     streamed, late = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
@@ -76,6 +78,7 @@ def test_a_window_gives_the_result_of_reading_everything_first(arrivals, toleran
     assert [s[:3] for s in streamed] == [s[:3] for s in at_once]
 
 
+@examples(100)
 @given(arrivals_within(60), st.integers(0, 30), st.sampled_from([0, 1]))
 def test_pairs_are_unique_and_within_the_tolerance_and_exact_where_possible(arrivals, tolerance, index):
     settled, _ = run(make_queue(window=60, tolerance=tolerance, num_partners=2), arrivals)
@@ -99,6 +102,7 @@ def test_pairs_are_unique_and_within_the_tolerance_and_exact_where_possible(arri
                     assert min(abs(label - other) for other in others) <= abs(label - depth)
 
 
+@examples(100)
 @given(st.lists(st.integers(0, 300), max_size=30), st.integers(0, 100))
 def test_late_messages_are_dropped_and_the_others_come_in_order_and_once(stamps, window):
     queue, fates, settled = make_queue(window=window, num_partners=0), [], []

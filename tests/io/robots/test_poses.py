@@ -12,6 +12,7 @@ from octoreplay.io.messages.sensor_messages import Transforms, convert
 from octoreplay.io.robots.poses import FrameTree, PoseTrack
 from octoreplay.transforms import normalise
 from support.log_factory import IDENTITY, ros2
+from support.long_suite import examples
 
 MS = 1_000_000
 
@@ -30,6 +31,7 @@ def test_a_zero_quaternion_is_refused(bad):
     assert len(track) == 0
 
 
+@examples(100)
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**6), positions, quaternions), min_size=2, max_size=8, unique_by=lambda e: e[0]
@@ -83,6 +85,7 @@ def test_the_last_of_two_equal_stamps_is_kept():
     assert track.at(5)[0] == pytest.approx((1.0, 0.0, 0.0))
 
 
+@examples(100)
 @given(st.lists(st.integers(0, 1000), min_size=1, max_size=20, unique=True), st.integers(0, 1000), st.integers(0, 1000))
 def test_forgetting_changes_nothing_from_its_stamp_on(stamps, forget, later):
     whole, short = PoseTrack(300), PoseTrack(300)

@@ -12,6 +12,7 @@ from octoreplay.errors import InputError
 from octoreplay.io.robots.poses import PoseTrack
 from octoreplay.io.robots.trajectories import TrajectoryRows, read_rows, read_times, trajectory
 from octoreplay.transforms import pose_matrix
+from support.long_suite import examples
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 TURN = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
@@ -82,6 +83,7 @@ def test_rows_of_lost_tracking_are_ignored(tmp_path, lost):
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 
 
+@examples(100)
 @given(
     st.lists(st.tuples(st.integers(0, 50), st.tuples(*[st.floats(-10, 10)] * 3), quaternions), min_size=1, max_size=12),
     st.integers(-5, 55), st.integers(1, 40),

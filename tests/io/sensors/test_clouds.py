@@ -14,6 +14,7 @@ from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Cloud, CloudField, Scan, convert
 from octoreplay.io.sensors.clouds import decode_cloud, decode_scan, label_field
 from support.log_factory import Factory, ros2
+from support.long_suite import examples
 
 HERE = "a.mcap: topic '/points' at 1.000 s"
 KINDS = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
@@ -34,6 +35,7 @@ def with_field(cloud: Cloud, name: str, **changes) -> Cloud:
     return dataclasses.replace(cloud, fields=fields)
 
 
+@examples(100)
 @given(
     st.integers(1, 4), st.integers(1, 5), st.sampled_from(KINDS), st.integers(0, 5), st.integers(0, 9),
     st.booleans(), st.sampled_from(KINDS), st.permutations(["x", "y", "z", "intensity", "label", "confidence"]),

@@ -16,6 +16,7 @@ from octoreplay.errors import ConfigError
 from octoreplay.replay.network.graph import TeamNetwork, check_team_graph, step_size
 from octoreplay.replay.settling import settle_ticks_max
 from reference import graph as reference
+from support.long_suite import examples
 from support.team_graphs import NAMES, directed, nowhere
 
 
@@ -69,6 +70,7 @@ def _graph(tick, consensus=None):
         assume(False)
 
 
+@examples(100)
 @given(
     _ticks(),
     st.none() | st.floats(0.05, 1.2),
@@ -111,6 +113,7 @@ def test_every_graph_equals_the_reference(tick, epsilon, rule, settle):
     assert settle_ticks_max(graph, consensus, expected.epsilon) == most
 
 
+@examples(100)
 @given(_networks(), st.sampled_from(["gradient", "local"]), st.none() | st.floats(0.05, 1.2))
 def test_the_check_before_a_run_equals_the_reference_at_all_times(shape, rule, epsilon):
     num_robots, network = shape
@@ -129,6 +132,7 @@ def test_the_check_before_a_run_equals_the_reference_at_all_times(shape, rule, e
         raise
 
 
+@examples(100)
 @given(_ticks())
 def test_row_sums_are_at_most_one_and_only_links_have_weights(tick):
     graph = _graph(tick)
@@ -138,6 +142,7 @@ def test_row_sums_are_at_most_one_and_only_links_have_weights(tick):
     assert receivers_and_senders == {(receiver, sender) for sender, receiver in graph.links}
 
 
+@examples(100)
 @given(_ticks())
 def test_consensus_converges_below_the_bound_and_diverges_above(tick):
     graph = _graph(tick)
@@ -150,6 +155,7 @@ def test_consensus_converges_below_the_bound_and_diverges_above(tick):
     assert graph.lambda_2(0.95 * graph.epsilon_bound) < 1.0 < graph.lambda_2(1.05 * graph.epsilon_bound)
 
 
+@examples(100)
 @given(
     st.integers(2, 7).flatmap(
         lambda n: st.tuples(
@@ -165,12 +171,14 @@ def test_no_bound_of_a_directed_graph_is_below_one_half_and_a_simulation_finds_i
     assert graph.lambda_2(step_size(graph, ConsensusConfig())) < 1.0
 
 
+@examples(100)
 @given(_ticks())
 def test_the_default_step_size_is_stable_on_every_graph(tick):
     graph = _graph(tick)
     assert graph.lambda_2(step_size(graph, ConsensusConfig())) < 1.0
 
 
+@examples(100)
 @given(_ticks())
 def test_a_partition_leaves_the_links_within_groups(tick):
     network, robot_ids, active, _ = tick

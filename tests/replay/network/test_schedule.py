@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.errors import ConfigError
 from octoreplay.replay.network.schedule import Schedule
+from support.long_suite import examples
 
 NAMES = ("husky", "jackal", "spot", "warthog")
 
@@ -192,6 +193,7 @@ def _holds(entry, elapsed_s):
     return entry.start <= elapsed_s < entry.end
 
 
+@examples(100)
 @given(st.lists(_entries(), max_size=4))
 def test_the_state_at_every_time_follows_from_the_entries(entries):
     times = [k / 2 for k in range(20)]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from octoreplay.config.network import NetworkConfig
 from octoreplay.replay.network.topology import Topology
 from reference import graph as reference
+from support.long_suite import examples
 
 NAMES = tuple(f"robot_{number}" for number in range(64))
 NOWHERE = (math.nan,) * 3
@@ -139,6 +140,7 @@ def test_without_hysteresis_a_link_lasts_up_to_the_range():
 _POINT = st.none() | st.tuples(*[st.integers(0, 6).map(float)] * 3)
 
 
+@examples(100)
 @given(st.data())
 def test_every_topology_equals_the_reference_in_every_tick(data):
     num_robots = data.draw(st.integers(1, 7))

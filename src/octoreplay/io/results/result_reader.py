@@ -31,16 +31,12 @@ from octoreplay.io.results.result_writer import (
     map_state_topic,
     pose_topic,
 )
-from octoreplay.records import (
-    CENTRAL,
-    ClassTable,
-    Float64Array,
-    FrameCounts,
+from octoreplay.records import CENTRAL, ClassTable, Float64Array, FrameCounts, MapState
+from octoreplay.run_metrics import (
     FramePlace,
     Join,
     LinkMetrics,
     LinkTotals,
-    MapState,
     PairMetrics,
     RobotMetrics,
     RunSummary,

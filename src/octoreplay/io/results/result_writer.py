@@ -32,7 +32,8 @@ from octoreplay.io.results.geometry_messages import (
     vector,
 )
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import PAIR_SHARES, TEAM, LeafTable, MapState, RobotPose, RunSummary, TickMetrics
+from octoreplay.records import TEAM, LeafTable, MapState, RobotPose
+from octoreplay.run_metrics import PAIR_SHARES, RunSummary, TickMetrics
 from octoreplay.transforms import transform_of
 
 FORMAT_VERSION = "2"
