@@ -78,8 +78,9 @@ def fit_fixes(
     ``seconds`` (n,) their times.
 
     Yaw and horizontal shift minimise the weighted distances (L1, by iteratively reweighted least squares), then the
-    weighted squares without the outliers. The errors of fixes are correlated in time: a bias of all of them stays in
-    ``shift_sigma``, and fixes within 30 s count as one in ``angle_sigma``.
+    weighted squares without the outliers. The errors of fixes are correlated in time. ``shift_sigma`` is that of a
+    single fix, because all of them may share an error; in ``angle_sigma``, which follows from the residuals, fixes
+    within 30 s count as one. Refused where the way is too short for the angle.
     """
     if len(points_map) < _MIN_FIXES:
         return _refused(f"{len(points_map)} position fixes, fewer than {_MIN_FIXES}")
@@ -95,17 +96,16 @@ def fit_fixes(
     heights = (points_enu - points_map)[used, 2]
     T[2, 3] = np.average(heights, weights=height_weights[used])
     lengths = _residual_lengths(T, points_enu[used], points_map[used])
+    scatter = max(math.sqrt(float(np.mean(lengths**2)) / 2), _LEAST_RESIDUAL)
     known = sigmas[used, 0][np.isfinite(sigmas[used, 0])]
-    sigma = max(math.sqrt(float(np.mean(lengths**2)) / 2), float(np.median(known)) if known.size else 0.0, 1e-3)
     planar = points_map[used, :2] - points_map[used, :2].mean(axis=0)
     spread = math.sqrt(float(np.mean((planar**2).sum(axis=1))))
-    times = seconds[used]
-    num_independent = min(1.0 + float(times.max() - times.min()) / _CORRELATION_TIME, float(used.sum()))
-    angle_sigma = sigma / max(spread, 1e-9) / math.sqrt(num_independent)
+    num_independent = min(1.0 + float(np.ptp(seconds[used])) / _CORRELATION_TIME, float(used.sum()))
+    angle_sigma = scatter / max(spread, 1e-9) / math.sqrt(num_independent)
     if angle_sigma > _LARGEST_ANGLE_SIGMA:
         extent = float(np.linalg.norm(np.ptp(planar, axis=0)))
-        return _refused(f"a way of {extent:.1f} m is too short for fixes with a standard deviation of {sigma:.1f} m")
-    return KnownPose(T, sigma, angle_sigma)
+        return _refused(f"a way of {extent:.1f} m is too short for fixes that scatter by {scatter:.2f} m")
+    return KnownPose(T, max(scatter, float(np.median(known)) if known.size else 0.0), angle_sigma)
 
 
 def upright_fit(target: Float64Array, source: Float64Array, weights: Float64Array) -> Float64Array:
