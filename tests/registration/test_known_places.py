@@ -77,6 +77,12 @@ def test_outliers_are_left_out():
     assert found.shift_sigma < 0.4
 
 
+def test_a_fix_at_the_other_end_of_the_world_changes_nothing():
+    enu = moved(TRUE, drive())
+    enu[:3] = (4e6, -3e6, 1e5)
+    assert pose_difference(fitted(drive(), enu).T, TRUE) == pytest.approx((0, 0), abs=1e-3)
+
+
 def test_accurate_fixes_count_more():
     sigmas = np.full((60, 2), 0.05)
     sigmas[::2] = 5.0

@@ -75,6 +75,12 @@ def test_fixes_lead_to_the_frame_where_the_search_fails(maps, without_search):
         assert bee.origin.endswith("; agrees with position fixes")
 
 
+def test_a_first_fix_far_away_changes_nothing(maps, without_search):
+    sightings = [fixes_of(T) for T in TRUTH.values()]
+    sightings[0].fixes.geodetic[0] = (-20.0, 150.0, 0.0)
+    assert assert_right(aligned(maps, *sightings)).origin.endswith("; agrees with position fixes")
+
+
 @pytest.mark.parametrize("names", [("3",), ("3", "7")])
 def test_tags_lead_to_the_frame_where_the_search_fails(maps, without_search, names):
     tags = {name: TAGS[name] for name in names}

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from octoreplay.geodesy import enu_points
 from octoreplay.io.robots.sightings import Sightings
@@ -52,13 +51,17 @@ class Prior:
         return float(np.linalg.norm(((pair.T_first_second - self.pose.T) @ centre)[:2])), angle
 
     def gap(self, maps: Sequence[OwnMap]) -> float:
-        """Return the least horizontal distance of both maps' occupied cells, less what the deviations explain [m]."""
-        ones, others = (maps[index].occupied.points for index in (self.first, self.second))
+        """Return a lower limit of the horizontal distance between both maps' occupied cells [m]; 0 if they may overlap.
+
+        It is the distance between circles around the cells, less three standard deviations.
+        """
+        ones, others = (maps[index].occupied.points[:, :2] for index in (self.first, self.second))
         if not len(ones) or not len(others):
             return 0.0
-        moved = others @ self.pose.T[:3, :3].T + self.pose.T[:3, 3]
-        nearest = float(KDTree(ones[:, :2]).query(moved[:, :2])[0].min())
-        return nearest - _SAME_SIGMAS * self.pose.shift_sigma
+        centre = np.append(maps[self.second].occupied.points.mean(axis=0), 1.0)
+        between = float(np.linalg.norm((self.pose.T @ centre)[:2] - ones.mean(axis=0)))
+        radii = sum(float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (ones, others))
+        return max(0.0, between - radii - _SAME_SIGMAS * self.pose.shift_sigma)
 
 
 class Priors:
@@ -143,11 +146,13 @@ def _tag_priors(
     """Known transforms from common tags, and sentences on tags that are not used."""
     priors, notes = [], []
     tags: list[dict[str, Float64Array]] = []
-    for robot_id, seen in zip(robot_ids, sightings, strict=False):
+    for index, seen in enumerate(sightings):
         places = {name: tag_place(poses) for name, poses in seen.tags.items()}
         tags.append({name: place for name, place in places.items() if place is not None})
         moved = [name for name, place in places.items() if place is None]
-        notes += [f"tag {name} of {robot_id} is not used: it was seen at places over 1 m apart" for name in moved]
+        notes += [
+            f"tag {name} of {robot_ids[index]} is not used: it was seen at places over 1 m apart" for name in moved
+        ]
     for i, j in combinations(range(len(tags)), 2):
         pose = fit_tags(tags[i], tags[j], is_upright=is_upright)
         if pose is not None and pose.refusal:
@@ -160,13 +165,14 @@ def _tag_priors(
 def _fixed_frames(
     robot_ids: Sequence[str], sightings: Sequence[Sightings], is_upright: bool
 ) -> tuple[dict[int, KnownPose], list[str]]:
-    """Map frames that position fixes place east, north and up of the first fix, and sentences on the others."""
+    """Map frames that position fixes place east, north and up of the first robot's, and sentences on the others."""
     fixes = {index: seen.fixes for index, seen in enumerate(sightings) if len(seen.fixes)}
     if fixes and not is_upright:
         return {}, ["position fixes are not used: they need map frames with a vertical z axis (--dof 4)"]
     poses, notes = {}, []
     for index, found in fixes.items():
-        origin = next(iter(fixes.values())).geodetic[0]
+        # The median is no outlier; 'lower' keeps it a value of one fix where longitudes change their sign.
+        origin = np.quantile(next(iter(fixes.values())).geodetic, 0.5, axis=0, method="lower")
         pose = fit_fixes(found.points_map, enu_points(found.geodetic, origin), found.sigmas, found.seconds)
         if pose.refusal:
             notes.append(f"the position fixes of {robot_ids[index]} are not used: {pose.refusal}")

@@ -112,6 +112,10 @@ def _decoded(
         return entry if time.clock == "header" else replace(entry, stamp_ns=message.log_time_ns)
 
     for message in log.messages([topic for topic in (robot.fix_topic, *tags_topics) if topic]):
+        is_tf = kind_of(message.type_name) is Kind.TF
+        # Most TF holds no tags and need not be decoded; every encoding stores names as they are.
+        if is_tf and b"tag" not in bytes(message.data):
+            continue
         try:
             found = message.sensor_message()
         except InputError:
@@ -120,7 +124,6 @@ def _decoded(
         if isinstance(found, PositionFix):
             fixes.append(stamped(found, message))
         elif isinstance(found, Transforms):
-            is_tf = kind_of(message.type_name) is Kind.TF
             tags += [stamped(tag, message) for tag in (_tags_of_tf(found) if is_tf else found.transforms)]
     return (
         [fix for fix in fixes if thinning.keeps(fix.stamp_ns)],
