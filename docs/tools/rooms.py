@@ -19,7 +19,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 DRAWINGS = ROOT / "docs" / "architecture"
 START, END = "<!-- rooms -->\n", "<!-- end -->"
 
-WIDTH, ROW, BOX_WIDTH, BOX_HEIGHT = 640, 68, 140, 38
+WIDTH, ROW, BOX_WIDTH, BOX_HEIGHT = 640, 68, 112, 38
 
 TICK = (
     "frames\nio/robots/robot_log.py",

@@ -26,7 +26,14 @@ def twins(shared_file) -> Path:
         simulate_team(
             folder,
             SimulationConfig(
-                num_robots=1, duration=6.0, rate=2.0, image=(96, 72), own_frames=True, world_size=40.0, seed=3
+                num_robots=1,
+                duration=6.0,
+                rate=2.0,
+                image=(96, 72),
+                own_frames=True,
+                world_size=40.0,
+                seed=3,
+                fixes=0.05,
             ),
         )
         shutil.copy(folder / "husky_1.mcap", folder / "twin.mcap")
@@ -43,6 +50,7 @@ def test_align_writes_a_team_file_that_a_run_takes(twins, tmp_path):
     assert "have equal maps: are their logs the same?" in done.stderr
     team = load_team_file(tmp_path / "aligned.yaml")
     assert [robot.robot_id for robot in team.robots] == ["husky_1", "twin"]
+    assert team.robots[1].T_team_map_from.endswith("; agrees with position fixes")
     shift, angle = pose_difference(transform_of(team.robots[1].T_team_map), np.eye(4))
     assert (shift, angle) == pytest.approx((0, 0), abs=1e-3)
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {"team.png", "pair_husky_1_twin.png"}

@@ -16,6 +16,7 @@ from octoreplay.errors import ConfigError
 FULL = RobotConfig(
     "a", (Path("/logs/a.mcap"), Path("/logs/b.mcap")), depth_topic="/depth", label_topic="", confidence_topic="/sure",
     camera_info_topic="/info", pose_file=Path("/logs/a.txt"), pose_times=Path("/elsewhere/times.txt"),
+    fix_topic="/gps/fix", tags_topic="",
     map_frame="map", sensor_frame="camera", intrinsics=(1.0, 2.0, 3.0, 4.0), rectified=False, depth_unit=0.01,
     clock_offset=-1.5, T_team_map=(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0),
     T_team_map_sigma=(0.1, 0.1, 0.2, 0.01, 0.01, 0.02), T_team_map_from="aligned with c, L 812",

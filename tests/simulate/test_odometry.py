@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from octoreplay.simulate.odometry import MAX_TILT, drift_corrections, own_frame
+from octoreplay.geodesy import enu_points
+from octoreplay.simulate.odometry import FIX_ORIGIN, MAX_TILT, drift_corrections, own_frame, position_fixes
 
 
 def straight_way(length: float, step: float) -> np.ndarray:
@@ -111,3 +112,11 @@ def test_own_frames_start_at_the_pose_with_x_forward_and_a_small_tilt():
     assert tilts.max() > 0.95 * MAX_TILT
     assert tilts.mean() == pytest.approx(MAX_TILT / 2, rel=0.15)
     np.testing.assert_allclose(np.arctan2(frames[:, 1, 0], frames[:, 0, 0]), heading, atol=2e-4)
+
+
+def test_half_of_the_variance_of_fixes_is_common_to_all():
+    true = np.array([(3.0, -4.0, 1.0)] * 50)
+    draws = [enu_points(position_fixes(true, 2.0, np.random.default_rng(k)), FIX_ORIGIN) - true for k in range(800)]
+    errors = np.array(draws)
+    np.testing.assert_allclose(errors.std(axis=(0, 1)), (2.0, 2.0, 4.0), rtol=0.06)
+    np.testing.assert_allclose(errors.mean(axis=1).std(axis=0), np.array([2.0, 2.0, 4.0]) * math.sqrt(0.51), rtol=0.08)

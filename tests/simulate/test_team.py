@@ -16,9 +16,10 @@ from octoreplay.config.frames_file import load_frames_file
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, OutputError
+from octoreplay.geodesy import enu_points
 from octoreplay.io.datasets.pose_files import read_tum_track
 from octoreplay.simulate import team
-from octoreplay.simulate.odometry import drift_corrections
+from octoreplay.simulate.odometry import FIX_ORIGIN, drift_corrections
 from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
@@ -200,6 +201,21 @@ def test_pose_noise_changes_the_recorded_poses_only(small, tmp_path):
     assert 0.01 < np.mean(moved) < 1.5
 
 
+def test_fixes_are_at_the_true_positions_each_second(small, tmp_path):
+    simulate_team(tmp_path / "team", dataclasses.replace(SMALL, fixes=0.01))
+    assert load_team_file(tmp_path / "team" / "team.yaml").robots[1].fix_topic == "/husky_2/fix"
+    messages = read_messages(tmp_path / "team" / "husky_2.mcap")
+    fixes = messages.pop("/husky_2/fix")
+    assert messages.keys() == read_messages(small / "husky_2.mcap").keys()
+    geodetic = np.array([(fix.latitude, fix.longitude, fix.altitude) for _, fix in fixes])
+    true = logged_poses(messages, "husky_2")[::20, :3, 3]
+    np.testing.assert_allclose(enu_points(geodetic, FIX_ORIGIN), true, atol=0.08)
+    assert [time for time, _ in fixes] == [START_NS + k * 10**9 for k in range(4)]
+    for _, fix in fixes:
+        assert fix.header.frame_id == "husky_2/base_link"
+        assert fix.position_covariance[::4] == pytest.approx((1e-4, 1e-4, 4e-4))
+
+
 def test_kinds_divide_every_class_of_images_and_truth(small, tmp_path):
     simulate_team(tmp_path / "team", dataclasses.replace(SMALL, kinds_per_class=4))
     names = load_team_file(tmp_path / "team" / "team.yaml").classes.names
@@ -362,7 +378,7 @@ def test_a_failed_simulation_removes_its_files(tmp_path, monkeypatch, error, exi
 @pytest.mark.parametrize(
     "options",
     [{"num_robots": 0}, {"duration": 0.5}, {"rate": 0.0}, {"image": (4, 120)}, {"image": (160, 1)}, {"seed": -1},
-     {"resolution": 0.0}, {"label_noise": 1.5}, {"patchy_noise": 1.5}, {"odometry_drift": (101.0, 0.0)},
+     {"resolution": 0.0}, {"label_noise": 1.5}, {"patchy_noise": 1.5}, {"fixes": 0.0}, {"odometry_drift": (101.0, 0.0)},
      {"odometry_drift": (0.0, -1.0)}, {"world_size": 5.0}, {"max_depth": 66.0}, {"duration": float("nan")}],
 )  # fmt: skip
 def test_options_out_of_range_are_refused_by_name(options):

@@ -13,6 +13,8 @@ _FOXGLOVE_MSGS = {
     "foxglove_msgs/PackedElementField[] fields\nuint8[] data\n",
     "LaserScan": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nfloat64 start_angle\n"
     "float64 end_angle\nfloat64[] ranges\nfloat64[] intensities\n",
+    "LocationFix": "builtin_interfaces/Time timestamp\nstring frame_id\nfloat64 latitude\nfloat64 longitude\n"
+    "float64 altitude\nfloat64[9] position_covariance\nuint8 position_covariance_type\n",
     "PoseInFrame": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\n",
     "FrameTransform": "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
     "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",

@@ -31,6 +31,15 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
 
 
+TAG = "apriltag_ros/msg/AprilTagDetection"
+ROS1.register(
+    {
+        **get_types_from_msg("int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose\n", TAG),
+        **get_types_from_msg("std_msgs/Header header\napriltag_ros/AprilTagDetection[] detections\n", f"{TAG}Array"),
+    }
+)
+
+
 class Entry(NamedTuple):
     """One message of a log."""
 
@@ -172,6 +181,31 @@ class Factory:
                 )
             )
         return self.make("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+    def fix(
+        self, stamp_ns: int, geodetic: Sequence[float], *, sigma: float | None = 1.0, status: int = 0,
+        frame_id: str = "camera",
+    ) -> Any:  # fmt: skip
+        """A NavSatFix; the standard deviation of its height is twice ``sigma``."""
+        latitude, longitude, altitude = map(float, geodetic)
+        diagonal = (0.0,) * 3 if sigma is None else (sigma**2, sigma**2, 4 * sigma**2)
+        return self.make(
+            "sensor_msgs/msg/NavSatFix", header=self.header(stamp_ns, frame_id),
+            status=self.make("sensor_msgs/msg/NavSatStatus", status=status, service=1), latitude=latitude,
+            longitude=longitude, altitude=altitude, position_covariance=np.diag(diagonal).ravel(),
+            position_covariance_type=0 if sigma is None else 2,
+        )  # fmt: skip
+
+    def tags(self, stamp_ns: int, positions: Mapping[int, Sequence[float]], *, frame_id: str = "camera") -> Any:
+        """Detected tags of ROS 1 at positions in the camera's frame, with the camera's rotation."""
+        detections = [
+            self.make(
+                TAG, id=np.array([number], np.int32), size=np.array([0.2]),
+                pose=self.pose_with_covariance(stamp_ns, position, frame_id=frame_id),
+            )
+            for number, position in positions.items()
+        ]  # fmt: skip
+        return self.make(f"{TAG}Array", header=self.header(stamp_ns, frame_id), detections=detections)
 
     def label_info(self, stamp_ns: int, names: Mapping[int, str]) -> Any:
         entries = [

@@ -108,11 +108,17 @@ def align_with_bar(
 ) -> Alignment:
     """Align the robots of a configuration from the evidence in their own frames, with a progress bar."""
     from octoreplay.replay.alignment import align_robots
-    from octoreplay.replay.own_maps import own_map_of
+    from octoreplay.replay.own_maps import own_maps
 
     with progress_bar("align") as update:
-        maps = [own_map_of(config, *own) for own in evidence]
-        return align_robots(config, maps, dof=dof, guesses=guesses, progress=lambda share: update(share, None, ""))
+        return align_robots(
+            config,
+            own_maps(config, evidence),
+            dof=dof,
+            guesses=guesses,
+            sightings=[own.sightings for own in evidence],
+            progress=lambda share: update(share, None, ""),
+        )
 
 
 def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys, out: Console) -> tuple[ResolvedRun, Alignment]:

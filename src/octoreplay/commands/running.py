@@ -155,6 +155,8 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
               help="drift of the recorded poses: of the way [%], of the heading per 10 m [degrees]")  # fmt: skip
 @click.option("--own-frames", is_flag=True,
               help="record each robot's poses in an odometry frame of its own")  # fmt: skip
+@click.option("--fixes", type=float, default=None, metavar="SIGMA",
+              help="write a position fix (GPS) each second, with this standard deviation [m]")  # fmt: skip
 @click.option("--kinds-per-class", type=int, default=1, show_default=True,
               help="divide each of the eight classes into this many classes")  # fmt: skip
 @click.option("--world-size", type=float, default=70.0, show_default=True, help="edge length of the square village [m]")

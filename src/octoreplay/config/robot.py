@@ -34,6 +34,8 @@ class RobotConfig:
     pose_topic, pose_file, pose_times : str or Path or None
         Pose source: a topic, or a trajectory file in TUM or KITTI format. A KITTI file goes with ``pose_times``, the
         time of each line, or has one pose per message of the sensor.
+    fix_topic, tags_topic : str or None
+        Topics of position fixes and of detected tags, from which ``align`` takes candidates; '' to use none.
     intrinsics : tuple of 4 float or None
         (fx, fy, cx, cy) [pixels], instead of CameraInfo.
     rectified : bool or None
@@ -84,6 +86,12 @@ class RobotConfig:
     )
     label_info_topic: str | None = field(
         default=None, metadata=help_text("topic of the LabelInfo with the classes' names")
+    )
+    fix_topic: str | None = field(
+        default=None, metadata=help_text("topic of position fixes (GPS) for align; '' to use none")
+    )
+    tags_topic: str | None = field(
+        default=None, metadata=help_text("topic of tags with poses (AprilTags), or TF, for align; '' to use none")
     )
     map_frame: str | None = field(
         default=None,

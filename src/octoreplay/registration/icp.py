@@ -28,8 +28,8 @@ _FLATNESS = 0.25
 # Squared Mahalanobis distance at which Geman and McClure's weight is 1/4.
 _ROBUST_SCALE = 4.0
 _NUM_ITERATIONS = 12
-# Iterations of a stage end where a step is below this share of its gate: of the last stage, and of others. A rotation is
-# measured at a distance [m].
+# Iterations end where a step is below this share of the gate: in the last stage, and in others. A rotation is measured
+# at a distance [m].
 _RELATIVE_STEP, _COARSE_STEP, _LEVER = 0.005, 0.03, 10.0
 # Number of neighbouring correspondences that carry the information of one independent measurement.
 _CORRESPONDENCES_PER_SAMPLE = 50.0

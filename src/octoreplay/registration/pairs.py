@@ -165,7 +165,7 @@ class _Matcher:
         """Poses with their information and verification: the best candidates and the guesses after refinement."""
         ranked = sorted(self._candidates(), key=lambda T: -self._rank(T))
         thin = [_thinned(surface) for surface in self._surfaces]
-        refined = []
+        refined: list[tuple[Float64Array, Float64Array, Verification]] = []
         for candidate in (*ranked[:_NUM_REFINED], *guesses):
             T, information = self._refine(thin, candidate, _COARSE_GATES)
             if any(not self.is_distinct(T, other, *_SAME_POSE) for other, _, _ in refined):

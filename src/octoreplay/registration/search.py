@@ -49,6 +49,23 @@ def planar_candidates(first: OwnMap, second: OwnMap) -> list[Float64Array]:
     return [planar.pose(_height_difference(a, b, planar)) for planar in kept]
 
 
+def climbed_pose(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> Float64Array:
+    """Return the most likely upright pose (4, 4) near another one, by hill climbing, at the height of the ground.
+
+    Returns the pose unchanged where a map has no known column.
+    """
+    a, b = first.columns, second.columns
+    points = b.known[0]
+    if a.known[1].size == 0 or points.size == 0:
+        return T_first_second
+    centre = points.mean(axis=0)
+    yaw = math.atan2(T_first_second[1, 0], T_first_second[0, 0])
+    target = _rotation(yaw) @ centre + T_first_second[:2, 3]
+    table = _score_table(a, b, 2 * first.num_classes)
+    climbed = _climbed(a, b, table, _Planar(yaw, centre, target))
+    return climbed.pose(_height_difference(a, b, climbed))
+
+
 def column_score(first: OwnMap, second: OwnMap, T_first_second: Float64Array) -> float:
     """Return the score of a pose (4, 4): the sum over the second map's known columns, as for candidates."""
     a, b = first.columns, second.columns

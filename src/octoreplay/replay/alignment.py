@@ -18,13 +18,15 @@ from octoreplay.config.run import RunConfig
 from octoreplay.config.subteam import subteam
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.robots.discover import resolve
+from octoreplay.io.robots.sightings import Sightings
 from octoreplay.records import Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots
 from octoreplay.registration.team import TeamAlignment, align_team
-from octoreplay.replay.own_maps import own_map_of, own_maps
+from octoreplay.replay.own_maps import own_evidences, own_map_of, own_maps
+from octoreplay.replay.priors import Priors
 from octoreplay.result import Result
 from octoreplay.transforms import inverse, numbers_of, pose_difference, transform_of
 
@@ -95,7 +97,8 @@ class Alignment:
     problems : tuple of str
         Sentences on given poses that the maps contradict.
     notes : tuple of str
-        Sentences on given poses that no overlap verifies, and on empty and equal maps.
+        Sentences on given poses that no overlap verifies, on empty and equal maps, and on known places in the logs that
+        are not used or that disagree with the maps.
     """
 
     dof: int
@@ -161,9 +164,15 @@ def align_logs(
             progress(share)
 
     resolved = resolve(config.with_parameters({"strict_frames": False}))
-    maps = own_maps(resolved, progress=lambda share: show(share / 2), num_threads=num_threads)
+    evidence = own_evidences(resolved, progress=lambda share: show(share / 2), num_threads=num_threads)
     return align_robots(
-        config, maps, dof=dof, guesses=guesses, progress=lambda share: show((1 + share) / 2), num_threads=num_threads
+        config,
+        own_maps(config, evidence),
+        dof=dof,
+        guesses=guesses,
+        sightings=[own.sightings for own in evidence],
+        progress=lambda share: show((1 + share) / 2),
+        num_threads=num_threads,
     )
 
 
@@ -174,6 +183,7 @@ def align_robots(
     dof: int = 4,
     T_map_own: Sequence[Float64Array] | None = None,
     guesses: Frames | None = None,
+    sightings: Sequence[Sightings] | None = None,
     progress: Callable[[float], None] | None = None,
     num_threads: int | None = None,
 ) -> Alignment:
@@ -181,21 +191,23 @@ def align_robots(
 
     ``dof`` is 4 for robots whose map frames have a vertical z axis, 6 for others. A ``T_team_map`` of the configuration
     that no command computed is trusted: it places its robot unless the maps contradict it. ``guesses`` are verified and
-    refined like every other candidate, and are not used where no overlap verifies them. ``T_map_own`` (4, 4) places
-    each map in its robot's map frame (default: it is in that frame). ``progress`` is called with the finished share of
+    refined like every other candidate, and are not used where no overlap verifies them. So are transforms that follow
+    from ``sightings``, the known places in each robot's logs, for maps in map frames. ``T_map_own`` (4, 4) places each
+    map in its robot's map frame (default: it is in that frame). ``progress`` is called with the finished share of
     pairs, 0 to 1. ``num_threads`` does not change the result. Raises ConfigError for fewer than two robots, and for
     guesses of other robots.
     """
     robot_ids = tuple(robot.robot_id for robot in config.robots)
     check_alignable(config, guesses or {})
     placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
-    candidates = _candidates(config, placed, guesses or {})
+    priors = Priors(robot_ids, maps, sightings, is_upright=dof == 4)
+    candidates = _candidates(config, placed, guesses or {}, priors)
     aligned = _align_pairs(maps, robot_ids, dof, candidates, progress, num_threads)
     given = _given(config)
     placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
     for refusal in placement.refusals:
         given.pop(refusal.index, None)
-    qualities = {(pair.first, pair.second): _quality(pair, dof) for pair in aligned.pairs}
+    qualities = {(pair.first, pair.second): _quality(pair, dof, priors) for pair in aligned.pairs}
 
     def frames(team: Sequence[PlacedRobot]) -> tuple[RobotFrame, ...]:
         first = team[0].anchor
@@ -214,7 +226,11 @@ def align_robots(
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
         tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
-        (*_unverified(placement.teams[0], given, robot_ids), *_odd_maps(maps, robot_ids)),
+        (
+            *_unverified(placement.teams[0], given, robot_ids),
+            *_odd_maps(maps, robot_ids),
+            *priors.notes(aligned.pairs, [robot.index for robot in placement.teams[0]]),
+        ),
     )
 
 
@@ -317,12 +333,9 @@ def _configured(config: RunConfig) -> list[Float64Array]:
 
 
 def _candidates(
-    config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames
+    config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames, priors: Priors
 ) -> dict[tuple[int, int], list[Float64Array]]:
-    """Known transforms between the maps of pairs: those that the configuration holds or assumes, and guesses.
-
-    Every further source of transforms between robots, such as position fixes or landmarks in the logs, belongs here.
-    """
+    """Known transforms between the maps of pairs: those those of the configuration, guesses, and those of the logs."""
     configured = _configured(config)
     # A robot with a frame and one without are not related by the identity.
     is_known = [robot.T_team_map is not None for robot in config.robots]
@@ -336,6 +349,7 @@ def _candidates(
         if all(robot_id in guessed for robot_id in ids):
             poses.append((guessed[ids[0]], guessed[ids[1]]))
         found[i, j] = [inverse(one @ T_map_own[i]) @ other @ T_map_own[j] for one, other in poses]
+        found[i, j] += priors.candidates(i, j)
     return found
 
 
@@ -363,10 +377,12 @@ def _robot_frame(
     return RobotFrame(robot_id, T, covariance, origin, partner, False)
 
 
-def _quality(pair: PairAlignment, dof: int) -> str:
-    """Number by which a pair is ranked, as text."""
+def _quality(pair: PairAlignment, dof: int, priors: Priors) -> str:
+    """Number by which a pair is ranked, and the known places that agree with it, as text."""
     agreement = pair.verification
-    return f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
+    number = f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
+    agreeing = priors.agreeing(pair)
+    return f"{number}; agrees with {' and '.join(agreeing)}" if agreeing else number
 
 
 def _difference(shift: float, angle: float) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.run import RunConfig
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sightings import Sightings, read_sightings
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
@@ -22,17 +23,16 @@ _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class OwnEvidence(NamedTuple):
-    """Evidence of one robot in its own map frame, and the means of its measured points by cell."""
+    """Evidence of one robot in its own map frame, means of its measured points by cell, and places from its logs."""
 
     octree: SemanticOctree
     means: CellMeans
+    sightings: Sightings
 
 
-def own_maps(
-    config: ResolvedRun, *, progress: Callable[[float], None] | None = None, num_threads: int | None = None
-) -> list[OwnMap]:
-    """Return the map of each robot in its own map frame, in the order of ``config.robots``; as ``own_evidences``."""
-    return [own_map_of(config, *own) for own in own_evidences(config, progress=progress, num_threads=num_threads)]
+def own_maps(config: RunConfig, evidence: Sequence[OwnEvidence]) -> list[OwnMap]:
+    """Return the map for registration of each robot's evidence."""
+    return [own_map_of(config, own.octree, own.means) for own in evidence]
 
 
 def own_evidences(
@@ -60,7 +60,7 @@ def own_evidences(
 def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     """Return the evidence of one robot's scans in the robot's own map frame, without ``bounds``."""
     num_classes = config.classes.num_classes
-    own = OwnEvidence(SemanticOctree(config.map.resolution, num_classes), CellMeans(config.map.resolution))
+    octree, means = SemanticOctree(config.map.resolution, num_classes), CellMeans(config.map.resolution)
     # The bounds are in the team's frame, which is not known yet.
     region = dataclasses.replace(config.map, bounds=())
     caster = ScanCaster(config.sensor, region, num_classes)
@@ -69,9 +69,9 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     reach = sensor_reach(config.sensor, region)
     with RobotLog(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
-            add_scan(own.octree, caster.cast(frame), increments, 0)
-            own.means.add_scan(frame, config.sensor)
-    return own
+            add_scan(octree, caster.cast(frame), increments, 0)
+            means.add_scan(frame, config.sensor)
+        return OwnEvidence(octree, means, read_sightings(log, config.time))
 
 
 def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence]) -> tuple[PairMetrics, ...]:

@@ -403,7 +403,8 @@ def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
     """Lines with the topics and frames of a robot's configuration, and how its poses reach the map frame."""
     names = {
         "depth_topic": "depth", "cloud_topic": "cloud", "label_topic": "labels", "camera_info_topic": "camera",
-        "pose_topic": "pose", "label_info_topic": "names", "map_frame": "map frame", "sensor_frame": "sensor frame",
+        "pose_topic": "pose", "label_info_topic": "names", "fix_topic": "fixes", "tags_topic": "tags",
+        "map_frame": "map frame", "sensor_frame": "sensor frame",
     }  # fmt: skip
     width = max(len(name) for name in names.values())
     values = {name: value for field, name in names.items() if (value := getattr(robot, field))}

@@ -1,4 +1,4 @@
-"""Odometry of simulated robots: dead-reckoning drift, and frames that start at the robot's first pose."""
+"""Localisation of simulated robots: drift of dead reckoning, frames that start at the first pose, position fixes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,17 @@ import math
 
 import numpy as np
 
+from octoreplay.geodesy import geodetic_points
 from octoreplay.records import Float64Array
 
 MAX_TILT = math.radians(1.0)
 """Largest angle between the vertical and the z axis of a robot's own frame [rad]."""
+
+FIX_ORIGIN = np.array([48.0, 11.0, 500.0])
+"""Latitude, longitude [degree] and height above the ellipsoid [m] of the village's origin; x is east, y north."""
+
+HEIGHT_FACTOR = 2.0
+"""Standard deviation of a fix's height, relative to that of a horizontal coordinate."""
 
 _REFERENCE_WAY = 50.0
 _BIAS_SHARE = 0.9
@@ -80,6 +87,16 @@ def own_frame(T_map_body: Float64Array, rng: np.random.Generator) -> Float64Arra
     T_map_odom[:3, :3] = (Rotation.from_rotvec([0.0, 0.0, heading]) * tilt).as_matrix()
     T_map_odom[:3, 3] = T_map_body[:3, 3]
     return T_map_odom
+
+
+def position_fixes(positions: Float64Array, sigma: float, rng: np.random.Generator) -> Float64Array:
+    """Draw position fixes (n, 3) of true positions (n, 3) [m]: latitude, longitude [degree] and height [m] in WGS 84.
+
+    ``sigma`` is the standard deviation of a horizontal coordinate [m]. One half of the variance is an error that all
+    fixes share, as of the satellites' orbits and clocks and of the atmosphere; the other half is white.
+    """
+    draws = rng.standard_normal((len(positions) + 1, 3)) * (1.0, 1.0, HEIGHT_FACTOR) * sigma / math.sqrt(2.0)
+    return geodetic_points(positions + draws[0] + draws[1:], FIX_ORIGIN)
 
 
 def _bounded_errors(ways: Float64Array, draws: Float64Array) -> Float64Array:

@@ -16,11 +16,11 @@ from octoreplay.config.sensor import MapConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.datasets.pose_files import write_tum
-from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter, topics
+from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter, fix_topic, topics
 from octoreplay.records import CameraModel, ClassTable, Float64Array, Int64Array
 from octoreplay.simulate.camera import LabelPatches, MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.exploration import Exploration, explore
-from octoreplay.simulate.odometry import drift_corrections, own_frame
+from octoreplay.simulate.odometry import HEIGHT_FACTOR, drift_corrections, own_frame, position_fixes
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import MAX_KINDS, Terrain, village_classes
 from octoreplay.simulate.world_files import write_ground_truth, write_mesh
@@ -67,6 +67,8 @@ class SimulationConfig:
     own_frames : bool
         True to record each robot's poses in a frame of its own, which starts at its first pose. The robots start with
         random headings.
+    fixes : float or None
+        Standard deviation of a horizontal coordinate of position fixes [m], one each second; None for logs without.
     kinds_per_class : int
         Number of classes that each of the eight classes is divided into.
     world_size : float
@@ -89,6 +91,7 @@ class SimulationConfig:
     pose_noise: float = 0.0
     odometry_drift: tuple[float, float] = (0.0, 0.0)
     own_frames: bool = False
+    fixes: float | None = None
     kinds_per_class: int = 1
     world_size: float = 70.0
     identical_houses: bool = False
@@ -109,6 +112,7 @@ class SimulationConfig:
             ("pose_noise", self.pose_noise, 0.0, 10.0),
             ("odometry_drift in percent", self.odometry_drift[0], 0.0, 100.0),
             ("odometry_drift in degrees per 10 m", self.odometry_drift[1], 0.0, 90.0),
+            ("fixes", 0.001 if self.fixes is None else self.fixes, 0.001, 1000.0),
             ("kinds_per_class", self.kinds_per_class, 1, MAX_KINDS),
             ("world_size", self.world_size, 20.0, 1000.0),
             ("max_depth", self.max_depth, 1.0, 65.0),
@@ -272,6 +276,7 @@ def _team(folder: Path, config: SimulationConfig) -> RunConfig:
                 camera_info_topic=camera_info,
                 pose_topic=odometry,
                 label_info_topic=label_info,
+                fix_topic=None if config.fixes is None else fix_topic(robot_id),
             )
         )
     return RunConfig(tuple(robots), classes=config.class_table, map=MapConfig(resolution=config.resolution))
@@ -334,6 +339,11 @@ class _Recorder:
             self.T_map_odom = own_frame(self.poses[0], np.random.default_rng([config.seed, 5, index]))
             recorded = inverse(self.T_map_odom) @ recorded
         self._recorded = recorded
+        self._fixes: dict[int, Float64Array] = {}
+        if config.fixes is not None:
+            steps = range(0, schedule.num_poses, max(1, round(1e9 / schedule.pose_period_ns)))
+            rng = np.random.default_rng([config.seed, 8, index])
+            self._fixes = dict(zip(steps, position_fixes(self.poses[steps, :3, 3], config.fixes, rng), strict=True))
         self._exposures = schedule.exposures(index, config.num_robots)
         self._rng = np.random.default_rng([config.seed, 2, index])
         self._patches: LabelPatches | None = None
@@ -350,6 +360,10 @@ class _Recorder:
             following = self._states[min(step + 1, len(self._states) - 1)]
             speed = float(np.hypot(*(following[:2] - state[:2]))) * 1e9 / period_ns
             log.write_pose(stamp_ns, recorded, speed, float(following[2] - state[2]) * 1e9 / period_ns)
+            if self._config.fixes is not None and step in self._fixes:
+                log.write_fix(
+                    stamp_ns, self._fixes[step].tolist(), self._config.fixes, HEIGHT_FACTOR * self._config.fixes
+                )
             if step in self._exposures:
                 # Exposed midway between two poses, so that readers have to interpolate.
                 T_map_camera = midway(T_map_body, self.poses[step + 1]) @ T_BODY_CAMERA

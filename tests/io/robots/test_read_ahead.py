@@ -87,10 +87,10 @@ def test_closing_ends_a_read_without_frames(robot, monkeypatch):
             seen.append(number)
             yield from original(self, topics)
 
-    original = RobotLog._messages
+    original = RobotLog.messages
     time_config = TimeConfig(start=1e6)
     with RobotLog(robot, time_config, TABLE) as log:
-        monkeypatch.setattr(RobotLog, "_messages", messages)
+        monkeypatch.setattr(RobotLog, "messages", messages)
         started = time.monotonic()
         with ReadAhead(log):
             time.sleep(0.2)

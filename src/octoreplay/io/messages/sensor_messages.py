@@ -1,6 +1,7 @@
 """Sensor, pose and label messages in one form for ROS message types and Foxglove schemas.
 
-Sources: ROS's common_interfaces, geometry2 and vision_msgs; https://docs.foxglove.dev/docs/sdk/schemas
+Sources: ROS's common_interfaces, geometry2 and vision_msgs; apriltag_ros and
+isaac_ros_apriltag_interfaces; https://docs.foxglove.dev/docs/sdk/schemas
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class Kind(StrEnum):
     PATH = "path"
     TF = "TF"
     LABEL_INFO = "LabelInfo"
+    FIX = "position fix"
+    TAGS = "tags"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -147,7 +150,25 @@ class LabelNames:
     names: Mapping[int, str]
 
 
-SensorMessage: TypeAlias = Image | CompressedImage | Calibration | Cloud | Scan | Transforms | LabelNames
+@dataclass(frozen=True, slots=True)
+class PositionFix:
+    """Position of an antenna in WGS 84: latitude and longitude [degree], height above the ellipsoid [m].
+
+    ``sigma`` and ``height_sigma`` are the standard deviations [m] of a horizontal coordinate and of the height; NaN
+    where they are unknown. ``is_valid`` is False without a fix.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    latitude: float
+    longitude: float
+    altitude: float
+    sigma: float
+    height_sigma: float
+    is_valid: bool
+
+
+SensorMessage: TypeAlias = Image | CompressedImage | Calibration | Cloud | Scan | Transforms | LabelNames | PositionFix
 
 
 def kind_of(type_name: str) -> Kind | None:
@@ -296,6 +317,35 @@ def _label_info(value: Any) -> LabelNames:
     return LabelNames({int(entry.class_id): str(entry.class_name) for entry in value.class_map})
 
 
+# --- known places ----------------------------------------------------------------------------------------------------
+
+
+def _position_fix(value: Any) -> PositionFix:
+    position = float(value.latitude), float(value.longitude), float(value.altitude)
+    # STATUS_NO_FIX is -1. Receivers without a fix also give NaN, or latitude and longitude 0.
+    has_fix = value.status.status >= 0 if hasattr(value, "status") else True
+    in_range = abs(position[0]) <= 90.0 and abs(position[1]) <= 360.0 and abs(position[2]) < 1e6
+    variances = _row(value.position_covariance)[::4] if int(value.position_covariance_type) > 0 else np.zeros(3)
+    east, north, up = variances if variances.size == 3 and np.all(variances > 0) else (math.nan,) * 3
+    sigmas = math.sqrt((east + north) / 2), math.sqrt(up)
+    return PositionFix(*_head(value), *position, *sigmas, has_fix and in_range and any(position[:2]))
+
+
+def _tag_detections(value: Any) -> Transforms:
+    # Several ids are those of a bundle of tags with one pose.
+    def tag(detection: Any) -> str:
+        ids = detection.id if hasattr(detection.id, "__len__") else (detection.id,)
+        family = getattr(detection, "family", "")
+        return (f"{family}:" if family else "") + "+".join(str(int(number)) for number in ids)
+
+    def pose(part: Any) -> Any:
+        return pose(part.pose) if hasattr(part, "pose") else part
+
+    stamp, frame_id = _head(value)
+    found = [(tag(detection), pose(detection.pose)) for detection in value.detections]
+    return Transforms(tuple(StampedTransform(stamp, frame_id, name, *_pose(part)) for name, part in found))
+
+
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 
@@ -387,4 +437,9 @@ _TYPES: Mapping[str, tuple[Kind, Callable[[Any], SensorMessage]]] = {
     "foxglove.FrameTransforms": (Kind.TF, _tf_message),
     "foxglove.FrameTransform": (Kind.TF, _frame_transform),
     "vision_msgs/msg/LabelInfo": (Kind.LABEL_INFO, _label_info),
+    "sensor_msgs/msg/NavSatFix": (Kind.FIX, _position_fix),
+    "foxglove.LocationFix": (Kind.FIX, _position_fix),
+    "apriltag_ros/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),
+    "apriltags2_ros/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),
 }

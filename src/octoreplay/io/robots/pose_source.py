@@ -142,6 +142,19 @@ class PoseSource:
         """Transform from the sensor to the frame of ``body_box`` at a stamp, (4, 4) float64; None where TF has none."""
         return self._sensor_at(stamp_ns) if self._body is None else self._link_at(self._body, stamp_ns)
 
+    @property
+    def moving_tf(self) -> tuple[str, ...]:
+        """Topics of the moving transforms that concern the robot."""
+        return moving_tf_names(self._tf)
+
+    def T_sensor_frame(self, frame: str) -> Float64Array | None:
+        """Fixed transform from another frame of the robot to the sensor, (4, 4) float64; None where TF has none."""
+        if not self._tree.is_fixed(self._sensor_frame, frame):
+            return None
+        with suppress(InputError):
+            return self._tree.T_a_b(self._sensor_frame, frame, 0)
+        return None
+
     def forget_before(self, stamp_ns: int) -> None:
         """Drop poses that no stamp from ``stamp_ns`` on needs."""
         self._tree.forget_before(stamp_ns)

@@ -141,7 +141,7 @@ class RobotLog:
         if self.counts.used == 0 and self.counts.no_pose > 0:
             if log_start_ns is not None:
                 # Transforms in the part that was not read may connect the frames.
-                for message in self._messages(poses.topics, None, log_start_ns):
+                for message in self.messages(poses.topics, None, log_start_ns):
                     self._add_pose(message, poses)
             poses.check_connected()
             self._check_within_reach()
@@ -163,7 +163,7 @@ class RobotLog:
 
         Messages that no pose from the stamp ``needed_from_ns`` (without the clock offset) on needs may be left out.
         """
-        for message in self._messages(poses.topics, self._log_start_ns(needed_from_ns, poses)):
+        for message in self.messages(poses.topics, self._log_start_ns(needed_from_ns, poses)):
             self._add_pose(message, poses)
             yield message
 
@@ -180,7 +180,7 @@ class RobotLog:
             num_partners=len(partner_topics),
         )
         topics = {self.sensor_topic, *poses.topics, *partner_topics}
-        for number, message in enumerate(self._until_sensor_ends(self._messages(topics, log_start_ns))):
+        for number, message in enumerate(self._until_sensor_ends(self.messages(topics, log_start_ns))):
             if not is_wanted():
                 return
             if self._is_over(thinning, queue.newest_ns, message.log_time_ns):
@@ -201,7 +201,7 @@ class RobotLog:
             if message.topic == self.sensor_topic:
                 end_ns = message.log_time_ns + _LOG_DELAY_NS
             elif end_ns is not None and message.log_time_ns > end_ns:
-                following = next(self._messages((self.sensor_topic,), message.log_time_ns), None)
+                following = next(self.messages((self.sensor_topic,), message.log_time_ns), None)
                 if following is None:
                     return
                 end_ns = following.log_time_ns
@@ -220,7 +220,7 @@ class RobotLog:
         try:
             delays = [
                 message.log_time_ns - self._stamp_of(message, StampCheck(self._offset_ns))
-                for message in islice(self._messages((self.sensor_topic,), log_start_ns), _NUM_FIRST)
+                for message in islice(self.messages((self.sensor_topic,), log_start_ns), _NUM_FIRST)
             ]
         except DamagedMessageError:
             return None
@@ -238,7 +238,7 @@ class RobotLog:
     def _check_first_stamps(self) -> None:
         """Pass each topic's first stamps to the stamp check, which compares later stamps with them."""
         for topic in (self.sensor_topic, *self._maker.partner_topics):
-            for message in islice(self._messages((topic,)), _NUM_FIRST):
+            for message in islice(self.messages((topic,)), _NUM_FIRST):
                 with contextlib.suppress(DamagedMessageError):
                     self._stamp_of(message, self._stamp_check)
 
@@ -270,7 +270,7 @@ class RobotLog:
             raise InputError(f"{first.where}: the header's stamp is 0; give clock: log to use the log's times")
         window_ns = round(self._time.reorder_window * 1e9)
         stamps, check = [], StampCheck(self._offset_ns)
-        for message in islice(self._messages((self.sensor_topic,)), _NUM_FIRST):
+        for message in islice(self.messages((self.sensor_topic,)), _NUM_FIRST):
             if message.log_time_ns > first.log_time_ns + window_ns:
                 break
             with contextlib.suppress(DamagedMessageError):
@@ -315,7 +315,7 @@ class RobotLog:
             raise InputError(f"{self._name}: {missing} for '{self.sensor_topic}'; give intrinsics: [fx, fy, cx, cy]")
         return DepthFrameMaker(self.robot, self._labels, message)
 
-    def _messages(
+    def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
         """Messages of some topics of all the robot's logs in [start_ns, stop_ns) of log time, in order of log time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,7 +31,8 @@ class RobotLogWriter:
 
     Topics of robot R: ``/R/camera/depth/image_raw`` (16UC1 in millimetres or 32FC1 in metres),
     ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16), ``/R/labels/label_info`` (once),
-    ``/R/odom``, ``/tf`` (``map_frame`` to R/base_link) and ``/tf_static`` (R/base_link to R/camera_optical_frame).
+    ``/R/odom``, ``/tf`` (``map_frame`` to R/base_link), ``/tf_static`` (R/base_link to R/camera_optical_frame) and
+    ``/R/fix``.
     Without a ``camera`` the log is a lidar's: ``/R/lidar/points`` in the frame R/lidar replaces the images.
 
     ``class_table`` is None for a log without labels. ``T_body_sensor`` is (4, 4) float64, from the camera's optical
@@ -54,6 +56,7 @@ class RobotLogWriter:
         self._depth_topic, self._label_topic, self._info_topic, self._pose_topic, label_info = topics(robot_id)
         self._map_frame, self._body_frame = map_frame, f"{robot_id}/base_link"
         self._cloud_topic = cloud_topic(robot_id)
+        self._fix_topic = fix_topic(robot_id)
         self._sensor_frame = f"{robot_id}/lidar" if camera is None else f"{robot_id}/camera_optical_frame"
         self._writer = RosMcapWriter(path)
         self._write_transform("/tf_static", start_ns, self._body_frame, self._sensor_frame, T_body_sensor)
@@ -91,6 +94,26 @@ class RobotLogWriter:
             twist=message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
         self._writer.write(self._pose_topic, "nav_msgs/msg/Odometry", odometry, stamp_ns)
+
+    def write_fix(self, stamp_ns: int, geodetic: Sequence[float], sigma: float, height_sigma: float) -> None:
+        """Append a position fix of the base: latitude, longitude [degree], height above the ellipsoid [m] in WGS 84.
+
+        ``sigma`` and ``height_sigma`` are the standard deviations of a horizontal coordinate and of the height [m].
+        """
+        latitude, longitude, altitude = map(float, geodetic)
+        value = message(
+            "sensor_msgs/msg/NavSatFix",
+            header=header(stamp_ns, self._body_frame),
+            # A fix without augmentation, from GPS.
+            status=message("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+            latitude=latitude,
+            longitude=longitude,
+            altitude=altitude,
+            position_covariance=np.diag([sigma**2, sigma**2, height_sigma**2]).ravel(),
+            # COVARIANCE_TYPE_DIAGONAL_KNOWN
+            position_covariance_type=2,
+        )
+        self._writer.write(self._fix_topic, "sensor_msgs/msg/NavSatFix", value, stamp_ns)
 
     def write_frame(
         self, stamp_ns: int, depth_image: npt.NDArray[Any], label_image: npt.NDArray[Any] | None = None
@@ -256,6 +279,11 @@ def topics(robot_id: str) -> tuple[str, str, str, str, str]:
 def cloud_topic(robot_id: str) -> str:
     """Return the topic of a lidar robot's point clouds."""
     return f"/{robot_id}/lidar/points"
+
+
+def fix_topic(robot_id: str) -> str:
+    """Return the topic of a robot's position fixes."""
+    return f"/{robot_id}/fix"
 
 
 def _quaternion(rotation: npt.ArrayLike) -> Any:

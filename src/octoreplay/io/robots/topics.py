@@ -20,6 +20,9 @@ from octoreplay.io.robots.survey import CLOUDS, IMAGES
 # Poses that are commanded, not measured.
 _NO_POSE_HINTS = ("goal", "initialpose", "initial_pose", "target", "setpoint")
 
+# Fixes that a filter computed from the poses and other fixes.
+_NO_FIX_HINTS = ("filtered", "odometry")
+
 _ROLE_KINDS: Mapping[str, tuple[tuple[Kind, ...], str]] = {
     "depth_topic": (IMAGES, "image"),
     "label_topic": (IMAGES, "image"),
@@ -28,6 +31,8 @@ _ROLE_KINDS: Mapping[str, tuple[tuple[Kind, ...], str]] = {
     "cloud_topic": (CLOUDS, "point cloud or laser scan"),
     "pose_topic": (POSE_KINDS, "pose"),
     "label_info_topic": ((Kind.LABEL_INFO,), "LabelInfo"),
+    "fix_topic": ((Kind.FIX,), "position fix"),
+    "tags_topic": ((Kind.TAGS, Kind.TF), "tag"),
 }
 
 T = TypeVar("T")
@@ -50,7 +55,7 @@ def find_topics(robot: RobotConfig, group: LogGroup, problems: list[str] | None 
     found = _fill(found, attempt(lambda: _find_pose(found, group), problems))
     if found.pose_topic is not None:
         found = _fill(found, attempt(lambda: _find_frames(found, group), problems))
-    return found
+    return _fill(found, _find_known_places(group))
 
 
 def attempt(step: Callable[[], T], problems: list[str] | None) -> T | None:
@@ -181,6 +186,12 @@ def _find_label_info(robot: RobotConfig, group: LogGroup) -> dict[str, str | Non
     present = group.topics_of((Kind.LABEL_INFO,)) or group.unowned_topics(Kind.LABEL_INFO)
     infos = _nearest(present, str(robot.label_topic or robot.cloud_topic))
     return {"label_info_topic": _only(infos, "label_info_topic", "LabelInfo topics", robot, group) if infos else None}
+
+
+def _find_known_places(group: LogGroup) -> dict[str, str | None]:
+    """First topics, by name, of position fixes and of detected tags; None where the log has none."""
+    fixes = [topic for topic in group.topics_of((Kind.FIX,)) if not any(hint in topic for hint in _NO_FIX_HINTS)]
+    return {"fix_topic": next(iter(fixes), None), "tags_topic": next(iter(group.topics_of((Kind.TAGS,))), None)}
 
 
 # --- poses and frames ------------------------------------------------------------------------------------------------
