@@ -163,6 +163,8 @@ class _Matcher:
         self, guesses: Sequence[Float64Array]
     ) -> list[tuple[Float64Array, Float64Array, Verification]]:
         """Poses with their information and verification: the best candidates and the guesses after refinement."""
+        if len(self._first.occupied) == 0 or len(self._second.occupied) == 0:
+            return []
         ranked = sorted(self._candidates(), key=lambda T: -self._rank(T))
         thin = [_thinned(surface) for surface in self._surfaces]
         refined: list[tuple[Float64Array, Float64Array, Verification]] = []
