@@ -2,8 +2,8 @@
 
 Each robot of a village is mapped in a random frame: any yaw, up to 30 m, tilted by up to a degree. Pairs of one village
 have a true pose, pairs of different villages have none. A pose off by more than 1 m or 5 degrees is wrong; with drift
-it is 3 m and 10 degrees, because each map is bent. Weights and limits were fitted on the seeds 1 - 6, 11 - 16,
-300 - 305, 400, 401, 2000 - 2004 and 3000 - 3007.
+it is 3 m and 10 degrees, because each map is bent. Weights and limits were fitted on the seeds 1 - 6, 11 - 16, 300 -
+305, 400, 401, 2000 - 2004, 3000 - 3007 and 4000 - 4009.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ _UPWARDS[2, 3] = 1.0
 # Share of the same ground cells under a right pose, and the score that a pose needs more for each share less, for each
 # share of contradicting obstacles, and for each squared standard deviation of tilt.
 _USUAL_GROUND_SAME = 0.985
-_PER_UNLIKE_GROUND, _PER_CONTRA, _PER_TILT = 500.0, 1100.0, 57.0
+_PER_UNLIKE_GROUND, _PER_CONTRA, _PER_TILT = 500.0, 1400.0, 68.0
 # Edge of the cells for which the least score holds [m].
 _SCORE_RESOLUTION = 0.3
 # A refined candidate with more contradicting obstacles than this is wrong.
@@ -60,7 +60,7 @@ class AcceptLimits:
         Least spread of the normals of these cells (``verify.spread_of_normals``): parallel planes fix no pose.
     """
 
-    min_score: float = 160.0
+    min_score: float = 170.0
     min_cells: int = 150
     max_contra: float = 0.1
     max_tilt: float = math.radians(2.5)
