@@ -22,7 +22,7 @@ from octoreplay.registration.rigid import cross_matrix
 _CODE_DISTANCE = 1e4
 _NUM_NEIGHBOURS = 30
 _MIN_NEIGHBOURS = 6
-_MIN_CORRESPONDENCES = 20
+MIN_CORRESPONDENCES = 20
 # A principal direction whose variance is below this share of the largest one is across the surface.
 _FLATNESS = 0.25
 # Squared Mahalanobis distance at which Geman and McClure's weight is 1/4.
@@ -124,18 +124,18 @@ def icp(
     near_source, near_target = _close_parts(source, target, T, 1.5 * gates[0])
     for gate in gates:
         for _ in range(_NUM_ITERATIONS):
-            pairs = _correspondences(near_source, near_target, T, gate)
+            pairs = correspondences(near_source, near_target, T, gate)
             num = len(pairs[0])
-            if num < _MIN_CORRESPONDENCES:
+            if num < MIN_CORRESPONDENCES:
                 return IcpResult(T, np.zeros((6, 6)), num)
             moved = near_source.points[pairs[0]] @ T[:3, :3].T + T[:3, 3]
             centre = moved.mean(axis=0)
             hessian, gradient = _normal_equations(near_source, near_target, T, pairs, moved, centre)
             if tilt_sigma is not None:
-                _add_tilt_prior(hessian, gradient, T, tilt_sigma)
+                add_tilt_prior(hessian, gradient, T, tilt_sigma)
             damping = 1e-9 * np.trace(hessian) * np.eye(6)
             motion = -np.linalg.solve(hessian + damping, gradient)
-            T = _moved(T, motion, centre)
+            T = moved_pose(T, motion, centre)
             shift, angle = np.linalg.norm(motion[3:]), np.linalg.norm(motion[:3])
             least = (_RELATIVE_STEP if gate == gates[-1] else _COARSE_STEP) * gate
             if shift < least and angle < least / _LEVER:
@@ -160,8 +160,8 @@ def _close_parts(source: Surface, target: Surface, T: Float64Array, gate: float)
     return close_source, target.subset(np.isfinite(distances))
 
 
-def _correspondences(source: Surface, target: Surface, T: Float64Array, gate: float) -> tuple[Int64Array, Int64Array]:
-    """Indices of corresponding points: the nearest target of each source, and the nearest source of each target."""
+def correspondences(source: Surface, target: Surface, T: Float64Array, gate: float) -> tuple[Int64Array, Int64Array]:
+    """Return indices of corresponding points: each source's nearest target, then each target's nearest source."""
     if len(source.points) == 0 or len(target.points) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     moved = source.points @ T[:3, :3].T + T[:3, 3]
@@ -184,33 +184,55 @@ def _normal_equations(
     centre: Float64Array,
 ) -> tuple[Float64Array, Float64Array]:
     """Gauss-Newton's matrix (6, 6) and gradient (6,) for a small motion about ``centre``."""
+    residuals = moved - target.points[pairs[1]]
+    information, pulls = weighted_pulls(source, target, (T[:3, :3], np.eye(3)), pairs, residuals)
+    jacobian = motion_jacobian(moved - centre)
+    flat = jacobian.reshape(-1, 6)
+    return flat.T @ (information @ jacobian).reshape(-1, 6), flat.T @ pulls.ravel()
+
+
+def weighted_pulls(
+    source: Surface,
+    target: Surface,
+    rotations: tuple[Float64Array, Float64Array],
+    pairs: tuple[Int64Array, Int64Array],
+    residuals: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the weighted information (n, 3, 3) of correspondences and its product with their ``residuals`` (n, 3).
+
+    ``rotations`` turn the source's and the target's frame to that of the residuals.
+    """
     i, j = pairs
-    rotation = T[:3, :3]
-    information = _inverse_symmetric(target.covariances[j] + rotation @ source.covariances[i] @ rotation.T)
-    residuals = moved - target.points[j]
+    turn, other = rotations
+    information = _inverse_symmetric(other @ target.covariances[j] @ other.T + turn @ source.covariances[i] @ turn.T)
     pulls = np.einsum("nij,nj->ni", information, residuals)
     squares = np.einsum("ni,ni->n", residuals, pulls)
     weights = np.sqrt(source.weights[i] * target.weights[j]) / (1.0 + squares / _ROBUST_SCALE) ** 2
-    arms = moved - centre
+    return information * weights[:, None, None], pulls * weights[:, None]
+
+
+def motion_jacobian(arms: Float64Array) -> Float64Array:
+    """Return the derivatives (n, 3, 6) of points at ``arms`` (n, 3) by a small motion (rotation, translation)."""
     jacobian = np.zeros((len(arms), 3, 6))
     jacobian[:, 0, 1], jacobian[:, 0, 2] = arms[:, 2], -arms[:, 1]
     jacobian[:, 1, 0], jacobian[:, 1, 2] = -arms[:, 2], arms[:, 0]
     jacobian[:, 2, 0], jacobian[:, 2, 1] = arms[:, 1], -arms[:, 0]
     jacobian[:, 0, 3] = jacobian[:, 1, 4] = jacobian[:, 2, 5] = 1.0
-    weighted = (information @ jacobian) * weights[:, None, None]
-    flat = jacobian.reshape(-1, 6)
-    return flat.T @ weighted.reshape(-1, 6), flat.T @ (pulls * weights[:, None]).ravel()
+    return jacobian
 
 
-def _add_tilt_prior(hessian: Float64Array, gradient: Float64Array, T: Float64Array, sigma: float) -> None:
-    """Add the prior of parallel vertical axes, in place: the rotation (w_x, w_y) turns z to (w_y, -w_x, 1)."""
+def add_tilt_prior(hessian: Float64Array, gradient: Float64Array, T: Float64Array, sigma: float) -> None:
+    """Add the prior of parallel vertical axes to the equations of a motion, in place.
+
+    The rotation (w_x, w_y) turns z to (w_y, -w_x, 1). ``sigma`` is the standard deviation of the angle [rad].
+    """
     weight = _CORRESPONDENCES_PER_SAMPLE / sigma**2
     hessian[[0, 1], [0, 1]] += weight
     gradient[:2] += weight * np.array([-T[1, 2], T[0, 2]])
 
 
-def _moved(T: Float64Array, motion: Float64Array, centre: Float64Array) -> Float64Array:
-    """The pose after a small motion (rotation vector, translation) about ``centre``."""
+def moved_pose(T: Float64Array, motion: Float64Array, centre: Float64Array) -> Float64Array:
+    """Return the pose (4, 4) after a small motion (rotation vector, translation) about ``centre``."""
     result = np.eye(4)
     rotation = Rotation.from_rotvec(motion[:3]).as_matrix()
     result[:3, :3] = rotation @ T[:3, :3]

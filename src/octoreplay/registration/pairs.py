@@ -18,8 +18,11 @@ from octoreplay.registration.verify import Verification, candidate_score, spread
 TILT_SIGMA = math.radians(1.0)
 """Standard deviation of the angle between the vertical axes of two gravity-aligned robots [rad]."""
 
-# Gates of the refinement [cell]: of every candidate, and of those that are not excluded by then.
-_COARSE_GATES, _FINE_GATES = (5.0, 3.0), (2.0, 1.2)
+FINE_GATES = (2.0, 1.2)
+"""Gates of the last stages of a registration [cell]."""
+
+# Gates of the first refinement of every candidate [cell].
+_COARSE_GATES = (5.0, 3.0)
 _NUM_REFINED = 4
 # Candidates are refined with one point in this many.
 _THINNING = 3
@@ -174,7 +177,7 @@ class _Matcher:
                 continue
             agreement = self.verify(T)
             if agreement.obstacles.share_contra <= _EXCLUDING_CONTRA:
-                T, information = self._refine(self._surfaces, T, _FINE_GATES)
+                T, information = self._refine(self._surfaces, T, FINE_GATES)
                 agreement = self.verify(T)
             refined.append((T, information, agreement))
         return refined

@@ -11,8 +11,9 @@ import numpy as np
 
 from octoreplay.mapping.octree import Run
 from octoreplay.records import Float64Array
+from octoreplay.registration.joint import register_together
 from octoreplay.registration.own_map import OwnMap
-from octoreplay.registration.pairs import AcceptLimits, PairAlignment, align_pair
+from octoreplay.registration.pairs import FINE_GATES, TILT_SIGMA, AcceptLimits, PairAlignment, align_pair
 from octoreplay.registration.verify import verify
 from octoreplay.transforms import inverse, pose_difference
 
@@ -65,7 +66,32 @@ def align_team(
         return align_pair(maps, *pair, dof=dof, guesses=known.get(pair, ()), limits=limits)
 
     pairs = tuple(run(align, combinations(range(len(maps)), 2)))
-    return join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
+    joined = join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
+    return refine_components(maps, joined, is_upright=dof == 4)
+
+
+def refine_components(maps: Sequence[OwnMap], alignment: TeamAlignment, *, is_upright: bool = True) -> TeamAlignment:
+    """Return an alignment whose poses are registered together in each component of three robots and more.
+
+    The pairs through which robots got their poses are changed with them.
+    """
+    poses = list(alignment.T_component_map)
+    for component in alignment.components:
+        if len(component) > 2:
+            surfaces = [maps[index].upright_surface if is_upright else maps[index].surface for index in component]
+            gates = [gate * maps[component[0]].resolution for gate in FINE_GATES]
+            sigma = TILT_SIGMA if is_upright else None
+            found = register_together(surfaces, [poses[index] for index in component], gates=gates, tilt_sigma=sigma)
+            for index, T in zip(component, found, strict=True):
+                poses[index] = T
+
+    def refined(pair: PairAlignment) -> PairAlignment:
+        i, j = pair.first, pair.second
+        if alignment.parents[i] != j and alignment.parents[j] != i:
+            return pair
+        return replace(pair, T_first_second=inverse(poses[i]) @ poses[j])
+
+    return replace(alignment, pairs=tuple(refined(pair) for pair in alignment.pairs), T_component_map=tuple(poses))
 
 
 def join_pairs(
