@@ -20,8 +20,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.trajectories import TrajectoryErrors, read_truth, trajectory_errors
 from octoreplay.io.robots.discover import resolve
 from octoreplay.registration.rigid import moved
-from octoreplay.registration.team import align_team
-from octoreplay.replay.own_maps import own_maps
+from octoreplay.replay.alignment import align_logs, aligned_config
 from octoreplay.replay.refinement import Refinement, RefinementConfig, refine_team
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 from octoreplay.transforms import numbers_of, transform_of
@@ -111,12 +110,8 @@ def _with_noisy_frames(config: RunConfig, folder: Path, seed: int) -> RunConfig:
 
 def _aligned(config: RunConfig) -> RunConfig:
     """Give each robot of the largest component its frame from an alignment; leave the others out."""
-    alignment = align_team(own_maps(resolve(config)))
-    robots = tuple(
-        dataclasses.replace(config.robots[index], T_team_map=numbers_of(alignment.T_component_map[index]))
-        for index in alignment.components[0]
-    )
-    return dataclasses.replace(config, robots=robots)
+    return aligned_config(config, align_logs(config).teams[0])
+
 
 
 if __name__ == "__main__":

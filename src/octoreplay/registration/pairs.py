@@ -135,7 +135,7 @@ def align_pair(
         poses.append(PairAlignment(first, second, T, information, agreement, refusal))
     if not poses:
         nothing = matcher.verify(np.eye(4))
-        return PairAlignment(first, second, np.eye(4), np.zeros((6, 6)), nothing, "no candidate: too little is known")
+        return PairAlignment(first, second, np.eye(4), np.zeros((6, 6)), nothing, matcher.refusal(nothing, np.eye(4)))
     poses.sort(key=lambda pose: (not pose.is_accepted, -matcher.evidence(pose.verification)))
     best = poses[0]
     for rival in poses[1:]:
