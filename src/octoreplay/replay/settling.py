@@ -1,4 +1,4 @@
-"""Settling: ticks after the last scan in which gamma ramps to 0, until no log-odds changes.
+"""Settling: ticks after the last scan in which gamma ramps to 0 and flows get finer, until no log-odds changes.
 
 Losses, delays and budgets make it take longer; the functions here bound by how much.
 """
@@ -17,6 +17,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.records import CONVERGED
 from octoreplay.replay.network.graph import CommunicationGraph, step_size
+from octoreplay.replay.robots.robot import Phase
 
 SETTLE_MAX = "settle_max reached"
 NO_SETTLING = "settling is off"
@@ -34,28 +35,49 @@ FLOOD_TICKS = 10_000
 class Settling:
     """Settling of one team over its last graph.
 
-    Iterate over ``gamma_factors()`` and call ``note()`` after every tick. ``stop_reason`` is set at the end.
+    Iterate over ``phases()`` and call ``note()`` after every tick. ``stop_reason`` is set at the end.
     ``longest_transmission`` is the longest time that a packet kept a link busy [s].
     """
 
     def __init__(self, graph: CommunicationGraph, config: ResolvedRun, longest_transmission: float) -> None:
         self.stop_reason = SETTLE_MAX
-        self._consensus = config.consensus
+        self._config = config
         self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
         self._most = num_settle_ticks(graph, config, longest_transmission)
         self._num_quiet = 0
 
-    def gamma_factors(self) -> Iterator[float]:
-        """Factor of gamma in each settling tick: 1 - n / settle in tick n, and 0 after the ramp."""
+    def phases(self) -> Iterator[Phase]:
+        """Phase of each settling tick.
+
+        In tick n the factor of gamma is 1 - n / settle, and 0 after the ramp. Flows have 2 n bits more, until every
+        step is the quantum.
+        """
+        num_finer = num_finer_ticks(self._config)
         for n in range(1, self._most + 1):
-            yield max(0.0, 1.0 - n / self._consensus.settle)
-            if self._num_quiet >= self._quiet_ticks:
+            if n <= num_finer:
+                # Coarse flows rest before the maps agree.
+                self._num_quiet = 0
+            yield Phase(max(0.0, 1.0 - n / self._config.consensus.settle), 2 * min(n, num_finer), is_settling=True)
+            if self._num_quiet >= self._quiet_ticks and n >= num_finer:
                 self.stop_reason = CONVERGED
                 return
 
     def note(self, max_change: float) -> None:
         """Note the largest change of a log-odds in the last tick."""
-        self._num_quiet = self._num_quiet + 1 if max_change < self._consensus.settle_tolerance else 0
+        is_quiet = max_change < self._config.consensus.settle_tolerance
+        self._num_quiet = self._num_quiet + 1 if is_quiet else 0
+
+
+def num_finer_ticks(config: ResolvedRun) -> int:
+    """Number of settling ticks in which flows get finer, by 2 bits each, until every step is the quantum."""
+    consensus = config.consensus
+    if not consensus.effective_flow_bits:
+        return 0
+    quantum = consensus.effective_quantum
+    # Maps without clamps are taken to stay within the range in which float32 holds the quantum.
+    largest = min(max(abs(value) for value in config.sensor.clamp), quantum * 2**24)
+    bits = math.floor(math.log2(max(largest, quantum) / quantum)) + 1
+    return max(0, math.ceil((bits - consensus.effective_flow_bits) / 2))
 
 
 def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
@@ -92,7 +114,7 @@ def num_settle_ticks(graph: CommunicationGraph, config: ResolvedRun, transmissio
         # The time until all waiting evidence is sent is unknown, but finite, since no new evidence comes.
         return max(most, FLOOD_TICKS)
     slower *= BUDGET_TICKS if has_budget else 1
-    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1
+    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1 + num_finer_ticks(config)
 
 
 def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsilon: float) -> int:
