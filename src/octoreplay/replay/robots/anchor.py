@@ -30,27 +30,35 @@ class Anchor:
         self.absent: frozenset[int] = frozenset()
         self._config = config
         self._after = config.consensus.anchor_after if config.consensus.traits.has_gamma else 0
-        self._heard: dict[int, int] = {}
+        self._num_missed: dict[int, int] = {}
 
-    def note(self, origins: Iterable[int], own: SemanticOctree, tick: int) -> bool:
-        """Note the robots that were heard in a tick; True where the absent ones changed and o is taken anew.
+    @property
+    def needs_evidence(self) -> bool:
+        """True where the next tick may need the log q_i of this tick."""
+        return self.target is not None or any(missed + 1 >= self._after for missed in self._num_missed.values())
 
-        ``own`` is the robot's map h_i before its iteration.
+    def advance(
+        self,
+        origins: Iterable[int],
+        own: SemanticOctree,
+        log_likelihood: SemanticOctree,
+        last: SemanticOctree,
+        tick: int,
+    ) -> None:
+        """Update the absent robots and the target for the iterations of a tick.
+
+        ``origins`` are the robots whose maps arrived, ``own`` is the map h_i, ``log_likelihood`` log q_i, and ``last``
+        log q_i at the last iteration.
         """
         if not self._after:
-            return False
-        self._heard.update(dict.fromkeys(origins, tick))
-        absent = frozenset(
-            index for index, last in self._heard.items() if num_due(self._config, index, last, tick) >= self._after
-        )
-        if absent == self.absent:
-            return False
-        self.absent = absent
-        self.target = own.copy() if absent else None
-        return True
-
-    def add_evidence(self, log_likelihood: SemanticOctree, last: SemanticOctree, tick: int) -> None:
-        """Add the change of log q_i since the last iteration to the target."""
+            return
+        for index in self._num_missed:
+            self._num_missed[index] += num_due(self._config, index, tick - 1, tick)
+        self._num_missed.update(dict.fromkeys(origins, 0))
+        absent = frozenset(index for index, missed in self._num_missed.items() if missed >= self._after)
+        if absent != self.absent:
+            self.absent = absent
+            self.target = own.copy() if absent else None
         if self.target is not None:
             step = Step(self.target, (), (), log_likelihood, 0.0, last_log_likelihood=last, since=tick)
             team_step([step], update=Update.ADD, revision=tick)

@@ -117,9 +117,8 @@ class ConsensusRobot(Robot):
         if self._has_published(tick):
             self.map.revisions[self.map.find(self._early)] = tick - 1
         self._update_log_likelihood(tick)
-        if self._anchor.note((source.origin for source, _ in arrived), self.map, tick):
-            self._keep_log_likelihood(tick)
-        self._anchor.add_evidence(self._log_likelihood, self._last_log_likelihood, tick)
+        origins = (source.origin for source, _ in arrived)
+        self._anchor.advance(origins, self.map, self._log_likelihood, self._last_log_likelihood, tick)
 
     def _end_tick(self, tick: int) -> None:
         """Restore the revisions of bricks with new evidence that the iterations did not change."""
@@ -181,7 +180,7 @@ class ConsensusRobot(Robot):
     def _finish_step(self, tick: int) -> None:
         """Count an iteration and store its evidence."""
         self.num_iterations += 1
-        if self._rule.keeps_last_evidence or self._anchor.target is not None:
+        if self._rule.keeps_last_evidence or self._anchor.needs_evidence:
             self._keep_log_likelihood(tick)
 
 

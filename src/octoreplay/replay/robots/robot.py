@@ -137,7 +137,7 @@ class Robot(ABC):
         self.exchange = Exchange(config.packet, packet_codec)
         self._config = config
         self._caster = ScanCaster(config.sensor, config.map, num_classes)
-        self._increments = clamped_increments(config.sensor)
+        self._increments = clamped_increments(config.sensor, config.consensus.effective_quantum)
         self._is_average = config.consensus.evidence != "sum"
         if self._is_average:
             self._increments = unclamped_increments(config.sensor)
