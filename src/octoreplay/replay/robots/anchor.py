@@ -19,6 +19,8 @@ class Anchor:
 
     Attributes
     ----------
+    is_used : bool
+        True for a run with anchors.
     target : SemanticOctree or None
         log q_i + o; None for log q_i.
     absent : frozenset of int
@@ -29,13 +31,9 @@ class Anchor:
         self.target: SemanticOctree | None = None
         self.absent: frozenset[int] = frozenset()
         self._config = config
-        self._after = config.consensus.anchor_after if config.consensus.traits.has_gamma else 0
-        self._num_missed: dict[int, int] = {}
-
-    @property
-    def needs_evidence(self) -> bool:
-        """True where the next tick may need the log q_i of this tick."""
-        return self.target is not None or any(missed + 1 >= self._after for missed in self._num_missed.values())
+        self._after = config.consensus.anchor_after
+        self.is_used = self._after > 0 and config.consensus.traits.has_gamma
+        self._heard: dict[int, int] = {}
 
     def advance(
         self,
@@ -50,12 +48,12 @@ class Anchor:
         ``origins`` are the robots whose maps arrived, ``own`` is the map h_i, ``log_likelihood`` log q_i, and ``last``
         log q_i at the last iteration.
         """
-        if not self._after:
+        if not self.is_used:
             return
-        for index in self._num_missed:
-            self._num_missed[index] += num_due(self._config, index, tick - 1, tick)
-        self._num_missed.update(dict.fromkeys(origins, 0))
-        absent = frozenset(index for index, missed in self._num_missed.items() if missed >= self._after)
+        self._heard.update(dict.fromkeys(origins, tick))
+        absent = frozenset(
+            index for index, last in self._heard.items() if num_due(self._config, index, last, tick) >= self._after
+        )
         if absent != self.absent:
             self.absent = absent
             self.target = own.copy() if absent else None

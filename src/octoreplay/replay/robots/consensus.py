@@ -36,6 +36,7 @@ class ConsensusRobot(Robot):
         # Bricks that got new evidence before the tick's publication, and those of them that kept its values since.
         self._early: Int64Array = np.empty(0, np.int64)
         self._unchanged: Int64Array = np.empty(0, np.int64)
+        self._receivers: frozenset[int] = frozenset()
         self._anchor = Anchor(config)
 
     def integrate(self, frames: Iterable[Frame], tick: int) -> None:
@@ -62,6 +63,7 @@ class ConsensusRobot(Robot):
         self._early = self.map.codes[revisions == tick]
         revisions[revisions == tick] = tick - 1
         self._published = self._public.advance(self.map, revisions, tick, streams=self.streams)
+        self._receivers = frozenset(receivers)
         self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 
@@ -75,7 +77,8 @@ class ConsensusRobot(Robot):
         base = None if self._public.is_exact else self._published_octree(tick)
         # A brick rests if the same step with the same values changed nothing in it.
         conditions = (
-            gamma, phase.extra_flow_bits, phase.is_settling, self._has_published(tick), self._anchor.absent,
+            gamma, phase.extra_flow_bits, phase.is_settling, self._has_published(tick), self._receivers,
+            self._anchor.absent,
             *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived),
         )  # fmt: skip
         is_steady = conditions == self._last_conditions and all(held.version == tick for _, held in arrived)
@@ -94,14 +97,14 @@ class ConsensusRobot(Robot):
         """Iterate once for each of the maps that ``arrived``, in order; the largest change of a log-odds."""
         consensus = self._config.consensus
         self._begin_step(arrived, tick)
-        # The sum over robots is kept only when both ends of a link exchange the same difference.
-        needs_base = self._rule.needs_symmetric_links or not self._public.is_exact
-        base = self._published_octree(tick) if needs_base else None
         factor = phase.gamma_factor
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
             gamma = share * gamma_at(consensus, self.num_iterations)
+            # The sum over robots is kept only when both ends of a link exchange the same difference.
+            keeps_sum = self._rule.needs_symmetric_links and self._is_mutual(arrival, tick)
+            base = self._published_octree(tick) if keeps_sum or not self._public.is_exact else None
             step = self._step([arrival], step_weights, phase, gamma, base, tick)
             team_step(
                 [step], update=self._update, revision=tick, clamp=self._config.sensor.clamp,
@@ -146,12 +149,16 @@ class ConsensusRobot(Robot):
         )  # fmt: skip
 
     def _flows(self, arrived: Sequence[Arrival], phase: Phase, tick: int) -> Flows | None:
-        """Flows of the links on which both ends published in this tick; None for a rule or a run without flows."""
+        """Flows of the mutual links; None for a rule or a run without flows."""
         bits = self._config.consensus.effective_flow_bits
         if not bits:
             return None
-        own = self._has_published(tick)
-        return Flows(bits + phase.extra_flow_bits, [own and held.version == tick for _, held in arrived])
+        return Flows(bits + phase.extra_flow_bits, [self._is_mutual(arrival, tick) for arrival in arrived])
+
+    def _is_mutual(self, arrival: Arrival, tick: int) -> bool:
+        """True where both ends of a link published to each other in this tick."""
+        has_sent = self._has_published(tick) and arrival.source.origin in self._receivers
+        return has_sent and arrival.held.version == tick
 
     def _has_published(self, tick: int) -> bool:
         """True where the robot published in this tick."""
@@ -180,7 +187,7 @@ class ConsensusRobot(Robot):
     def _finish_step(self, tick: int) -> None:
         """Count an iteration and store its evidence."""
         self.num_iterations += 1
-        if self._rule.keeps_last_evidence or self._anchor.needs_evidence:
+        if self._rule.keeps_last_evidence or self._anchor.is_used:
             self._keep_log_likelihood(tick)
 
 
