@@ -47,12 +47,12 @@ def team_metrics(
     max_change: float,
     *,
     published: Float64Array,
-    rest_difference: float,
+    least_tolerance: float,
 ) -> TwinMetrics:
     """Return all metrics of one tick.
 
-    ``published`` (N, M, K) are the maps before the iterations. ``rest_difference`` is the largest difference of two
-    neighbours at rest, quantum / (2 epsilon A_min); 0 without flows.
+    ``published`` (N, M, K) are the maps before the iterations. ``least_tolerance`` of ties is N times the largest
+    difference of two neighbours at rest, N quantum / (2 epsilon A_min); 0 without flows.
     """
     robots = range(len(maps))
     pairs = list(itertools.combinations(robots, 2))
@@ -60,7 +60,7 @@ def team_metrics(
     known_to_any: BoolArray = np.any(known, axis=0)
     total = sum(squared_distance(maps[i], maps[j]) for i, j in links)
     cells_and_links = sum(int((known[i] | known[j]).sum()) for i, j in links)
-    oracle_ties = ties(oracle, len(maps) * rest_difference)
+    oracle_ties = ties(oracle, least_tolerance)
     agreement = [oracle_agreement(labels[i], oracle, oracle_ties, known_to_any) for i in robots]
     return TwinMetrics(
         total_distance_published=sum(squared_distance(published[i], published[j]) for i, j in links),
@@ -68,7 +68,7 @@ def team_metrics(
         total_distance_all=sum(squared_distance(maps[i], maps[j]) for i, j in pairs),
         distance_per_cell_and_link=total / cells_and_links if cells_and_links else 0.0,
         num_known_cells=int(known_to_any.sum()),
-        label_disagreement=label_disagreement(labels, ties(maps, rest_difference), known_to_any),
+        label_disagreement=label_disagreement(labels, ties(maps, least_tolerance), known_to_any),
         max_change=max_change,
         agreement=tuple(both[0] for both in agreement),
         agreement_occupied=tuple(both[1] for both in agreement),

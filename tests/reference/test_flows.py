@@ -7,10 +7,11 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from octoreplay.config.network import ScheduleEntry
 from reference import flows, graph, rules
 from reference.evidence import Evidence, IndexedScan
 from reference.hand_made import ray, team_config
@@ -193,6 +194,17 @@ def test_settled_neighbours_differ_by_less_than_the_bound_of_the_quantum(seed, n
     assert check_rest(config, recording).settling
 
 
+@examples(25)
+@given(seed=st.integers(0, 2**32), num_robots=st.integers(3, 6))
+def test_labels_of_a_settled_team_differ_at_ties_only(seed, num_robots):
+    config, recording = random_team(
+        seed, num_robots, 15, has_failures=False, settle=5, settle_max=500, quantum=2.0**-5, epsilon=0.2
+    )
+    *_, last = Twin(config, recording).ticks()
+    assume(all(last.active))
+    assert last.metrics.label_disagreement == 0.0
+
+
 # --- without flows ---------------------------------------------------------------------------------------------------
 
 
@@ -232,6 +244,26 @@ def test_evidence_is_published_in_the_tick_that_integrates_it():
     published = 2 * (effective.hit - effective.miss) ** 2
     assert ticks[1].metrics.total_distance_published == published
     assert ticks[1].metrics.total_distance == pytest.approx(2 * (effective.hit - effective.miss - 2 * moved) ** 2)
+
+
+def test_evidence_enters_the_map_of_a_robot_that_is_off():
+    config = team_config("ab", rule="bayes", settle=0)
+    schedule = (ScheduleEntry(2.0, 4.0, robots_off=("b",)),)
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, schedule=schedule))
+    # The scan at 1.5 s enters in tick 2, the one at 2.5 s is left out.
+    frames = [ray("a", 0.0, 0), ray("b", 1.5, 1), ray("b", 2.5, 1), ray("a", 3.5, 0)]
+    ticks = list(Twin(config, record(config, frames)).ticks())
+    assert [tick.active for tick in ticks] == [
+        (False, False),
+        (True, False),
+        (True, False),
+        (True, False),
+        (True, True),
+    ]
+    assert [tick.maps[1, 2, 1] for tick in ticks[:4]] == [0.0, 0.0, 1.0, 1.0]
+    assert ticks[2].known[1].all()
+    assert [tick.maps[0, 2, 1] for tick in ticks] == [0.0, 0.0, 0.0, 0.0, 0.5]
+    assert ticks[4].maps[1, 2, 1] == 0.5
 
 
 def test_uncertain_hits_are_rounded_to_the_quantum():

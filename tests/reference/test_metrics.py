@@ -14,7 +14,7 @@ def test_squared_distances_by_hand():
     known = np.array([[True], [True], [False]])
     published = np.array([[[0, 3, 0]], [[0, 0, 0]], [[0, 0, 0]]], dtype=float)
     result = metrics.team_metrics(
-        maps, known, np.zeros((1, 3)), [(0, 1), (1, 2)], 0.25, published=published, rest_difference=0.0
+        maps, known, np.zeros((1, 3)), [(0, 1), (1, 2)], 0.25, published=published, least_tolerance=0.0
     )
     assert result.total_distance_published == 9.0
     assert result.total_distance == 5.0 + 4.0
@@ -66,13 +66,15 @@ def test_the_difference_of_neighbours_at_rest_is_a_tie():
     maps = np.array([[[0.0, 1.0, 1.01]], [[0.0, 1.01, 1.0]]])
     known = np.ones((2, 1), dtype=bool)
 
-    def measured(rest_difference):
+    def measured(least_tolerance):
         return metrics.team_metrics(
-            maps, known, 2 * maps[0], [(0, 1)], 0.0, published=maps, rest_difference=rest_difference
+            maps, known, 2 * maps[0], [(0, 1)], 0.0, published=maps, least_tolerance=least_tolerance
         )
 
     assert (measured(0.0).label_disagreement, measured(0.0).agreement) == (1.0, (1.0, 0.0))
-    assert (measured(0.011).label_disagreement, measured(0.011).agreement) == (0.0, (1.0, 1.0))
+    # The oracle's values are twice as far apart as a robot's.
+    assert (measured(0.011).label_disagreement, measured(0.011).agreement) == (0.0, (1.0, 0.0))
+    assert (measured(0.021).label_disagreement, measured(0.021).agreement) == (0.0, (1.0, 1.0))
 
 
 def test_shares_of_no_cells():

@@ -265,7 +265,9 @@ class Twin:
     def _metrics(self, exchange: Exchange, oracle: Float64Array) -> TwinMetrics:
         """Return the metrics of the maps after the iterations."""
         team = exchange.team
-        rest_difference = self.quantum / (2.0 * team.epsilon * team.least_weight) if self.flow_bits else 0.0
+        least_tolerance = 0.0
+        if self.flow_bits:
+            least_tolerance = self.num_robots * self.quantum / (2.0 * team.epsilon * team.least_weight)
         return team_metrics(
             self._with_prior(self.maps),
             self.known,
@@ -273,7 +275,7 @@ class Twin:
             team.links,
             float(np.abs(self.maps - exchange.published).max(initial=0.0)),
             published=self._with_prior(exchange.published),
-            rest_difference=rest_difference,
+            least_tolerance=least_tolerance,
         )
 
     def _exchange(self, tick: int, active: tuple[bool, ...], team: TeamGraph) -> Exchange:
