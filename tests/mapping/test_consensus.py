@@ -65,7 +65,7 @@ def _expected(update, own, base, neighbours, weights, log_q, last, gamma):
         return rules.gradient_step(mixed, log_q, gamma)
     if update is Update.NATURAL:
         return rules.natural_step(mixed, log_q, gamma)
-    return rules.bayes_step(mixed, log_q, last) if update is Update.ADD else log_q
+    return rules.with_evidence(mixed, log_q, last) if update is Update.ADD else log_q
 
 
 @examples(50)

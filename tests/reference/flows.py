@@ -28,5 +28,9 @@ def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: 
 
 
 def flow(own: Float64Array, other: Float64Array, weight: float, steps: Float64Array) -> Float64Array:
-    """Return f = e trunc(w (h_j - h_i) / e) with w = 2 epsilon A_ij, towards zero; -f at the other end."""
-    return np.trunc(weight * (other - own) / steps) * steps
+    """Return f = e trunc(w (h_j - h_i) / e) with w = 2 epsilon A_ij, towards zero; -f at the other end.
+
+    w and the product w (h_j - h_i) are float32: another precision would give other flows by a whole step.
+    """
+    amounts = np.float32(weight) * (other - own).astype(np.float32)
+    return np.trunc(amounts.astype(np.float64) / steps) * steps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from concurrent.futures import ThreadPoolExecutor
@@ -89,7 +90,10 @@ def compare_frames(config, frames, recording=None, *, every=1, with_metrics=Fals
     """
     recording = recording or record(config, frames)
     twin = Twin(config, recording, with_metrics=with_metrics)
-    session = Session(config, sources_of(config, frames), ThreadPoolExecutor(1))
+    # Resolved configurations hold the sensor model of the run's quantum.
+    session = Session(
+        dataclasses.replace(config, sensor=config.effective_sensor), sources_of(config, frames), ThreadPoolExecutor(1)
+    )
     outcome = Outcome()
     was_settling = False
     for expected, tick in itertools.zip_longest(twin.ticks(), session.ticks()):
@@ -140,6 +144,7 @@ def _compare_metrics(expected, metrics, peak_all):
     """Compare the metrics of a tick; labels may differ only where two log-odds are nearly equal."""
     theirs = expected.metrics
     rounding = 1e-10 * peak_all
+    assert metrics.total_distance_published == pytest.approx(theirs.total_distance_published, rel=1e-3, abs=rounding)
     assert metrics.total_distance == pytest.approx(theirs.total_distance, rel=1e-3, abs=rounding)
     assert metrics.total_distance_all == pytest.approx(theirs.total_distance_all, rel=1e-3, abs=rounding)
     assert metrics.distance_per_cell_and_link == pytest.approx(

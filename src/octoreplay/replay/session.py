@@ -133,9 +133,12 @@ class Session:
         self.is_symmetric &= graph.is_symmetric
         published = self._publish(graph, number, stamp_ns)
         receipts = self._deliver(graph, stamp_ns)
+        published_distance = self._measurer.published_distance(number, self.team, graph)
         max_change = self._iterate(graph, phase, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
-        metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
+        metrics = self._measurer.measure(
+            number, stamp_ns, self.team, graph, traffic, published_distance, max_change, settling=settling
+        )
         if self.joining is not None:
             metrics = dataclasses.replace(metrics, places=self.joining.frames.places)
             if not settling:

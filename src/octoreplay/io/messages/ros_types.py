@@ -117,7 +117,8 @@ octoreplay_msgs/RobotFrame[] robots
 std_msgs/Header header
 uint32 tick
 bool settling
-# Phi: over the tick's links; over all pairs of robots.
+# Phi: over the tick's links, of the maps as published and after the iterations; over all pairs of robots.
+float64 total_distance_published
 float64 total_distance
 float64 total_distance_all
 float64 distance_per_leaf
@@ -139,6 +140,17 @@ def typestore() -> Typestore:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, definition in {**VISION_MSGS, **OCTOREPLAY_MSGS}.items():
         store.register(get_types_from_msg(definition, name))
+    return store
+
+
+@cache
+def typestore_of(type_name: str, definition: str) -> Typestore:
+    """Return the types of a message as a file defines them, which may be an older version of octoreplay's messages.
+
+    ``definition`` is the text of a ros2msg schema with all types that it needs.
+    """
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(definition, type_name))
     return store
 
 

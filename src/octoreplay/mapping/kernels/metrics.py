@@ -223,7 +223,7 @@ def _link_distance(bricks, link_ends, square):
 
 @kernel
 def compare_maps(
-    table, link_ends, prior, tie_share, least_tie, oracle_tie, num_classes, scratch, int_scratch, places, distances,
+    table, link_ends, prior, tie_share, least_tie, num_classes, scratch, int_scratch, places, distances,
     counts, entropies,
 ):  # fmt: skip
     """Contribution of each brick to the metrics.
@@ -234,7 +234,7 @@ def compare_maps(
     - ``link_ends`` (L, 2) int64: robot indices.
     - ``prior``: float32 log-odds h_0.
     - ``tie_share``: float32, tolerance of ties as a share of a cell's largest |log-odds|.
-    - ``least_tie``, ``oracle_tie``: float32, least tolerances in a robot's map and in the oracle.
+    - ``least_tie``: float32, least tolerance of ties.
     - ``num_classes``: C.
     - ``scratch`` float32: room for N + 1 bricks of all classes and 6 + N of one class.
     - ``int_scratch`` (3 + N, 64) int32.
@@ -272,7 +272,7 @@ def compare_maps(
         for k in range(link_ends.shape[0]):
             link_cells += count_ones(table.known[link_ends[k, 0], b] | table.known[link_ends[k, 1], b])
         oracle = bricks[robots]
-        _label_cells(oracle, oracle, prior, tie_share, oracle_tie, labels[0], oracle_best, oracle_there, oracle_tied)
+        _label_cells(oracle, oracle, prior, tie_share, least_tie, labels[0], oracle_best, oracle_there, oracle_tied)
         num_occupied = np.int32(0)
         for i in range(BRICK_CELLS):
             in_any = np.int32(anyone >> np.uint64(i) & np.uint64(1))
