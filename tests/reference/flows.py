@@ -12,7 +12,25 @@ from octoreplay.records import Float64Array
 BITS_PER_SETTLING_TICK = 2
 """Growth of flow_bits in every settling tick."""
 EXTRA_SETTLING_TICKS = 8
-"""Addition to the default maximum number of settling ticks."""
+"""Least addition to the default maximum number of settling ticks."""
+
+
+def num_finer_ticks(maps: Float64Array, flow_bits: int, quantum: float) -> int:
+    """Return the number of settling ticks until every step of ``maps`` (N, M, K) is the quantum; 0 without flows."""
+    largest = np.abs(maps).max(initial=0.0)
+    if not flow_bits or largest == 0.0:
+        return 0
+    num_ticks = 0
+    while flow_step(largest, flow_bits + BITS_PER_SETTLING_TICK * num_ticks) > quantum:
+        num_ticks += 1
+    return num_ticks
+
+
+def flow_step(largest: float | Float64Array, flow_bits: int) -> Float64Array:
+    """Return 2^(floor(log2 m) - flow_bits) of the largest |log-odds| m; 0 where m is 0."""
+    # m = fraction * 2^exponent with a fraction in [1/2, 1), so that floor(log2 m) is exponent - 1, exactly.
+    _, exponent = np.frexp(largest)
+    return np.where(largest > 0.0, np.ldexp(1.0, exponent - 1 - flow_bits), 0.0)
 
 
 def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: float) -> Float64Array:
@@ -21,10 +39,7 @@ def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: 
     It is ``quantum`` where both maps are 0.
     """
     largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1, keepdims=True)
-    # largest = fraction * 2^exponent with a fraction in [1/2, 1), so that floor(log2 m) is exponent - 1, exactly.
-    _, exponent = np.frexp(largest)
-    steps = np.ldexp(1.0, exponent - 1 - flow_bits)
-    return np.where(largest > 0.0, np.maximum(steps, quantum), quantum)
+    return np.maximum(flow_step(largest, flow_bits), quantum)
 
 
 def flow(own: Float64Array, other: Float64Array, weight: float, steps: Float64Array) -> Float64Array:

@@ -182,7 +182,6 @@ class Twin:
         self.anchors = [Anchor((num_cells, num_columns), anchor_after) for _ in self.robot_ids]
         self.num_iterations = [0] * self.num_robots
         self.num_integrated = 0
-        self.coarsest_step = 0.0
 
     # --- time --------------------------------------------------------------------------------------------------------
 
@@ -213,10 +212,11 @@ class Twin:
         if consensus.settle == 0:
             self.stop_reason = STOPPED_OFF
             return
+        num_finer = flows.num_finer_ticks(self.maps, self.flow_bits, self.quantum)
         most = consensus.settle_max
         if most is None:
             most = graph.default_settle_max(consensus.settle, graph.second_eigenvalue(team))
-            most += flows.EXTRA_SETTLING_TICKS if self.flow_bits else 0
+            most += max(flows.EXTRA_SETTLING_TICKS, num_finer) if self.flow_bits else 0
         # Every flow is at least the quantum, so that no flow is below this tolerance.
         tolerance = min(consensus.settle_tolerance, self.quantum) if self.flow_bits else consensus.settle_tolerance
         for settling_tick in range(1, most + 1):
@@ -224,12 +224,13 @@ class Twin:
             before = self.maps.copy()
             stage = Stage(
                 gamma_factor=rules.settling_ramp(settling_tick, consensus.settle),
-                flow_bits=self.flow_bits and self.flow_bits + flows.BITS_PER_SETTLING_TICK * settling_tick,
+                flow_bits=self.flow_bits
+                and self.flow_bits + flows.BITS_PER_SETTLING_TICK * min(settling_tick, num_finer),
                 settling=True,
             )
             yield self._tick(tick, active, team, stage)
             is_at_rest = np.abs(self.maps - before).max(initial=0.0) < tolerance
-            if is_at_rest and self.coarsest_step <= self.quantum:
+            if is_at_rest and settling_tick >= num_finer:
                 self.stop_reason = STOPPED_CONVERGED
                 return
         self.stop_reason = STOPPED_MAX
@@ -239,7 +240,6 @@ class Twin:
     def _tick(self, tick: int, active: tuple[bool, ...], team: TeamGraph, stage: Stage) -> TwinTick:
         """Publish, deliver, iterate and measure; scans before the tick are already integrated."""
         exchange = self._exchange(tick, active, team)
-        self.coarsest_step = 0.0
         for robot in range(self.num_robots):
             arrived = frozenset(exchange.senders(robot))
             self.anchors[robot].update(self._due(tick), arrived, self.maps[robot], self.log_q_used[robot])
@@ -376,9 +376,8 @@ class Twin:
         return rules.mix(current, differences, team.epsilon) + amounts
 
     def _flow(self, own: Float64Array, other: Float64Array, weight: float, stage: Stage) -> Float64Array:
-        """Return the flow from a neighbour, and note the largest step."""
+        """Return the flow from a neighbour."""
         steps = flows.flow_steps(own, other, stage.flow_bits, self.quantum)
-        self.coarsest_step = max(self.coarsest_step, float(steps.max(initial=0.0)))
         return flows.flow(own, other, weight, steps)
 
     def _base(self, own: Float64Array) -> Float64Array:

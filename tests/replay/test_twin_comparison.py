@@ -115,12 +115,14 @@ def _scans_of_the_tick_come_late(monkeypatch):
 def _hits_add_too_little(monkeypatch):
     right = robot_module.clamped_increments
     monkeypatch.setattr(
-        robot_module, "clamped_increments", lambda config: dataclasses.replace(right(config), hit=config.hit - 0.01)
+        robot_module,
+        "clamped_increments",
+        lambda sensor, quantum: dataclasses.replace(right(sensor, quantum), hit=sensor.hit - 0.01),
     )
 
 
 def _clamping_is_forgotten(monkeypatch):
-    monkeypatch.setattr(robot_module, "clamped_increments", sensor.unclamped_increments)
+    monkeypatch.setattr(robot_module, "clamped_increments", lambda model, quantum: sensor.unclamped_increments(model))
 
 
 def _half_a_step(monkeypatch):

@@ -119,7 +119,8 @@ class Session:
         if self.config.consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
-        settling = Settling(self._graph, self.config, self._links.longest_transmission)
+        largest = max(robot.largest_log_odds() for robot in self.team.robots)
+        settling = Settling(self._graph, self.config, self._links.longest_transmission, largest)
         for phase in settling.phases():
             tick = self._exchange(number, start_ns + number * self._period_ns, phase)
             settling.note(tick.metrics.max_change)

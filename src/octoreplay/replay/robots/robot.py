@@ -247,6 +247,10 @@ class Robot(ABC):
 
     # --- iterations ---------------------------------------------------------------------------------------------------
 
+    def largest_log_odds(self) -> float:
+        """Largest |log-odds| of the map, relative to the prior."""
+        return self._change_since(SemanticOctree(self.map.resolution, self.map.num_classes), 0)
+
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """Largest change of a log-odds since the map was ``before``; overwrites ``before``."""
         return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
