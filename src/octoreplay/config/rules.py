@@ -45,7 +45,7 @@ class Rule:
     mixes_differences : bool
         True where neighbours' maps enter as differences h_j - h_i, False where they are added whole.
     needs_symmetric_links : bool
-        True where the team's sum is kept only if both ends of a link exchange maps in every tick.
+        True where the team's sum is kept only if both ends of a link receive a map in the same tick.
     keeps_last_evidence : bool
         True where an iteration adds the change of the evidence since the last iteration.
     survives_losses : bool

@@ -46,8 +46,9 @@ class Increments:
 
     def weighted_hits(self) -> Float32Array:
         """Return ``hit`` times each confidence, (256,) float32 for 0 to 255."""
-        hits = self.hit * np.arange(256) / 255
-        return np.asarray(np.rint(hits / self.quantum) * self.quantum if self.quantum else hits, np.float32)
+        if self.quantum:
+            return np.asarray(np.rint(self.hit * np.arange(256) / 255 / self.quantum) * self.quantum, np.float32)
+        return np.float32(self.hit) * (np.arange(256, dtype=np.float32) / np.float32(255))
 
 
 def clamped_increments(sensor: SensorConfig, quantum: float = 0.0) -> Increments:

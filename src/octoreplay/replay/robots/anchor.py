@@ -52,7 +52,7 @@ class Anchor:
             return
         self._heard.update(dict.fromkeys(origins, tick))
         absent = frozenset(
-            index for index, last in self._heard.items() if num_due(self._config, index, last, tick) >= self._after
+            index for index, heard in self._heard.items() if num_due(self._config, index, heard, tick) >= self._after
         )
         if absent != self.absent:
             self.absent = absent
