@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from octoreplay.config.network import ScheduleEntry
+from octoreplay.replay.robots import consensus as consensus_module
 from support.faulty_team import configured, dense, session_of
+from support.sessions import sent_packets
 
 GROUPS = ScheduleEntry(3.0, 7.0, groups=(("robot_0", "robot_1"), ("robot_2", "robot_3")))
 QUANTUM = 2.0**-16
@@ -67,6 +71,31 @@ def test_neighbours_at_rest_differ_by_less_than_the_bound():
     assert tick.metrics.max_change == 0.0
     for i, j in tick.graph.pairs:
         assert np.abs(maps[i] - maps[j]).max() < QUANTUM / tick.graph.weights[i, j]
+
+
+@pytest.mark.parametrize("parameters", [{"topology": "ring"}, {"topology": "line", "schedule": (GROUPS,)}], ids=str)
+def test_skipping_bricks_at_rest_does_not_change_a_byte_of_the_deltas(parameters, monkeypatch):
+    config = configured(rule="bayes", packets="delta", settle=2, **parameters)
+    right, num_skipping, runs = consensus_module.team_step, 0, []
+
+    def counted(steps, **kwargs):
+        nonlocal num_skipping
+        num_skipping += sum(step.since is not None for step in steps if step.neighbours)
+        return right(steps, **kwargs)
+
+    def whole(steps, **kwargs):
+        return right([dataclasses.replace(step, since=None) for step in steps], **kwargs)
+
+    for function in (counted, whole):
+        monkeypatch.setattr(consensus_module, "team_step", function)
+        runs.append(
+            [
+                (sent_packets(tick), tick.metrics.total_distance_all, tick.metrics.max_change)
+                for tick in session_of(config).ticks()
+            ]
+        )
+    assert num_skipping > 4
+    assert runs[0] == runs[1]
 
 
 def _kept_after(cut, rule, mode, anchor_after):
