@@ -63,9 +63,8 @@ class MapComparer:
     ) -> MapComparison:
         """Return the comparison; bricks with all revisions below ``since`` are not compared again.
 
-        ``links`` are robot indices, each linked pair once. Log-odds tie with the largest of
-        their cell where they are within ``least_tie``, or the relative tolerance, of it. The result does not depend on
-        ``threads``.
+        ``links`` are robot indices, each linked pair once. Log-odds tie with the largest of their cell where they are
+        within ``least_tie``, or the relative tolerance, of it. The result does not depend on ``threads``.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
         rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]
