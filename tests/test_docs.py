@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -108,14 +109,18 @@ def test_the_page_on_experiments_has_the_tables_of_the_stored_runs(name: str) ->
 
 def traits_table() -> str:
     """Table of the rules' traits as the page on the algorithm shows it."""
-    heads = ("rule", "packets hold", "ε", "γ", "modes", "packets", "exact in spite of losses", "of restarts")
+    heads = (
+        "rule", "packets hold", "ε", "γ", "flows", "quantum", "modes", "packets", "exact in spite of losses",
+        "of restarts",
+    )  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for rule in RULES.values():
-        flags = ["yes" if flag else "" for flag in (rule.has_step_size, rule.has_gamma)]
+        flags = ["yes" if flag else "" for flag in (rule.has_step_size, rule.has_gamma, rule.has_flows)]
+        quantum = f"2^{math.frexp(rule.default_quantum)[1] - 1}" if rule.default_quantum else ""
         exact = ["yes" if flag else "no" for flag in (rule.survives_losses, rule.survives_restarts)]
         sends = rule.exchanges is not Exchanged.NOTHING
         cells = [
-            f"`{rule.name}`", rule.exchanges.value, *flags, ", ".join(f"`{mode}`" for mode in rule.modes),
+            f"`{rule.name}`", rule.exchanges.value, *flags, quantum, ", ".join(f"`{mode}`" for mode in rule.modes),
             ", ".join(f"`{kind}`" for kind in rule.packets) if sends else "", *(exact if sends else ("", "")),
         ]  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |"))

@@ -6,8 +6,8 @@ import numpy as np
 
 from octoreplay.records import FloatArray, UInt8Array
 
-TIE_TOLERANCE = 1e-3
-"""A label agrees with a reference where the reference's log-odds of the label are this close to its largest."""
+TIE_TOLERANCE = 1e-4
+"""Log-odds within this share of the cell's largest |log-odds| of the maximum tie with it."""
 
 
 def class_probabilities(log_odds: FloatArray) -> FloatArray:

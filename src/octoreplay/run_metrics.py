@@ -152,14 +152,16 @@ class FramePlace:
 class TickMetrics(PairTotals):
     """Metrics of the team after one tick; docs/metrics.md defines them.
 
-    ``pairs`` are the pairs of robots that share known cells, in the robots' order. They are empty in results that were
-    written before the contradiction of evidence was measured. ``places`` are the frames of all robots where they find
-    them during the run, else empty.
+    ``total_distance_published`` is NaN in results that were written before it was measured. ``pairs`` are the pairs of
+    robots that share known cells, in the robots' order; they are empty in results that were written before the
+    contradiction of evidence was measured. ``places`` are the frames of all robots where they find them during the run,
+    else empty.
     """
 
     tick: int
     stamp_ns: int
     settling: bool
+    total_distance_published: float
     total_distance: float
     total_distance_all: float
     distance_per_leaf: float

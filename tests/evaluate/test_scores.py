@@ -110,10 +110,11 @@ def test_agreement_equals_that_over_cells(scene, prior):
 
 def test_a_tie_in_the_reference_is_agreement():
     here = octree_of({(0, 0, 0): (1.0, 2.0), (1, 0, 0): FREE})
-    there = octree_of({(0, 0, 0): (2.0, 1.9995), (1, 0, 0): (0.0005, 0.0)})
-    assert agreement(here.spans(), 0.0, there.spans(), 0.0, 2) == (1.0, 1.0)
-    there = octree_of({(0, 0, 0): (2.0, 1.99), (1, 0, 0): (0.01, 0.0)})
-    assert agreement(here.spans(), 0.0, there.spans(), 0.0, 2) == (0.0, 0.0)
+    for scale in (1.0, 0.01):
+        tied = {(0, 0, 0): (2.0 * scale, 1.99985 * scale), (1, 0, 0): (0.00015 * scale, -2.0 * scale)}
+        assert agreement(here.spans(), 0.0, octree_of(tied).spans(), 0.0, 2) == (1.0, 1.0)
+        apart = {(0, 0, 0): (2.0 * scale, 1.99975 * scale), (1, 0, 0): (0.00025 * scale, -2.0 * scale)}
+        assert agreement(here.spans(), 0.0, octree_of(apart).spans(), 0.0, 2) == (0.0, 0.0)
 
 
 def test_a_perfect_map_scores_one():

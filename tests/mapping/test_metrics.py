@@ -55,12 +55,25 @@ def test_agreement_by_hand():
     assert found.label_disagreement == 0.5
 
 
-@pytest.mark.parametrize(("margin", "agrees"), [(0.0, True), (0.0009, True), (0.0011, False)])
-def test_labels_within_the_tie_tolerance_of_the_oracle_agree(margin, agrees):
-    found = _compare([{(0, 0, 0): [0.0, 1.0]}], {(0, 0, 0): [1.0 + margin, 1.0]}, links=[])
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
+@pytest.mark.parametrize(("margin", "agrees"), [(0.0, True), (0.00009, True), (0.00011, False)])
+def test_labels_within_the_tie_tolerance_of_the_oracle_agree(margin, agrees, scale):
+    found = _compare([{(0, 0, 0): [0.0, 1.0]}], {(0, 0, 0): [scale, scale * (1.0 - margin)]}, links=[])
     assert found.agreement.tolist() == found.agreement_occupied.tolist() == [float(agrees)]
-    found = _compare([{(0, 0, 0): [-1.0, -1.0]}], {(0, 0, 0): [margin, -1.0]}, links=[])
+    found = _compare([{(0, 0, 0): [-1.0, -1.0]}], {(0, 0, 0): [scale * margin, -scale]}, links=[])
     assert found.agreement.tolist() == [float(agrees)]
+
+
+@pytest.mark.parametrize(("least_tie", "agrees"), [(0.0, False), (0.019, False), (0.021, True)])
+def test_ties_have_a_least_tolerance(least_tie, agrees):
+    maps, oracle = [{(0, 0, 0): [0.0, 1.0]}, {(0, 0, 0): [1.02, 1.0]}], {(0, 0, 0): [1.02, 1.0]}
+    octrees = [octree_of(cells) for cells in maps]
+    comparer = MapComparer(2, 0.0)
+    comparer.compare(octrees, octree_of(oracle), [(0, 1)], 0)
+    # Another tolerance compares unchanged bricks again.
+    found = comparer.compare(octrees, octree_of(oracle), [(0, 1)], 9, least_tie=least_tie)
+    assert found.agreement.tolist() == [float(agrees), 1.0]
+    assert found.label_disagreement == float(not agrees)
 
 
 def test_ties_of_a_map_go_to_free_and_then_to_the_lower_class():
@@ -84,7 +97,7 @@ def test_metrics_of_log_odds_of_any_magnitude(magnitude, prior):
     cells = {(i, 0, 0): row.tolist() for i, row in enumerate(values)} | {(9, 0, 0): [-magnitude] * 2}
     maps = [cells, {(2, 0, 0): [magnitude, 0.0]}, EMPTY]
     found = _compare(maps, cells, [(0, 1), (1, 2)], prior)
-    expected = team_metrics(*_dense(maps, cells, prior), [(0, 1), (1, 2)], 0.0)
+    expected = _reference(maps, cells, prior, [(0, 1), (1, 2)])
     assert found.total_distance == pytest.approx(expected.total_distance, rel=1e-5)
     assert found.total_distance_all == pytest.approx(expected.total_distance_all, rel=1e-5)
     assert found.entropy_bits.tolist() == pytest.approx(expected.entropy_bits, rel=1e-5, abs=1e-6)
@@ -134,6 +147,12 @@ def _dense(maps, oracle, prior):
     return dense[:-1], known, dense[-1]
 
 
+def _reference(maps, oracle, prior, links):
+    """Metrics of the reference."""
+    dense, known, of_oracle = _dense(maps, oracle, prior)
+    return team_metrics(dense, known, of_oracle, links, 0.0, published=dense, least_tolerance=0.0)
+
+
 @examples(40)
 @given(seed=st.integers(0, 10_000), prior=st.sampled_from([0.0, -1.2]))
 def test_random_maps_against_the_reference(seed, prior):
@@ -142,7 +161,7 @@ def test_random_maps_against_the_reference(seed, prior):
     oracle = {key: np.sum([cells.get(key, np.zeros(2)) for cells in maps], axis=0) for key in set().union(*maps)}
     links = [pair for pair in itertools.combinations(range(len(maps)), 2) if rng.random() < 0.6]
     found = _compare(maps, oracle, links, prior)
-    expected = team_metrics(*_dense(maps, oracle, prior), links, 0.0)
+    expected = _reference(maps, oracle, prior, links)
     assert found.total_distance == pytest.approx(expected.total_distance, rel=1e-5)
     assert found.total_distance_all == pytest.approx(expected.total_distance_all, rel=1e-5, abs=1e-9)
     assert found.num_known_cells == expected.num_known_cells

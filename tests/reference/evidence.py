@@ -9,6 +9,7 @@ import numpy as np
 
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.records import Float64Array, Int64Array
+from reference.rules import rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +25,13 @@ class IndexedScan:
 
 
 class Evidence:
-    """Clamped and unclamped sums of one robot's increments, (M, K) with column 0 zero, and numbers of scans."""
+    """Clamped and unclamped sums of one robot's increments, (M, K) with column 0 zero, and numbers of scans.
 
-    def __init__(self, num_cells: int, num_classes: int) -> None:
+    With a ``quantum`` above 0 the sums are multiples of it, if the sensor model's numbers are.
+    """
+
+    def __init__(self, num_cells: int, num_classes: int, quantum: float = 0.0) -> None:
+        self.quantum = quantum
         self.clamped: Float64Array = np.zeros((num_cells, num_classes + 1))
         self.total: Float64Array = np.zeros((num_cells, num_classes + 1))
         self.num_touching_scans: Int64Array = np.zeros(num_cells, dtype=np.int64)
@@ -35,7 +40,7 @@ class Evidence:
     def integrate(self, scan: IndexedScan, sensor: SensorConfig) -> None:
         """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells.
 
-        ``hit`` is multiplied by strength / 255.
+        ``hit`` is multiplied by strength / 255, and the product rounded to the quantum.
         """
         for cells, increments in self._increments(scan, sensor):
             self.total[cells] += increments
@@ -48,7 +53,8 @@ class Evidence:
         num_columns = self.clamped.shape[1]
         freed = np.full((len(scan.freed), num_columns), sensor.miss)
         hit = np.full((len(scan.hit), num_columns), sensor.miss if sensor.hit_other is None else sensor.hit_other)
-        hit[np.arange(len(scan.hit)), scan.hit_classes] = sensor.hit * scan.hit_strengths / 255
+        strongest = rounded(sensor.hit * scan.hit_strengths / 255, self.quantum)
+        hit[np.arange(len(scan.hit)), scan.hit_classes] = strongest
         for cells, increments in ((scan.freed, freed), (scan.hit, hit)):
             increments[:, 0] = 0.0
             yield cells, increments

@@ -44,6 +44,11 @@ class TeamGraph:
         """Return the receivers of the robot's outgoing links, in the team's order."""
         return sorted(receiver for sender, receiver in self.directed if sender == robot)
 
+    @property
+    def least_weight(self) -> float:
+        """Smallest weight of a link that is above 0; infinite without links."""
+        return float(self.weights[self.weights > 0.0].min(initial=math.inf))
+
     def degree(self, robot: int) -> int:
         """Return the number of the robot's incoming links."""
         return len(self.neighbours(robot))

@@ -44,16 +44,21 @@ def natural_step(mixed: Float64Array, log_likelihood: Float64Array, gamma: float
     return free_is_zero(mixed + gamma * (log_likelihood - mixed))
 
 
-def bayes_step(mixed: Float64Array, now: Float64Array, at_last_iteration: Float64Array) -> Float64Array:
-    """Return h~ + (s now - s at the last iteration)."""
-    return free_is_zero(mixed + (now - at_last_iteration))
+def with_evidence(log_odds: Float64Array, now: Float64Array, before: Float64Array) -> Float64Array:
+    """Return h + (s now - s before)."""
+    return free_is_zero(log_odds + (now - before))
 
 
 def merge_step(
     mixed: Float64Array, now: Float64Array, at_last_iteration: Float64Array, clamp_min: float, clamp_max: float
 ) -> Float64Array:
     """Return h~ + (s now - s at the last iteration), clamped; h~ = h_i + 2 epsilon sum_j A_ij h_j."""
-    return np.clip(bayes_step(mixed, now, at_last_iteration), clamp_min, clamp_max)
+    return np.clip(with_evidence(mixed, now, at_last_iteration), clamp_min, clamp_max)
+
+
+def rounded(log_odds: Float64Array, quantum: float) -> Float64Array:
+    """Return the nearest multiples of ``quantum``, ties to even; unchanged for 0."""
+    return np.rint(log_odds / quantum) * quantum if quantum else log_odds
 
 
 def free_is_zero(log_odds: Float64Array) -> Float64Array:

@@ -84,7 +84,8 @@ class Scenario:
         network_names = {field.name for field in dataclasses.fields(NetworkConfig)}
         network = {name: parameters.pop(name) for name in list(parameters) if name in network_names}
         config = self.base_config.with_parameters(parameters)
-        return dataclasses.replace(config, network=dataclasses.replace(config.network, edges=edges, **network))
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, edges=edges, **network))
+        return dataclasses.replace(config, sensor=config.effective_sensor)
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,10 +74,10 @@ def test_mix_by_hand():
     assert rules.mix(own, [], 0.5).tolist() == own.tolist()
 
 
-def test_natural_and_bayes_steps_by_hand():
+def test_natural_step_and_evidence_by_hand():
     mixed, log_q = np.array([[0.0, 1.0]]), np.array([[0.0, 3.0]])
     assert rules.natural_step(mixed, log_q, 0.25).tolist() == [[0.0, 1.5]]
-    assert rules.bayes_step(mixed, log_q, np.array([[0.0, 2.5]])).tolist() == [[0.0, 1.5]]
+    assert rules.with_evidence(mixed, log_q, np.array([[0.0, 2.5]])).tolist() == [[0.0, 1.5]]
 
 
 @pytest.mark.parametrize("step", [rules.gradient_step, rules.natural_step])
@@ -93,9 +93,15 @@ def test_unobserved_cells_keep_the_prior_under_every_rule():
     for result in (
         rules.gradient_step(mixed, nothing, 0.5),
         rules.natural_step(mixed, nothing, 0.5),
-        rules.bayes_step(mixed, nothing, nothing),
+        rules.with_evidence(mixed, nothing, nothing),
     ):
         assert not result.any()
+
+
+def test_rounding_to_the_nearest_multiple():
+    values = np.array([[0.0, 0.24, 0.26, -0.74, 0.75, 1.25]])
+    assert rules.rounded(values, 0.5).tolist() == [[0.0, 0.0, 0.5, -0.5, 1.0, 1.0]]
+    assert rules.rounded(values, 0.0).tolist() == values.tolist()
 
 
 def test_gamma_schedule_by_hand():

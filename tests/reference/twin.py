@@ -20,9 +20,10 @@ import numpy as np
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.records import BoolArray, Float64Array, Frame, Int64Array
-from reference import graph, rules
+from reference import flows, graph, rules
+from reference.anchors import Anchor
 from reference.evidence import Evidence, IndexedScan
-from reference.graph import TeamGraph
+from reference.graph import Link, TeamGraph
 from reference.metrics import TwinMetrics, team_metrics
 from reference.sensor import ScanUpdate, scan_update
 
@@ -71,6 +72,33 @@ class TwinTick:
         """Return one robot's log-odds (M, C) of the classes 1..C, including the prior."""
         absolute: Float64Array = self.maps[robot][:, 1:] + self.prior
         return absolute
+
+
+@dataclass(frozen=True, eq=False)
+class Exchange:
+    """Maps of a tick: published maps (N, M, K) and their cells (N, M), and the arrivals as (sender, receiver)."""
+
+    team: TeamGraph
+    published: Float64Array
+    known: BoolArray
+    arrivals: frozenset[Link]
+
+    def senders(self, receiver: int) -> list[int]:
+        """Return the robots whose maps arrived, in the team's order."""
+        return sorted(j for j, i in self.arrivals if i == receiver)
+
+    def is_mutual(self, i: int, j: int) -> bool:
+        """Return whether the maps of both robots arrived at the other one."""
+        return {(i, j), (j, i)} <= self.arrivals
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Parameters of a tick that change while settling; ``flow_bits`` 0: no flows."""
+
+    gamma_factor: float
+    flow_bits: int
+    settling: bool
 
 
 def record(config: RunConfig, frames: Sequence[Frame]) -> Recording:
@@ -126,6 +154,8 @@ class Twin:
         """Raise ConfigError where epsilon is above the bound of the graph of the whole team."""
         if config.map.prune_tolerance != 0.0:
             raise ConfigError("prune_tolerance: the reference is lossless")
+        if any(entry.forget for entry in config.network.schedule):
+            raise ConfigError("schedule: the reference has no robots that forget")
         self.config = config
         self.recording = recording
         self.with_metrics = with_metrics
@@ -134,15 +164,22 @@ class Twin:
         self.robot_ids = [robot.robot_id for robot in config.robots]
         self.num_robots = len(self.robot_ids)
         self.prior = config.map.prior(recording.num_classes)
-        self._graph_of(tuple([True] * self.num_robots))
+        self.sensor = config.effective_sensor
+        self.quantum = config.consensus.effective_quantum
+        self.flow_bits = config.consensus.effective_flow_bits
+        self._graph_of(tuple([True] * self.num_robots), self.start_ns)
+        self.scans = [scan for scan in recording.scans if not self._is_off(scan.robot, scan.stamp_ns)]
+        self.stamps = [[scan.stamp_ns for scan in self.scans if scan.robot == i] for i in range(self.num_robots)]
 
         num_cells, num_columns = len(recording.keys), recording.num_classes + 1
-        self.sums = [Evidence(num_cells, recording.num_classes) for _ in self.robot_ids]
+        self.sums = [Evidence(num_cells, recording.num_classes, self.quantum) for _ in self.robot_ids]
         self.log_q: Float64Array = np.zeros((self.num_robots, num_cells, num_columns))
         self.log_q_used = self.log_q.copy()
         self.touched: BoolArray = np.zeros((self.num_robots, num_cells), dtype=bool)
         self.maps = self.log_q.copy()
         self.known = self.touched.copy()
+        anchor_after = config.consensus.anchor_after if config.consensus.rule in ("gradient", "natural") else 0
+        self.anchors = [Anchor((num_cells, num_columns), anchor_after) for _ in self.robot_ids]
         self.num_iterations = [0] * self.num_robots
         self.num_integrated = 0
 
@@ -160,55 +197,59 @@ class Twin:
 
     def ticks(self) -> Iterator[TwinTick]:
         """Yield the team after every tick, including settling; ``stop_reason`` is set at the end."""
+        stage = Stage(gamma_factor=1.0, flow_bits=self.flow_bits, settling=False)
         for tick in range(self.num_log_ticks):
             stamp_ns = self.start_ns + tick * self.period_ns
             self._integrate_before(stamp_ns)
             active = self._active_at(stamp_ns)
-            team = self._graph_of(active)
-            yield self._tick(tick, active, team, gamma_factor=1.0, settling=False)
+            team = self._graph_of(active, stamp_ns)
+            yield self._tick(tick, active, team, stage)
         yield from self._settle(active, team)
 
     def _settle(self, active: tuple[bool, ...], team: TeamGraph) -> Iterator[TwinTick]:
-        """Yield ticks on the last graph with decreasing gamma until nothing changes."""
+        """Yield ticks on the last graph with decreasing gamma and growing flow_bits until nothing changes."""
         consensus = self.config.consensus
         if consensus.settle == 0:
             self.stop_reason = STOPPED_OFF
             return
+        num_finer = flows.num_finer_ticks(self.maps, self.flow_bits, self.quantum)
         most = consensus.settle_max
         if most is None:
             most = graph.default_settle_max(consensus.settle, graph.second_eigenvalue(team))
+            most += max(flows.EXTRA_SETTLING_TICKS, num_finer) if self.flow_bits else 0
+        # Every flow is at least the quantum, so that no flow is below this tolerance.
+        tolerance = min(consensus.settle_tolerance, self.quantum) if self.flow_bits else consensus.settle_tolerance
         for settling_tick in range(1, most + 1):
             tick = self.num_log_ticks - 1 + settling_tick
             before = self.maps.copy()
-            factor = rules.settling_ramp(settling_tick, consensus.settle)
-            yield self._tick(tick, active, team, gamma_factor=factor, settling=True)
-            if np.abs(self.maps - before).max(initial=0.0) < consensus.settle_tolerance:
+            stage = Stage(
+                gamma_factor=rules.settling_ramp(settling_tick, consensus.settle),
+                flow_bits=self.flow_bits
+                and self.flow_bits + flows.BITS_PER_SETTLING_TICK * min(settling_tick, num_finer),
+                settling=True,
+            )
+            yield self._tick(tick, active, team, stage)
+            is_at_rest = np.abs(self.maps - before).max(initial=0.0) < tolerance
+            if is_at_rest and settling_tick >= num_finer:
                 self.stop_reason = STOPPED_CONVERGED
                 return
         self.stop_reason = STOPPED_MAX
 
     # --- one tick ----------------------------------------------------------------------------------------------------
 
-    def _tick(
-        self, tick: int, active: tuple[bool, ...], team: TeamGraph, *, gamma_factor: float, settling: bool
-    ) -> TwinTick:
+    def _tick(self, tick: int, active: tuple[bool, ...], team: TeamGraph, stage: Stage) -> TwinTick:
         """Publish, deliver, iterate and measure; scans before the tick are already integrated."""
-        before = self.maps.copy()
-        published, published_known = before, self.known.copy()
+        exchange = self._exchange(tick, active, team)
         for robot in range(self.num_robots):
+            arrived = frozenset(exchange.senders(robot))
+            self.anchors[robot].update(self._due(tick), arrived, self.maps[robot], self.log_q_used[robot])
             if active[robot]:
-                self._iterate_robot(robot, team, published, published_known, gamma_factor)
-        change = float(np.abs(self.maps - before).max(initial=0.0))
+                self._iterate_robot(robot, exchange, stage)
         oracle = self.log_q.sum(axis=0)
-        metrics = None
-        if self.with_metrics:
-            metrics = team_metrics(
-                self._with_prior(self.maps), self.known, self._with_prior(oracle), team.links, change
-            )
         return TwinTick(
             tick=tick,
             stamp_ns=self.start_ns + tick * self.period_ns,
-            settling=settling,
+            settling=stage.settling,
             active=active,
             links=team.links,
             num_scans=tuple(sums.num_scans for sums in self.sums),
@@ -218,88 +259,149 @@ class Twin:
             known=self.known.copy(),
             evidence=self.log_q.copy(),
             oracle=oracle,
-            metrics=metrics,
+            metrics=self._metrics(exchange, oracle) if self.with_metrics else None,
         )
 
+    def _metrics(self, exchange: Exchange, oracle: Float64Array) -> TwinMetrics:
+        """Return the metrics of the maps after the iterations."""
+        team = exchange.team
+        least_tolerance = 0.0
+        if self.flow_bits:
+            least_tolerance = self.num_robots * self.quantum / (2.0 * team.epsilon * team.least_weight)
+        return team_metrics(
+            self._with_prior(self.maps),
+            self.known,
+            self._with_prior(oracle),
+            team.links,
+            float(np.abs(self.maps - exchange.published).max(initial=0.0)),
+            published=self._with_prior(exchange.published),
+            least_tolerance=least_tolerance,
+        )
+
+    def _exchange(self, tick: int, active: tuple[bool, ...], team: TeamGraph) -> Exchange:
+        """Return the published maps, and the arrivals from active robots that are due."""
+        due = self._due(tick)
+        exchanges = self.config.consensus.rule != "local"
+        arrivals = frozenset((j, i) for j, i in team.directed if exchanges and j in due and active[j] and active[i])
+        return Exchange(team, self.maps.copy(), self.known.copy(), arrivals)
+
+    def _due(self, tick: int) -> frozenset[int]:
+        """Return the robots that publish in a tick by their own periods and phases."""
+        due = []
+        for index, robot in enumerate(self.config.robots):
+            period = round((robot.publish_period or self.period_ns * 1e-9) * 1e9 / self.period_ns)
+            phase = round(robot.publish_phase * 1e9 / self.period_ns)
+            if (tick - phase) % period == 0:
+                due.append(index)
+        return frozenset(due)
+
     def _integrate_before(self, stamp_ns: int) -> None:
-        """Integrate the remaining scans with stamps before ``stamp_ns``, in order of (stamp, robot)."""
+        """Integrate the remaining scans with stamps before ``stamp_ns``, in order of (stamp, robot).
+
+        With rule 'bayes' every robot's new evidence enters its map, active or not.
+        """
         changed = set()
-        scans = self.recording.scans
-        while self.num_integrated < len(scans) and scans[self.num_integrated].stamp_ns < stamp_ns:
-            scan = scans[self.num_integrated]
-            self.sums[scan.robot].integrate(scan, self.config.sensor)
+        while self.num_integrated < len(self.scans) and self.scans[self.num_integrated].stamp_ns < stamp_ns:
+            scan = self.scans[self.num_integrated]
+            self.sums[scan.robot].integrate(scan, self.sensor)
             self.touched[scan.robot, scan.freed] = True
             self.touched[scan.robot, scan.hit] = True
             changed.add(scan.robot)
             self.num_integrated += 1
         for robot in changed:
             self.log_q[robot] = self.sums[robot].log_likelihood(self.config.consensus.evidence)
+            if self.config.consensus.rule == "bayes":
+                self._add_evidence(robot)
+
+    def _add_evidence(self, robot: int) -> None:
+        """Add the change of a robot's evidence to its map, and its cells."""
+        self.maps[robot] = rules.with_evidence(self.maps[robot], self.log_q[robot], self.log_q_used[robot])
+        self.known[robot] |= self.touched[robot]
+        self.log_q_used[robot] = self.log_q[robot]
 
     def _active_at(self, stamp_ns: int) -> tuple[bool, ...]:
-        """Return which robots are active: from the first tick after their first scan.
+        """Return which robots are active: from the first tick after their first scan, while the schedule has them on.
 
         With after_end 'leave', they are active up to and including the first tick after their last scan.
         """
         active = []
-        for robot in range(self.num_robots):
-            stamps = [scan.stamp_ns for scan in self.recording.scans if scan.robot == robot]
+        for robot, stamps in enumerate(self.stamps):
             begun = bool(stamps) and stamps[0] < stamp_ns
             left = self.config.network.after_end == "leave" and begun and stamps[-1] < stamp_ns - self.period_ns
-            active.append(begun and not left)
+            active.append(begun and not left and not self._is_off(robot, stamp_ns))
         return tuple(active)
 
-    def _graph_of(self, active: tuple[bool, ...]) -> TeamGraph:
-        """Return the weighted graph of the active robots."""
-        return graph.team_graph(self.config.network, self.config.consensus, self.robot_ids, active)
+    def _is_off(self, robot: int, stamp_ns: int) -> bool:
+        """Return whether the schedule turns a robot off at a time."""
+        elapsed_s = (stamp_ns - self.start_ns) * 1e-9
+        return any(
+            self.robot_ids[robot] in entry.robots_off and entry.start <= elapsed_s < entry.end
+            for entry in self.config.network.schedule
+        )
 
-    def _iterate_robot(
-        self,
-        robot: int,
-        team: TeamGraph,
-        published: Float64Array,
-        published_known: BoolArray,
-        gamma_factor: float,
-    ) -> None:
-        """Run all iterations of one robot in a tick, with the maps that its neighbours published in the tick."""
+    def _graph_of(self, active: tuple[bool, ...], stamp_ns: int) -> TeamGraph:
+        """Return the weighted graph of the active robots at a time of the schedule."""
+        elapsed_s = (stamp_ns - self.start_ns) * 1e-9
+        return graph.team_graph(self.config.network, self.config.consensus, self.robot_ids, active, elapsed_s)
+
+    def _iterate_robot(self, robot: int, exchange: Exchange, stage: Stage) -> None:
+        """Run all iterations of one robot in a tick: one with all maps that arrived, or one for each."""
         consensus = self.config.consensus
-        senders = [] if consensus.rule == "local" else team.neighbours(robot)
+        senders = exchange.senders(robot)
+        gamma_factor = stage.gamma_factor
         if consensus.mode == "sync" or not senders:
-            base = self._base(published[robot])
-            differences = [(team.weights[robot, j], published[j] - base) for j in senders]
-            self._iterate(robot, differences, team.epsilon, gamma_factor)
+            self._iterate(robot, senders, exchange, stage, gamma_factor)
         else:
-            per_arrival = gamma_factor / len(senders) if consensus.gamma_per_arrival == "divided" else gamma_factor
+            if consensus.gamma_per_arrival == "divided":
+                gamma_factor /= len(senders)
             for j in senders:
-                # 'bayes' conserves the sum over robots only if both ends of a link use the same difference.
-                own = self._base(published[robot] if consensus.rule == "bayes" else self.maps[robot])
-                self._iterate(robot, [(team.weights[robot, j], published[j] - own)], team.epsilon, per_arrival)
+                self._iterate(robot, [j], exchange, stage, gamma_factor)
         self.known[robot] |= self.touched[robot]
         for j in senders:
-            self.known[robot] |= published_known[j]
+            self.known[robot] |= exchange.known[j]
+
+    def _mixed(self, robot: int, senders: Sequence[int], exchange: Exchange, stage: Stage) -> Float64Array:
+        """Return the robot's map h~ after mixing with some of the maps that arrived."""
+        team, current = exchange.team, self.maps[robot]
+        differences, amounts = [], np.zeros_like(current)
+        for j in senders:
+            other, weight = exchange.published[j], team.weights[robot, j]
+            is_mutual = self.config.consensus.rule == "bayes" and exchange.is_mutual(robot, j)
+            # 'bayes' conserves the sum over robots only if both ends of a link use the same difference.
+            own = exchange.published[robot] if is_mutual else self._base(current)
+            if is_mutual and stage.flow_bits:
+                amounts += self._flow(own, other, 2.0 * team.epsilon * weight, stage)
+            else:
+                differences.append((weight, other - own))
+        return rules.mix(current, differences, team.epsilon) + amounts
+
+    def _flow(self, own: Float64Array, other: Float64Array, weight: float, stage: Stage) -> Float64Array:
+        """Return the flow from a neighbour."""
+        steps = flows.flow_steps(own, other, stage.flow_bits, self.quantum)
+        return flows.flow(own, other, weight, steps)
 
     def _base(self, own: Float64Array) -> Float64Array:
         """Return the map that is subtracted from a neighbour's: the robot's own, or 0 for 'merge'."""
         return np.zeros_like(own) if self.config.consensus.rule == "merge" else own
 
     def _iterate(
-        self, robot: int, differences: list[tuple[float, Float64Array]], epsilon: float, gamma_factor: float
+        self, robot: int, senders: Sequence[int], exchange: Exchange, stage: Stage, gamma_factor: float
     ) -> None:
         """Run one iteration of the rule at one robot."""
         consensus = self.config.consensus
         k = self.num_iterations[robot]
         gamma = gamma_factor * rules.gamma_at(consensus.gamma, k, consensus.gamma_power, consensus.gamma_decay)
-        mixed = rules.mix(self.maps[robot], differences, epsilon)
+        mixed = self._mixed(robot, senders, exchange, stage)
         log_q = self.log_q[robot]
-        if consensus.rule == "gradient":
-            self.maps[robot] = rules.gradient_step(mixed, log_q, gamma)
-        elif consensus.rule == "natural":
-            self.maps[robot] = rules.natural_step(mixed, log_q, gamma)
+        if consensus.rule in ("gradient", "natural"):
+            step = rules.gradient_step if consensus.rule == "gradient" else rules.natural_step
+            result = step(mixed, log_q + self.anchors[robot].offset, gamma)
+            self.maps[robot] = result if stage.settling else rules.rounded(result, self.quantum)
         elif consensus.rule == "bayes":
-            self.maps[robot] = rules.bayes_step(mixed, log_q, self.log_q_used[robot])
+            self.maps[robot] = rules.free_is_zero(mixed)
         elif consensus.rule == "merge":
-            sensor = self.config.sensor
             self.maps[robot] = rules.merge_step(
-                mixed, log_q, self.log_q_used[robot], sensor.clamp_min, sensor.clamp_max
+                mixed, log_q, self.log_q_used[robot], self.sensor.clamp_min, self.sensor.clamp_max
             )
         else:
             self.maps[robot] = log_q

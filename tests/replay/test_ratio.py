@@ -20,17 +20,24 @@ from support.faulty_team import (
 from support.long_suite import one_in
 
 
-def test_ratio_equals_bayes_without_faults():
-    sessions = [session_of(configured(rule=rule, settle=0)) for rule in ("ratio", "bayes")]
+def test_ratio_without_faults_mixes_linearly_and_then_adds_the_new_evidence():
+    """On a complete graph its shares are the default weights: h <- (I - L) h + s now - s before."""
     num_joined = []
-    for ratio, bayes in zip(*(session.ticks() for session in sessions), strict=True):
-        for one, other in zip(ratio.maps, bayes.maps, strict=True):
-            np.testing.assert_allclose(dense(one), dense(other), rtol=0, atol=RATIO_TOLERANCE)
-            np.testing.assert_array_equal(known_cells(one), known_cells(other))
-        num_joined.append(len(ratio.graph.active))
+    maps, evidence, known = 0.0, 0.0, False
+    for tick in session_of(configured(rule="ratio", settle=0)).ticks():
+        before, evidence = evidence, np.array([dense(octree) for octree in tick.evidence])
+        weights = tick.graph.weights
+        maps = np.broadcast_to(maps, evidence.shape)
+        maps = maps + np.einsum("ij,jmc->imc", weights - np.diag(weights.sum(axis=1)), maps) + evidence - before
+        known = np.broadcast_to(known, maps.shape[:2])
+        known = known | ((weights > 0) @ known) | np.array([known_cells(octree) for octree in tick.evidence])
+        for octree, expected, cells in zip(tick.maps, maps, known, strict=True):
+            np.testing.assert_allclose(dense(octree), expected, rtol=0, atol=RATIO_TOLERANCE)
+            np.testing.assert_array_equal(known_cells(octree), cells)
+        num_joined.append(len(tick.graph.active))
     assert num_joined[1] == 3
     assert num_joined[-1] == 4
-    assert np.abs(dense(ratio.maps[0])).max() > 2.0
+    assert np.abs(maps).max() > 2.0
 
 
 GROUPS = (("robot_0", "robot_1"), ("robot_2", "robot_3"))

@@ -15,7 +15,7 @@ from reference.hand_made import cloud, ray, team_config
 from reference.scenarios import TeamShape
 from support.long_suite import long, one_in
 from support.sessions import sent_packets
-from support.twin_comparison import SMALL, compare, compare_frames, scenario_of, sources_of
+from support.twin_comparison import SMALL, compare, compare_frames, scenario_of, sources_of, unrounded
 
 RULES = ("gradient", "bayes", "natural", "local")
 MODES = ("sync", "on-arrival")
@@ -71,6 +71,18 @@ def test_every_rule_mode_and_topology(rule, mode, topology):
 def test_settling_ends_at_its_maximum(settle_max, num_settling_ticks):
     outcome = compare(SMALL, topology="line", rule="natural", settle=5, settle_max=settle_max)
     assert outcome.num_settling_ticks == num_settling_ticks
+
+
+@pytest.mark.parametrize(
+    ("rule", "mode", "topology"), one_in(2, ["gradient", "natural"], MODES, ["ring", "line", "complete"])
+)
+def test_maps_rounded_to_the_quantum(rule, mode, topology):
+    """Near the middle of two multiples float32 and float64 round apart; the rule's contraction keeps that small."""
+    quantum = 2.0**-10
+    outcome = compare(
+        SMALL, topology=topology, rule=rule, mode=mode, settle=0, every=1, quantum=quantum, tolerance=4.5 * quantum
+    )
+    assert outcome.num_compared_maps >= 4 * 16
 
 
 @pytest.mark.parametrize(("rule", "evidence", "mode"), one_in(5, RULES, ["time-average", "cell-average"], MODES))
@@ -144,7 +156,9 @@ def test_the_papers_preset():
 @pytest.mark.parametrize("rule", RULES)
 def test_one_robot_alone(rule):
     scenario = scenario_of(1, SMALL)
-    config = dataclasses.replace(scenario.config(rule=rule, settle=0), robots=scenario.base_config.robots[:1])
+    config = dataclasses.replace(
+        scenario.config(rule=rule, settle=0, **unrounded(rule)), robots=scenario.base_config.robots[:1]
+    )
     frames = [frame for frame in scenario.frames if frame.robot_id == "robot_0"]
     outcome = compare_frames(config, frames, every=4, with_metrics=True)
     assert outcome.tick.graph.pairs == ()
@@ -154,7 +168,7 @@ def test_one_robot_alone(rule):
 @pytest.mark.parametrize("rule", RULES)
 def test_a_robot_that_never_scans(rule, mode):
     frames = [ray("a", 0.0, 1), ray("b", 0.4, 2), ray("a", 2.0, 1, distance=1.0)]
-    compare_frames(team_config("abc", rule=rule, mode=mode, settle=2), frames, with_metrics=True)
+    compare_frames(team_config("abc", rule=rule, mode=mode, settle=2, **unrounded(rule)), frames, with_metrics=True)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -162,7 +176,8 @@ def test_a_robot_that_never_scans(rule, mode):
 def test_an_empty_scan_is_counted(rule, evidence):
     empty = dataclasses.replace(cloud(np.zeros((0, 3)), []), stamp_ns=ray("a", 2.3, 1).stamp_ns)
     frames = [ray("a", 0.0, 1), ray("b", 0.4, 2), ray("b", 1.0, 2), empty, ray("b", 5.0, 1)]
-    outcome = compare_frames(team_config("ab", rule=rule, evidence=evidence, settle=0), frames, with_metrics=True)
+    config = team_config("ab", rule=rule, evidence=evidence, settle=0, **unrounded(rule))
+    outcome = compare_frames(config, frames, with_metrics=True)
     assert outcome.twin_tick.num_scans == (2, 3)
 
 
@@ -177,7 +192,7 @@ def test_scans_on_the_tick_and_the_last_tick(evidence):
 @pytest.mark.parametrize("rule", RULES)
 def test_numbers_of_classes(rule, num_classes):
     frames = [ray("a", 0.0, 1), ray("b", 0.5, num_classes), ray("a", 1.5, 1), ray("b", 2.5, num_classes, distance=1.0)]
-    config = team_config("ab", num_classes, rule=rule, settle=2, settle_tolerance=1e-3)
+    config = team_config("ab", num_classes, rule=rule, settle=2, settle_tolerance=1e-3, **unrounded(rule))
     compare_frames(config, frames, with_metrics=True)
 
 

@@ -12,8 +12,17 @@ import pytest
 from octoreplay.config.network import LinkConfig
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
+from octoreplay.records import CONVERGED
 from octoreplay.replay.network.graph import TeamNetwork, step_size
-from octoreplay.replay.settling import QUIET_PROB, num_quiet_ticks, num_settle_ticks, settle_ticks_max
+from octoreplay.replay.settling import (
+    FINER_TICKS,
+    QUIET_PROB,
+    Settling,
+    num_finer_ticks,
+    num_quiet_ticks,
+    num_settle_ticks,
+    settle_ticks_max,
+)
 
 IDS = ("a", "b", "c", "d")
 
@@ -47,7 +56,39 @@ def test_without_faults_settling_needs_one_quiet_tick_and_the_graph_limits_its_t
     graph, config = _team(topology=topology, rule=rule)
     assert num_quiet_ticks(graph, config) == 1
     expected = settle_ticks_max(graph, config.consensus, step_size(graph, config.consensus))
-    assert num_settle_ticks(graph, config) == expected > RAMP
+    assert num_settle_ticks(graph, config) == expected + FINER_TICKS * (rule == "bayes") > RAMP
+
+
+def test_flows_add_the_ticks_in_which_they_get_finer():
+    graph, config = _team(rule="bayes")
+    assert num_settle_ticks(graph, config, num_finer=8) == num_settle_ticks(graph, config)
+    assert num_settle_ticks(graph, config, num_finer=13) == num_settle_ticks(graph, config) + 13 - FINER_TICKS
+    for without in ({"flow_bits": 0}, {"quantum": 0.0}, {"evidence": "time-average"}):
+        assert num_settle_ticks(*_team(rule="bayes", **without)) == num_settle_ticks(graph, config) - FINER_TICKS
+
+
+@pytest.mark.parametrize(
+    ("largest", "parameters", "expected"),
+    [
+        (0.0, {}, 0), (2.0**-12, {}, 0), (2.0**-11, {}, 1), (3.999, {}, 7), (4.0, {}, 7), (8.0, {}, 8), (1e9, {}, 21),
+        (4.0, {"flow_bits": 0}, 0), (4.0, {"flow_bits": 18}, 0), (4.0, {"flow_bits": 17}, 1),
+        (4.0, {"quantum": 0.5}, 0), (4.0, {"rule": "gradient"}, 0),
+    ],
+)  # fmt: skip
+def test_flows_get_finer_until_their_step_is_the_quantum(largest, parameters, expected):
+    _, config = _team(**{"rule": "bayes", **parameters})
+    assert num_finer_ticks(config.consensus, largest) == expected
+
+
+def test_settling_does_not_end_before_flows_are_finest():
+    graph, config = _team(rule="bayes", settle_tolerance=0.5)
+    settling = Settling(graph, config, 0.0, 4.0)
+    phases = []
+    for phase in settling.phases():
+        phases.append(phase)
+        settling.note(2.0**-16 if phase.extra_flow_bits == 14 and len(phases) < 10 else 0.0)
+    assert [phase.extra_flow_bits for phase in phases] == [2, 4, 6, 8, 10, 12, 14, 14, 14, 14]
+    assert settling.stop_reason == CONVERGED
 
 
 def test_given_numbers_override_the_links():

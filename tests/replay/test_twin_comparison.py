@@ -8,15 +8,19 @@ import functools
 import numpy as np
 import pytest
 
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.mapping import sensor
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.metrics import MapComparer
 from octoreplay.replay import session as session_module
 from octoreplay.replay.measure import TickMeasurer
+from octoreplay.replay.robots import anchor as anchor_module
 from octoreplay.replay.robots import consensus as consensus_module
 from octoreplay.replay.robots import robot as robot_module
+from octoreplay.replay.robots.anchor import Anchor
 from octoreplay.replay.session import Session
-from reference import rules
+from reference import flows, rules
 from support.octree_factory import class_rows
 from support.twin_comparison import SMALL, compare
 
@@ -115,12 +119,14 @@ def _scans_of_the_tick_come_late(monkeypatch):
 def _hits_add_too_little(monkeypatch):
     right = robot_module.clamped_increments
     monkeypatch.setattr(
-        robot_module, "clamped_increments", lambda config: dataclasses.replace(right(config), hit=config.hit - 0.01)
+        robot_module,
+        "clamped_increments",
+        lambda sensor, quantum: dataclasses.replace(right(sensor, quantum), hit=sensor.hit - 0.01),
     )
 
 
 def _clamping_is_forgotten(monkeypatch):
-    monkeypatch.setattr(robot_module, "clamped_increments", sensor.unclamped_increments)
+    monkeypatch.setattr(robot_module, "clamped_increments", lambda model, quantum: sensor.unclamped_increments(model))
 
 
 def _half_a_step(monkeypatch):
@@ -136,6 +142,53 @@ def _neighbours_cells_are_not_taken(monkeypatch):
         known[:] = np.bitwise_or.reduce(table.known[columns[: consensus_kernels.FIRST_NEIGHBOUR]])
 
     monkeypatch.setattr(consensus_kernels, "join_columns", wrong)
+
+
+def _flows_are_rounded_at_one_end(monkeypatch):
+    right = consensus_module.team_step
+
+    def wrong(steps, **kwargs):
+        return right([*steps[:1], *(dataclasses.replace(step, flows=None) for step in steps[1:])], **kwargs)
+
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
+
+
+def _flows_have_a_bit_more(monkeypatch):
+    right = consensus_module.Flows
+    monkeypatch.setattr(consensus_module, "Flows", lambda bits, has_flow: right(bits + 1, has_flow))
+
+
+def _flows_are_rounded_to_nearest_in_the_twin(monkeypatch):
+    monkeypatch.setattr(flows, "flow", lambda own, other, weight, step: np.rint(weight * (other - own) / step) * step)
+
+
+def _flow_steps_of_one_robot_in_the_twin(monkeypatch):
+    right = flows.flow_steps
+    monkeypatch.setattr(flows, "flow_steps", lambda own, other, *args: right(own, own, *args))
+
+
+def _evidence_comes_after_publishing(monkeypatch):
+    monkeypatch.setattr(consensus_module.ConsensusRobot, "integrate", robot_module.Robot.integrate)
+
+
+def _anchor_stays(monkeypatch):
+    right = Anchor.advance
+
+    def wrong(self, *args):
+        last = self.target
+        right(self, *args)
+        self.target = self.target or last
+
+    monkeypatch.setattr(Anchor, "advance", wrong)
+
+
+def _anchor_comes_late(monkeypatch):
+    right = anchor_module.num_due
+    monkeypatch.setattr(anchor_module, "num_due", lambda *args: right(*args) - 1)
+
+
+def _new_evidence_does_not_move_an_anchored_map(monkeypatch):
+    monkeypatch.setattr(anchor_module, "team_step", lambda steps, **kwargs: [])
 
 
 LOG_ODDS_DIFFER = "log-odds differ"
@@ -165,6 +218,16 @@ MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious|iterations d
         ("gradient", "sync", _hits_add_too_little, LOG_ODDS_DIFFER),
         ("local", "sync", _clamping_is_forgotten, LOG_ODDS_DIFFER), ("gradient", "sync", _half_a_step, LOG_ODDS_DIFFER),
         ("natural", "sync", _neighbours_cells_are_not_taken, "cells are missing"),
+        ("bayes", "sync", _flows_are_rounded_at_one_end, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _flows_have_a_bit_more, LOG_ODDS_DIFFER),
+        ("bayes", "on-arrival", _flows_have_a_bit_more, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _flows_are_rounded_to_nearest_in_the_twin, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _flow_steps_of_one_robot_in_the_twin, LOG_ODDS_DIFFER),
+        ("bayes", "on-arrival", _flow_steps_of_one_robot_in_the_twin, LOG_ODDS_DIFFER),
+        ("bayes", "sync", _evidence_comes_after_publishing, MAPS_DIFFER),
+        ("natural", "sync", _anchor_stays, MAPS_DIFFER), ("gradient", "on-arrival", _anchor_stays, MAPS_DIFFER),
+        ("natural", "on-arrival", _anchor_comes_late, LOG_ODDS_DIFFER),
+        ("natural", "sync", _new_evidence_does_not_move_an_anchored_map, LOG_ODDS_DIFFER),
     ],
 )  # fmt: skip
 def test_the_comparison_fails_with_a_fault(monkeypatch, rule, mode, fault, message):
@@ -175,10 +238,30 @@ def test_the_comparison_fails_with_a_fault(monkeypatch, rule, mode, fault, messa
 
 
 def _compare(rule, mode):
-    compare(SMALL, topology="line", rule=rule, mode=mode, settle=0, every=5)
+    """Compare on a line that is in two parts from 5 s to 9 s."""
+    apart = ScheduleEntry(5.0, 9.0, groups=(("robot_0", "robot_1"), ("robot_2", "robot_3")))
+    compare(
+        SMALL, topology="line", rule=rule, mode=mode, schedule=(apart,), anchor_after=2, gamma=0.5, settle=0, every=5
+    )
 
 
 _compare_without_fault = functools.cache(_compare)
+
+
+def test_the_comparison_fails_with_ties_that_are_absolute(monkeypatch):
+    """Averages of evidence are small."""
+    right = MapComparer.compare
+
+    def compare_averages():
+        compare(SMALL, topology="line", rule="bayes", evidence="time-average", settle=0, every=50, with_metrics=True)
+
+    def absolute(self, *args, **kwargs):
+        return right(self, *args, **{**kwargs, "least_tie": 1e-2})
+
+    compare_averages()
+    monkeypatch.setattr(MapComparer, "compare", absolute)
+    with pytest.raises(AssertionError):
+        compare_averages()
 
 
 def _each_robot(robots, name, change):

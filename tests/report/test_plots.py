@@ -122,7 +122,7 @@ def test_a_robot_that_did_not_publish_is_left_out_of_the_mean() -> None:
 def test_figures_of_a_run_without_exchange_or_disagreement(tmp_path: Path) -> None:
     silent = [
         dataclasses.replace(
-            tick, total_distance=0.0, total_distance_all=0.0, links=(), pairs=(),
+            tick, total_distance_published=0.0, total_distance=0.0, total_distance_all=0.0, links=(), pairs=(),
             robots=tuple(dataclasses.replace(r, packet_bytes=0, octree_bytes=0, grid_bytes=0) for r in tick.robots),
         )
         for tick in METRICS[:1]

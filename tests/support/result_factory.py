@@ -50,7 +50,8 @@ def tick_metrics(tick: int, *, settling: bool = False, links: bool = True) -> Ti
     )  # fmt: skip
     directed = (("alpha", "beta"), ("beta", "alpha")) if links else ()
     return TickMetrics(
-        tick=tick, stamp_ns=START + tick * SECOND, settling=settling, total_distance=1.0 / 3.0 + tick,
+        tick=tick, stamp_ns=START + tick * SECOND, settling=settling, total_distance_published=2.0 + tick,
+        total_distance=1.0 / 3.0 + tick,
         total_distance_all=0.1 + 2 * tick, distance_per_leaf=1e-7 * tick, distance_per_cell_and_link=2e-300,
         num_known_cells=2000 + tick, label_disagreement=0.25, max_change=float(tick) ** -2 if tick else 0.0,
         robots=robots,

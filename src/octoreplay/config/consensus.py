@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from octoreplay.config.fields import check_ranges, parameter
+from octoreplay.config.fields import SMALLEST, check_ranges, parameter
 from octoreplay.config.rules import RULES, Rule
+from octoreplay.errors import ConfigError
 
 EVIDENCES = ("sum", "time-average", "cell-average")
 MODES = ("sync", "on-arrival")
@@ -44,6 +46,25 @@ class ConsensusConfig:
         "mode on-arrival: gamma divided by the number of received maps (divided), or the whole gamma for each (full)",
         choices=("divided", "full"),
     )
+    flow_bits: int = parameter(
+        4,
+        "rule bayes: leading bits of the amounts that two robots exchange in a tick; fewer bits let maps come to rest"
+        " earlier (0: exact amounts)",
+        minimum=0,
+        maximum=20,
+    )
+    quantum: float | None = parameter(
+        None,
+        "smallest step of log-odds, a power of two, for evidence sum and the rules bayes, gradient and natural; 0: none"
+        " (default: 2^-16 for bayes, 2^-10 for gradient and natural)",
+        minimum=0.0,
+    )
+    anchor_after: int = parameter(
+        5,
+        "rules gradient and natural: number of consecutive packets of a robot that have to be missing before a receiver"
+        " keeps what it learned from others (0: never)",
+        minimum=0,
+    )
     settle: int = parameter(
         20, "ticks over which gamma ramps to 0 after the end of the logs (0: no settling)", minimum=0
     )
@@ -56,8 +77,31 @@ class ConsensusConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        if self.quantum:
+            _check_power_of_two(self.quantum)
 
     @property
     def traits(self) -> Rule:
         """Traits of the rule."""
         return RULES[self.rule]
+
+    @property
+    def effective_quantum(self) -> float:
+        """Step of log-odds of the run, a power of two; 0 for rules and readings of evidence without a quantum."""
+        if self.evidence != "sum" or self.traits.default_quantum == 0.0:
+            return 0.0
+        return self.traits.default_quantum if self.quantum is None else self.quantum
+
+    @property
+    def effective_flow_bits(self) -> int:
+        """``flow_bits`` where the rule has flows and the run has a quantum, else 0."""
+        return self.flow_bits if self.traits.has_flows and self.effective_quantum > 0.0 else 0
+
+
+def _check_power_of_two(quantum: float) -> None:
+    """Raise ConfigError for a quantum that is no power of two or too small."""
+    if quantum < SMALLEST:
+        raise ConfigError(f"quantum: {quantum:g} is below the least value {SMALLEST:g}; 0 means none")
+    if math.frexp(quantum)[0] != 0.5:
+        exponent = round(math.log2(quantum))
+        raise ConfigError(f"quantum: {quantum:g} is not a power of two; the nearest is 2^{exponent} = {2.0**exponent}")

@@ -16,6 +16,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             {
                 "rule": "gradient", "evidence": "time-average", "mode": "on-arrival", "gamma_per_arrival": "full",
                 "topology": "complete", "publish_period": 1.0, "weights": "degree", "settle": 0, "gamma": 1.0,
+                "flow_bits": 0, "quantum": 0.0, "anchor_after": 0,
             }
         )
     }

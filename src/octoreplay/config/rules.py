@@ -34,11 +34,18 @@ class Rule:
     has_step_size : bool
         True where the rule mixes maps with the step size epsilon, which the graph bounds.
     has_gamma : bool
-        True where a gradient step of size gamma_k follows the mixing; gamma ramps to 0 while the team settles.
+        True where a gradient step of size gamma_k towards the own evidence follows the mixing; gamma ramps to 0 while
+        the team settles. The pull is anchored while other robots are absent (``anchor_after``).
+    has_flows : bool
+        True where maps mix in coarse amounts that are equal at both ends of a link (``flow_bits``).
+    default_quantum : float
+        Default step of log-odds with evidence 'sum', a power of two; 0 where the rule has none.
+    adds_evidence_first : bool
+        True where new evidence enters the map before it is published, in every tick.
     mixes_differences : bool
         True where neighbours' maps enter as differences h_j - h_i, False where they are added whole.
     needs_symmetric_links : bool
-        True where the team's sum is kept only if both ends of a link exchange maps in every tick.
+        True where the team's sum is kept only if both ends of a link receive a map in the same tick.
     keeps_last_evidence : bool
         True where an iteration adds the change of the evidence since the last iteration.
     survives_losses : bool
@@ -59,6 +66,9 @@ class Rule:
     exchanges: Exchanged
     has_step_size: bool = False
     has_gamma: bool = False
+    has_flows: bool = False
+    default_quantum: float = 0.0
+    adds_evidence_first: bool = False
     mixes_differences: bool = True
     needs_symmetric_links: bool = False
     keeps_last_evidence: bool = False
@@ -71,15 +81,18 @@ class Rule:
 
 
 _RULES = (
-    Rule(name="gradient", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True),
+    Rule(name="gradient", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True, default_quantum=2.0**-10),
     Rule(
         name="bayes",
         exchanges=Exchanged.MAP,
         has_step_size=True,
+        has_flows=True,
+        default_quantum=2.0**-16,
+        adds_evidence_first=True,
         needs_symmetric_links=True,
         keeps_last_evidence=True,
     ),
-    Rule(name="natural", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True),
+    Rule(name="natural", exchanges=Exchanged.MAP, has_step_size=True, has_gamma=True, default_quantum=2.0**-10),
     Rule(
         name="ratio",
         exchanges=Exchanged.RUNNING_SUMS,

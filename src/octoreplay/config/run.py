@@ -19,7 +19,7 @@ from octoreplay.config.output import OutputConfig
 from octoreplay.config.packets import PacketConfig
 from octoreplay.config.parameters import coerced
 from octoreplay.config.robot import RobotConfig
-from octoreplay.config.sensor import MapConfig, SensorConfig
+from octoreplay.config.sensor import MapConfig, SensorConfig, rounded_sensor
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable
@@ -74,6 +74,7 @@ class RunConfig:
         if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
             raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
         _check_rule(self)
+        rounded_sensor(self.sensor, self.consensus.effective_quantum)  # raises ConfigError
         if self.alignment.is_on_air:
             _check_on_air(self)
 
@@ -113,6 +114,11 @@ class RunConfig:
         """Link configuration from one robot to another."""
         values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
         return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
+
+    @property
+    def effective_sensor(self) -> SensorConfig:
+        """Sensor model of the run: increments and clamps are multiples of the run's quantum."""
+        return rounded_sensor(self.sensor, self.consensus.effective_quantum)
 
     def with_parameters(self, values: Mapping[str, Any]) -> Self:
         """Return the configuration with flat parameters replaced.

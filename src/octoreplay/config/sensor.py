@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -42,6 +43,22 @@ class SensorConfig:
     def clamp(self) -> tuple[float, float]:
         """Smallest and largest log-odds of a class."""
         return self.clamp_min, self.clamp_max
+
+
+def rounded_sensor(sensor: SensorConfig, quantum: float) -> SensorConfig:
+    """Return the sensor model with increments and clamps rounded to multiples of ``quantum``; unchanged for 0.
+
+    Ties go to the even multiple. Raises ConfigError where a number other than 0 becomes 0, or the clamps become equal.
+    """
+    if quantum == 0.0:
+        return sensor
+    rounded: dict[str, float | None] = {}
+    for name in ("hit", "miss", "hit_other", "clamp_min", "clamp_max"):
+        value = getattr(sensor, name)
+        rounded[name] = None if value is None else round(value / quantum) * quantum
+        if value and rounded[name] == 0.0:
+            raise ConfigError(f"quantum: {quantum:g} rounds {name} {value:g} to 0; choose a smaller quantum, or 0")
+    return dataclasses.replace(sensor, **rounded)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -71,9 +71,10 @@ def agreement(
     leaf, other = intervals.leaves_a[both], intervals.leaves_b[both]
     labels = best_labels(spans.deviations + np.float32(prior))[leaf]
     values = reference.deviations + np.float32(reference_prior)
-    best = np.maximum(values.max(axis=1, initial=0.0), 0.0)[other]
+    best = values.max(axis=1, initial=0.0)[other]
+    tolerance = np.float32(TIE_TOLERANCE) * np.abs(values).max(axis=1, initial=0.0)[other]
     of_label = np.where(labels > 0, values[other, np.maximum(labels, 1) - 1], 0.0)
-    agrees = of_label >= best - np.float32(TIE_TOLERANCE)
+    agrees = of_label >= best - tolerance
     is_occupied = best_labels(values) > 0
     weights = intervals.num_cells[both] * agrees
     parts = weights.sum(), weights[is_occupied[other]].sum()

@@ -24,7 +24,8 @@ class Update(IntEnum):
 
     GRADIENT = consensus_kernels.GRADIENT
     NATURAL = consensus_kernels.NATURAL
-    BAYES = consensus_kernels.BAYES
+    MIX = consensus_kernels.MIX
+    ADD = consensus_kernels.ADD
     MERGE = consensus_kernels.MERGE
     COPY = consensus_kernels.COPY
 
@@ -43,6 +44,18 @@ def gamma_at(consensus: ConsensusConfig, iteration: int) -> float:
     return float(consensus.gamma / (1.0 + iteration / consensus.gamma_decay) ** consensus.gamma_power)
 
 
+@dataclass(frozen=True)
+class Flows:
+    """Coarse amounts that move over a robot's links, equal at both ends (docs/algorithm.md).
+
+    - ``bits``: the step of a cell is its largest |log-odds|, rounded down to a power of two, times 2^-bits.
+    - ``has_flow``: True for each neighbour whose link has flows; the others' amounts are exact.
+    """
+
+    bits: int
+    has_flow: Sequence[bool]
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """Inputs of one robot's iteration.
@@ -50,6 +63,7 @@ class Step:
     - ``own``: the robot's map h_i, changed in place.
     - ``neighbours``: published maps h_j that arrived.
     - ``step_weights``: their w_ij = 2 epsilon A_ij.
+    - ``flows``: Flows of the links; None for exact amounts.
     - ``log_likelihood``: log q_i.
     - ``gamma``: gradient step size.
     - ``base``: the robot's own published map b_i (default: ``own``).
@@ -67,6 +81,7 @@ class Step:
     base: SemanticOctree | None = None
     last_log_likelihood: SemanticOctree | None = None
     since: int | None = None
+    flows: Flows | None = None
 
 
 NUM_PARTS = 16
@@ -79,18 +94,24 @@ def team_step(
     update: Update,
     revision: int,
     clamp: tuple[float, float] = (-math.inf, math.inf),
+    quantum: float = 0.0,
     threads: Executor | None = None,
 ) -> list[float]:
     """Run one iteration at each of several robots, in place; return each robot's largest change of a log-odds.
 
-    The mixed map is h~ = h_i + sum_j w_ij (h_j - b_i), summed over the neighbours. The new map is
+    The mixed map is h~ = h_i + sum_j f_ij, summed over the neighbours, with f_ij = w_ij (h_j - b_i), or with flows
+    f_ij = e trunc(w_ij (h_j - b_i) / e), evaluated in float32. The step e of a cell is
+    2^(floor(log2 max_c(|h_j[c]|, |b_i[c]|)) - bits), and at least ``quantum``. The new map is
 
     - ``GRADIENT`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
       sigma = softmax(h~);
     - ``NATURAL``: h_i = h~ + gamma (log q_i - h~);
-    - ``BAYES``: h_i = h~ + log q_i - log q_i at the last iteration;
-    - ``MERGE``: as ``BAYES``, then clamped to ``clamp``; with an empty ``base`` it adds w_ij h_j at every arrival;
+    - ``MIX``: h_i = h~;
+    - ``ADD``: h_i = h~ + log q_i - log q_i at the last iteration;
+    - ``MERGE``: as ``ADD``, then clamped to ``clamp``; with an empty ``base`` it adds w_ij h_j at every arrival;
     - ``COPY``: h_i = log q_i.
+
+    ``GRADIENT`` and ``NATURAL`` round the new values to multiples of ``quantum``; 0 does not round.
 
     h_i[0] stays 0. Changed bricks get ``revision``. The result equals that of the same steps done cell by cell and
     robot by robot, and does not depend on ``threads``. No robot's ``own`` may be among another robot's neighbours.
@@ -114,14 +135,15 @@ def team_step(
     list(run(prepare, range(len(steps))))
     all_columns = np.concatenate(columns)
     first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
-    weights = np.concatenate([[0.0] * FIRST_NEIGHBOUR + list(step.step_weights) for step in steps]).astype(np.float32)
+    weights, flow_weights, flow_shares, has_plain = _link_weights(steps)
     gammas = np.array([step.gamma for step in steps], np.float32)
 
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
-            part[0], part[-1] + 1, table, all_columns, first_columns, weights, gammas, int(update), num_classes,
-            np.float32(clamp[0]), np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(),
-            needs_update, *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
+            part[0], part[-1] + 1, table, all_columns, first_columns, weights, flow_weights, flow_shares, has_plain,
+            np.float32(quantum), gammas, int(update), num_classes, np.float32(clamp[0]), np.float32(clamp[1]),
+            layouts.reshape(-1, layouts.shape[2]), known.ravel(), needs_update,
+            *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
     list(run(work, parts_of(codes.size, threads)))
@@ -133,6 +155,19 @@ def team_step(
         return float(largest)
 
     return list(run(finish, range(len(steps))))
+
+
+def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, Float32Array, BoolArray]:
+    """Weights of the links without and with flows at the kernel's columns, each robot's 2^-bits and plain links."""
+    plain, flowing, shares, has_plain = [], [], [], []
+    for step in steps:
+        has_flow = step.flows.has_flow if step.flows is not None else [False] * len(step.neighbours)
+        own = [0.0] * FIRST_NEIGHBOUR
+        plain += [*own, *(0.0 if flow else w for w, flow in zip(step.step_weights, has_flow, strict=True))]
+        flowing += [*own, *(w if flow else 0.0 for w, flow in zip(step.step_weights, has_flow, strict=True))]
+        shares.append(2.0**-step.flows.bits if step.flows is not None else 1.0)
+        has_plain.append(not all(has_flow))
+    return np.array(plain, np.float32), np.array(flowing, np.float32), np.array(shares, np.float32), np.array(has_plain)
 
 
 def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, BrickTable, list[Int64Array]]:

@@ -46,6 +46,7 @@ class MapComparer:
         # A brick's index in this octree is its row in the arrays below.
         self._bricks = SemanticOctree(1.0, 1)
         self._links: Int64Array | None = None
+        self._least_tie = 0.0
         self._distances: Float64Array = np.empty((0, 2))
         self._counts: Int32Array = np.empty((0, 4 + 3 * num_robots), np.int32)
         self._entropies: Float64Array = np.empty((0, num_robots))
@@ -57,18 +58,22 @@ class MapComparer:
         links: Sequence[tuple[int, int]],
         since: int,
         threads: Executor | None = None,
+        *,
+        least_tie: float = 0.0,
     ) -> MapComparison:
         """Return the comparison; bricks with all revisions below ``since`` are not compared again.
 
-        ``links`` are robot indices, each linked pair once. The result does not depend on ``threads``.
+        ``links`` are robot indices, each linked pair once. Log-odds tie with the largest of their cell where they are
+        within ``least_tie``, or the relative tolerance, of it. The result does not depend on ``threads``.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
         rows = [self._bricks.find_or_add(octree.codes[octree.revisions >= since]) for octree in (*maps, oracle)]
         stale = np.zeros(self._bricks.num_bricks, np.bool_)
         stale[np.concatenate(rows)] = True
-        if self._links is None or not np.array_equal(self._links, link_ends):
+        is_new = self._links is None or not np.array_equal(self._links, link_ends)
+        if is_new or self._least_tie != least_tie:
             stale[:] = True
-            self._links = link_ends
+            self._links, self._least_tie = link_ends, least_tie
         for name in ("_distances", "_counts", "_entropies"):
             old = getattr(self, name)
             if len(old) < len(stale):
@@ -101,9 +106,10 @@ class MapComparer:
             link_ends,
             np.float32(self._prior),
             np.float32(TIE_TOLERANCE),
+            np.float32(self._least_tie),
             maps[0].num_classes,
-            cache_aligned(((len(maps) + 1) * maps[0].num_classes + 5, BRICK_CELLS), np.float32),
-            cache_aligned((5, BRICK_CELLS), np.int32),
+            cache_aligned(((len(maps) + 1) * maps[0].num_classes + len(maps) + 6, BRICK_CELLS), np.float32),
+            cache_aligned((len(maps) + 3, BRICK_CELLS), np.int32),
             rows,
             self._distances,
             self._counts,

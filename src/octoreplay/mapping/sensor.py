@@ -32,7 +32,8 @@ MAX_GRID_CELLS = 1 << 32
 class Increments:
     """Log-odds that one scan adds to a cell: ``hit`` to the class hit, ``hit_other`` to the others, ``miss`` if passed.
 
-    Sums are clamped to [``least``, ``most``]. With ``is_count``, hits ignore the labels' confidences.
+    Sums are clamped to [``least``, ``most``]. With ``is_count``, hits ignore the labels' confidences. ``hit`` times a
+    confidence is rounded to a multiple of ``quantum``; 0 does not round.
     """
 
     hit: float
@@ -41,12 +42,19 @@ class Increments:
     least: float
     most: float
     is_count: bool = False
+    quantum: float = 0.0
+
+    def weighted_hits(self) -> Float32Array:
+        """Return ``hit`` times each confidence, (256,) float32 for 0 to 255."""
+        if self.quantum:
+            return np.asarray(np.rint(self.hit * np.arange(256) / 255 / self.quantum) * self.quantum, np.float32)
+        return np.float32(self.hit) * (np.arange(256, dtype=np.float32) / np.float32(255))
 
 
-def clamped_increments(sensor: SensorConfig) -> Increments:
+def clamped_increments(sensor: SensorConfig, quantum: float = 0.0) -> Increments:
     """Return the sensor model's increments with its clamping limits: evidence s of a robot."""
     hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
-    return Increments(sensor.hit, sensor.miss, hit_other, sensor.clamp_min, sensor.clamp_max)
+    return Increments(sensor.hit, sensor.miss, hit_other, sensor.clamp_min, sensor.clamp_max, quantum=quantum)
 
 
 def unclamped_increments(sensor: SensorConfig) -> Increments:
@@ -337,11 +345,12 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
     )
     octree.expand_bricks(indices, wanted, known, changes)
     brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
-    steps = np.float32(increments.hit), miss, np.float32(increments.hit_other), least, most
+    others = miss, np.float32(increments.hit_other), least, most
     num_words = storage.OCTETS * (octree.num_classes + 1) + 1
     if increments.is_count or cells.strengths.size == 0:
         scratch = np.empty((2, num_words), np.uint64)
-        evidence.apply_marks(*brick_marks, octree.num_classes, *steps, revision, scratch)
+        evidence.apply_marks(*brick_marks, octree.num_classes, np.float32(increments.hit), *others, revision, scratch)
     else:
         strengths, scratch = cells.strengths.view(np.uint64), np.empty((3, num_words), np.uint64)
-        evidence.apply_weighted_marks(*brick_marks, strengths, octree.num_classes, *steps, revision, scratch)
+        hits = increments.weighted_hits()
+        evidence.apply_weighted_marks(*brick_marks, strengths, octree.num_classes, hits, *others, revision, scratch)

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.messages import Receipt
-from octoreplay.replay.network.graph import CommunicationGraph, Link
+from octoreplay.replay.network.graph import CommunicationGraph, Link, step_size
 from octoreplay.replay.network.links import LinkCounts
 from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Team
 from octoreplay.run_metrics import LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
@@ -42,6 +43,8 @@ class _Component:
         self.members = tuple(members)
         self._threads = threads
         self._is_new = True
+        self._since = 0
+        self._consensus = config.consensus
         self._comparer = MapComparer(len(ids), config.map.prior(num_classes))
         self._evidence_comparer = EvidenceComparer(ids, num_classes, state_limits(config.sensor))
 
@@ -50,29 +53,44 @@ class _Component:
         self._comparer.forget()
         self._evidence_comparer.forget()
 
-    def compare(
-        self, number: int, team: Team[Robot], graph: CommunicationGraph
-    ) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
-        """Comparison of the maps after a tick, arrays over the members, and the metrics of the pairs of members."""
+    def published_distance(self, number: int, team: Team[Robot], graph: CommunicationGraph) -> float:
+        """Phi of the maps as published in a tick, before the iterations; updates the oracle."""
         robots = [team.robots[index] for index in self.members]
-        evidence = [robot.evidence.octree for robot in robots]
         if self._is_new:
-            changed = np.unique(np.concatenate([octree.codes for octree in evidence]))
+            changed = np.unique(np.concatenate([robot.evidence.octree.codes for robot in robots]))
         else:
             changed = np.unique(np.concatenate([robot.changed_evidence(number) for robot in robots]))
-        since = 0 if self._is_new else number
+        self._since = 0 if self._is_new else number
         self._is_new = False
         sum_of_evidence(self.oracle, team.evidence(self.members), changed, number)
+        return self._compare_maps(team, graph).total_distance
+
+    def compare(self, team: Team[Robot], graph: CommunicationGraph) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
+        """Comparison of the maps after a tick, arrays over the members, and the metrics of the pairs of members."""
+        evidence = [team.robots[index].evidence.octree for index in self.members]
+        return self._compare_maps(team, graph), self._evidence_comparer.compare(evidence, self._since, self._threads)
+
+    def _compare_maps(self, team: Team[Robot], graph: CommunicationGraph) -> MapComparison:
+        """Comparison of the maps as they are, in bricks that changed in this tick."""
         position = {index: place for place, index in enumerate(self.members)}
         links = [(position[i], position[j]) for i, j in graph.pairs if i in position and j in position]
-        comparison = self._comparer.compare([robot.map for robot in robots], self.oracle, links, since, self._threads)
-        return comparison, self._evidence_comparer.compare(evidence, since, self._threads)
+        maps = [team.robots[index].map for index in self.members]
+        least_tie = len(team.robots) * rest_difference(self._consensus, graph)
+        return self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
 
     def spread(self, values: npt.NDArray[Any], num_robots: int) -> npt.NDArray[Any]:
         """Return values (M,) of the members as an array (N,) over the robots, 0 for other robots."""
         spread = np.zeros(num_robots, values.dtype)
         spread[list(self.members)] = values
         return spread
+
+
+def rest_difference(consensus: ConsensusConfig, graph: CommunicationGraph) -> float:
+    """Largest difference of two neighbours' log-odds at rest: quantum / (2 epsilon A_min) with flows, else 0."""
+    weights = graph.weights[graph.weights > 0.0]
+    if not consensus.effective_flow_bits or not weights.size:
+        return 0.0
+    return consensus.effective_quantum / (2.0 * step_size(graph, consensus) * float(weights.min()))
 
 
 class TickMeasurer:
@@ -107,6 +125,10 @@ class TickMeasurer:
         for component in self._components:
             component.forget()
 
+    def published_distance(self, number: int, team: Team[Robot], graph: CommunicationGraph) -> float:
+        """Phi of the maps as published in tick ``number``; ``measure`` must follow after the iterations."""
+        return sum(component.published_distance(number, team, graph) for component in self._components)
+
     def measure(
         self,
         number: int,
@@ -114,15 +136,16 @@ class TickMeasurer:
         team: Team[Robot],
         graph: CommunicationGraph,
         traffic: Traffic,
+        published_distance: float,
         max_change: float,
         *,
         settling: bool,
     ) -> TickMetrics:
         """Metrics of the team after tick ``number`` (docs/metrics.md).
 
-        ``max_change`` is the largest change of a log-odds in the tick.
+        ``max_change`` is the largest change of a log-odds by the iterations.
         """
-        compared = [component.compare(number, team, graph) for component in self._components]
+        compared = [component.compare(team, graph) for component in self._components]
         comparison = self._combined([of_maps for of_maps, _ in compared])
         links = self._link_metrics(graph, traffic)
         robots = tuple(
@@ -134,6 +157,7 @@ class TickMeasurer:
             tick=number,
             stamp_ns=stamp_ns,
             settling=settling,
+            total_distance_published=published_distance,
             total_distance=comparison.total_distance,
             total_distance_all=comparison.total_distance_all,
             distance_per_leaf=comparison.total_distance / max(num_leaves, 1),

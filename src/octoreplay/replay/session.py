@@ -19,7 +19,7 @@ from octoreplay.replay.joining import Joining
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
 from octoreplay.replay.network.links import Links
-from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Turn
+from octoreplay.replay.robots.robot import REPLAY, MapSizes, Phase, Publication, Robot, Turn
 from octoreplay.replay.robots.team import make_team
 from octoreplay.replay.settling import NO_SETTLING, Settling
 from octoreplay.replay.tick import Tick, falls_due
@@ -119,23 +119,27 @@ class Session:
         if self.config.consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
-        settling = Settling(self._graph, self.config, self._links.longest_transmission)
-        for gamma_factor in settling.gamma_factors():
-            tick = self._exchange(number, start_ns + number * self._period_ns, gamma_factor, settling=True)
+        largest = max(robot.largest_log_odds() for robot in self.team.robots)
+        settling = Settling(self._graph, self.config, self._links.longest_transmission, largest)
+        for phase in settling.phases():
+            tick = self._exchange(number, start_ns + number * self._period_ns, phase)
             settling.note(tick.metrics.max_change)
             yield tick
             number += 1
         self.stop_reason = settling.stop_reason
 
-    def _exchange(self, number: int, stamp_ns: int, gamma_factor: float = 1.0, *, settling: bool = False) -> Tick:
+    def _exchange(self, number: int, stamp_ns: int, phase: Phase = REPLAY) -> Tick:
         """The rest of a tick after its scans: publish, deliver, iterate, measure."""
-        graph, robots = self._graph, self.team.robots
+        graph, robots, settling = self._graph, self.team.robots, phase.is_settling
         self.is_symmetric &= graph.is_symmetric
         published = self._publish(graph, number, stamp_ns)
         receipts = self._deliver(graph, stamp_ns)
-        max_change = self._iterate(graph, gamma_factor, number)
+        published_distance = self._measurer.published_distance(number, self.team, graph)
+        max_change = self._iterate(graph, phase, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
-        metrics = self._measurer.measure(number, stamp_ns, self.team, graph, traffic, max_change, settling=settling)
+        metrics = self._measurer.measure(
+            number, stamp_ns, self.team, graph, traffic, published_distance, max_change, settling=settling
+        )
         if self.joining is not None:
             metrics = dataclasses.replace(metrics, places=self.joining.frames.places)
             if not settling:
@@ -252,12 +256,12 @@ class Session:
             return self.joining.exchange(receiver)
         return self.team.robots[receiver]
 
-    def _iterate(self, graph: CommunicationGraph, gamma_factor: float, number: int) -> float:
+    def _iterate(self, graph: CommunicationGraph, phase: Phase, number: int) -> float:
         """Iterate at every active robot with the maps that arrived; the largest change of a log-odds."""
         step_weights = 2.0 * step_size(graph, self.config.consensus) * graph.weights
         robots = self.team.robots
         turns = [Turn(robots[index], robots[index].take_arrivals(), step_weights[index]) for index in graph.active]
-        return max(self.team.iterate(turns, gamma_factor, number, self._threads), default=0.0)
+        return max(self.team.iterate(turns, phase, number, self._threads), default=0.0)
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Settling: ticks after the last scan in which gamma ramps to 0, until no log-odds changes.
+"""Settling: ticks after the last scan in which gamma ramps to 0 and flows get finer, until no log-odds changes.
 
 Losses, delays and budgets make it take longer; the functions here bound by how much.
 """
@@ -17,6 +17,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.records import CONVERGED
 from octoreplay.replay.network.graph import CommunicationGraph, step_size
+from octoreplay.replay.robots.robot import Phase
 
 SETTLE_MAX = "settle_max reached"
 NO_SETTLING = "settling is off"
@@ -31,31 +32,67 @@ FLOOD_TICKS = 10_000
 """Largest number of ticks that settling waits for evidence that a budget holds back."""
 
 
+FINER_TICKS = 8
+"""Least number of settling ticks that flows add to the default maximum."""
+
+BITS_PER_TICK = 2
+"""Growth of ``flow_bits`` in each settling tick."""
+
+
 class Settling:
     """Settling of one team over its last graph.
 
-    Iterate over ``gamma_factors()`` and call ``note()`` after every tick. ``stop_reason`` is set at the end.
-    ``longest_transmission`` is the longest time that a packet kept a link busy [s].
+    Iterate over ``phases()`` and call ``note()`` after every tick. ``stop_reason`` is set at the end.
+    ``longest_transmission`` is the longest time that a packet kept a link busy [s], ``largest`` the largest |log-odds|
+    relative to the prior in any map.
     """
 
-    def __init__(self, graph: CommunicationGraph, config: ResolvedRun, longest_transmission: float) -> None:
+    def __init__(
+        self, graph: CommunicationGraph, config: ResolvedRun, longest_transmission: float, largest: float
+    ) -> None:
         self.stop_reason = SETTLE_MAX
         self._consensus = config.consensus
+        self._num_finer = num_finer_ticks(config.consensus, largest)
         self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
-        self._most = num_settle_ticks(graph, config, longest_transmission)
+        self._most = num_settle_ticks(graph, config, longest_transmission, self._num_finer)
+        self._tolerance = config.consensus.settle_tolerance
+        if config.consensus.effective_flow_bits:
+            # No flow is below the quantum.
+            self._tolerance = min(self._tolerance, config.consensus.effective_quantum)
         self._num_quiet = 0
 
-    def gamma_factors(self) -> Iterator[float]:
-        """Factor of gamma in each settling tick: 1 - n / settle in tick n, and 0 after the ramp."""
+    def phases(self) -> Iterator[Phase]:
+        """Phase of each settling tick.
+
+        In tick n the factor of gamma is 1 - n / settle, and 0 after the ramp. Flows have 2 n bits more, until every
+        step is the quantum.
+        """
         for n in range(1, self._most + 1):
-            yield max(0.0, 1.0 - n / self._consensus.settle)
-            if self._num_quiet >= self._quiet_ticks:
+            if n <= self._num_finer:
+                # Coarse flows rest before the maps agree.
+                self._num_quiet = 0
+            extra_bits = BITS_PER_TICK * min(n, self._num_finer)
+            yield Phase(max(0.0, 1.0 - n / self._consensus.settle), extra_bits, is_settling=True)
+            if self._num_quiet >= self._quiet_ticks and n >= self._num_finer:
                 self.stop_reason = CONVERGED
                 return
 
     def note(self, max_change: float) -> None:
         """Note the largest change of a log-odds in the last tick."""
-        self._num_quiet = self._num_quiet + 1 if max_change < self._consensus.settle_tolerance else 0
+        self._num_quiet = self._num_quiet + 1 if max_change < self._tolerance else 0
+
+
+def num_finer_ticks(consensus: ConsensusConfig, largest: float) -> int:
+    """Number of settling ticks in which flows get finer, until every step is the quantum; 0 without flows.
+
+    It is the least n with floor(log2 ``largest``) - (flow_bits + 2 n) <= log2 quantum. ``largest`` is the largest
+    |log-odds| of the maps; flows do not raise it.
+    """
+    if not consensus.effective_flow_bits or largest == 0.0:
+        return 0
+    # frexp gives floor(log2 x) + 1 exactly.
+    num_bits = math.frexp(largest)[1] - math.frexp(consensus.effective_quantum)[1]
+    return max(0, math.ceil((num_bits - consensus.effective_flow_bits) / BITS_PER_TICK))
 
 
 def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
@@ -71,8 +108,13 @@ def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission
     return num_losses * slower + _delay(links, config, 2.0 * transmission)
 
 
-def num_settle_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
-    """Largest number of settling ticks, with each weight reduced to its link's share of packets that arrive."""
+def num_settle_ticks(
+    graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0, num_finer: int = 0
+) -> int:
+    """Largest number of settling ticks, with each weight reduced to its link's share of packets that arrive.
+
+    Flows add ``num_finer`` ticks, and at least FINER_TICKS.
+    """
     consensus = config.consensus
     if not consensus.traits.has_step_size:
         consensus = dataclasses.replace(consensus, epsilon=None)
@@ -92,7 +134,8 @@ def num_settle_ticks(graph: CommunicationGraph, config: ResolvedRun, transmissio
         # The time until all waiting evidence is sent is unknown, but finite, since no new evidence comes.
         return max(most, FLOOD_TICKS)
     slower *= BUDGET_TICKS if has_budget else 1
-    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1
+    finer = max(FINER_TICKS, num_finer) if consensus.effective_flow_bits else 0
+    return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1 + finer
 
 
 def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsilon: float) -> int:

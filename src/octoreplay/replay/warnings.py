@@ -42,7 +42,7 @@ def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
         and (config.packet.packets in other.packets or not has_budget)
     ]
     sentence = (
-        f"rule '{rule.name}' keeps the team's sum only when both ends of a link exchange maps in every tick; with"
+        f"rule '{rule.name}' keeps the team's sum only when both ends of a link receive a map in the same tick; with"
         f" {', '.join([*found[:-2], ' and '.join(found[-2:])])} it drifts from the mean; rule {' or '.join(others)}"
         " does not"
     )

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TEAM_COLUMNS = (
-    "tick", "stamp_ns", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
+    "tick", "stamp_ns", "settling", "total_distance_published", "total_distance", "total_distance_all",
+    "distance_per_leaf",
     "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change",
     *PAIR_SHARES, "num_components",
 )  # fmt: skip
@@ -134,6 +135,11 @@ def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
     times = log_seconds(metrics)
     links = np.array([tick.total_distance for tick in metrics])
     pairs = np.array([tick.total_distance_all for tick in metrics])
+    published = np.array([tick.total_distance_published for tick in metrics])
+    axes.plot(
+        times, np.where(published > 0, published, np.nan), ":", color=GREY, linewidth=1.4,
+        label="\u03a6 over the links, before the iterations",
+    )  # fmt: skip
     axes.plot(times, np.where(links > 0, links, np.nan), color=BLUE, linewidth=1.6, label="\u03a6 over the links")
     # On a complete graph the two lines are equal except for rounding.
     if not np.allclose(links, pairs, rtol=1e-3):

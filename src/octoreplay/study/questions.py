@@ -71,7 +71,7 @@ def steps(duration: float, num_villages: int) -> Experiment:
                 "bound",
                 tuple(teams)[:1],
                 (f"topology+epsilon={bounds}",),
-                {"rule": "bayes", "duration": min(duration, 20.0), "settle_max": 200, **_FINAL_STATES},
+                {"rule": "bayes", "flow_bits": 0, "duration": min(duration, 20.0), "settle_max": 200, **_FINAL_STATES},
                 has_truth=False,
                 extra_columns=_theory,
             ),

@@ -1,4 +1,5 @@
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,9 @@ import pytest
 
 from octoreplay.errors import InputError
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.messages import ros_types
 from octoreplay.io.messages.ros_types import message, time_message
+from octoreplay.io.results import result_writer
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
 from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
@@ -66,6 +69,52 @@ def test_a_result_of_an_older_version_has_no_pairs_and_no_evidence(
             reader.states("gamma", evidence=True)
         with pytest.raises(InputError, match="the centralised map has no evidence; robots: alpha, beta"):
             reader.states("central", evidence=True)
+
+
+def _write_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, change: Callable[[str], str]) -> Path:
+    """Write a result whose definition of the metrics is changed."""
+    name = "octoreplay_msgs/msg/TickMetrics"
+    changed = {**ros_types.OCTOREPLAY_MSGS, name: change(ros_types.OCTOREPLAY_MSGS[name])}
+    make_message = result_writer.message
+
+    def message(type_name: str, **fields: object) -> object:
+        if type_name == name:
+            fields = {key: value for key, value in fields.items() if f" {key}\n" in changed[name]}
+        return make_message(type_name, **fields)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ros_types, "OCTOREPLAY_MSGS", changed)
+        patch.setattr(result_writer, "message", message)
+        ros_types.typestore.cache_clear()
+        path = write_result(tmp_path)
+    ros_types.typestore.cache_clear()
+    return path
+
+
+def test_a_result_of_an_older_version_has_no_published_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _write_with(monkeypatch, tmp_path, lambda text: text.replace("float64 total_distance_published\n", ""))
+    with ResultReader(path) as reader:
+        metrics = reader.metrics()
+    assert all(np.isnan(tick.total_distance_published) for tick in metrics)
+    assert [dataclasses.replace(tick, total_distance_published=0.0) for tick in metrics] == [
+        dataclasses.replace(tick, total_distance_published=0.0) for tick in METRICS
+    ]
+
+
+def test_a_definition_that_no_version_wrote_is_damage() -> None:
+    name = "octoreplay_msgs/msg/TickMetrics"
+    definition, _ = ros_types.typestore().generate_msgdef(name, ros_version=2)
+    assert ros_types.typestore_of(name, definition).fielddefs[name] == ros_types.typestore().fielddefs[name]
+    for old, new, sentence in (
+        ("total_distance_published", "total_distance_publishec", "has the unknown field 'total_distance_publishec'"),
+        ("uint64 num_known_cells", "float64 num_known_cells", "has the unknown field 'num_known_cells'"),
+        ("=====", "==?==", "cannot be read"),
+    ):
+        assert old in definition
+        with pytest.raises(ValueError, match=sentence):
+            ros_types.typestore_of(name, definition.replace(old, new, 1))
 
 
 def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 VISION_MSGS = {
@@ -117,7 +117,8 @@ octoreplay_msgs/RobotFrame[] robots
 std_msgs/Header header
 uint32 tick
 bool settling
-# Phi: over the tick's links; over all pairs of robots.
+# Phi: over the tick's links, of the maps as published and after the iterations; over all pairs of robots.
+float64 total_distance_published
 float64 total_distance
 float64 total_distance_all
 float64 distance_per_leaf
@@ -139,6 +140,27 @@ def typestore() -> Typestore:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, definition in {**VISION_MSGS, **OCTOREPLAY_MSGS}.items():
         store.register(get_types_from_msg(definition, name))
+    return store
+
+
+@cache
+def typestore_of(type_name: str, definition: str) -> Typestore:
+    """Return the types of a message as a file defines them, which may be an older version of octoreplay's messages.
+
+    ``definition`` is the text of a ros2msg schema with all types that it needs. Older versions have fewer fields.
+    Raises ValueError for a text that cannot be read, and for fields that the present types do not have.
+    """
+    try:
+        defined = get_types_from_msg(definition, type_name)
+    except TypesysError as error:
+        raise ValueError(f"the definition of '{type_name}' cannot be read") from error
+    present = typestore().fielddefs
+    for name, (_, fields) in defined.items():
+        unknown = [field for field, kind in fields if (field, kind) not in present[name][1]]
+        if unknown:
+            raise ValueError(f"'{name}' has the unknown field '{unknown[0]}'")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(defined)
     return store
 
 

@@ -21,7 +21,7 @@ from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import parse_team
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint
-from octoreplay.io.messages.ros_types import stamp_to_ns, typestore
+from octoreplay.io.messages.ros_types import stamp_to_ns, typestore_of
 from octoreplay.io.results.result_writer import (
     CONTRADICTION_TOPIC,
     FORMAT_VERSION,
@@ -271,8 +271,8 @@ class ResultReader:
             for schema, _, record in self._reader.iter_messages(
                 topics, starting_at=start_ns, ending_before=end_ns, reverse=reverse
             ):
-                name = schema.name if schema is not None else ""
-                yield record.log_time, typestore().deserialize_cdr(record.data, name)
+                name, definition = ("", "") if schema is None else (schema.name, schema.data.decode())
+                yield record.log_time, typestore_of(name, definition).deserialize_cdr(record.data, name)
         except _DAMAGE as error:
             raise InputError(f"{self.path}: damaged at topic '{topics[0]}': {error}") from error
 
@@ -313,6 +313,7 @@ def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...], places: tuple[Fram
         links=tuple(LinkMetrics(**_fields(LinkMetrics, link)) for link in value.links),
         pairs=pairs,
         places=places,
+        total_distance_published=getattr(value, "total_distance_published", math.nan),
         **{name: getattr(value, name) for name in plain},
     )
 

@@ -33,7 +33,7 @@ from octoreplay.mapping.kernels.storage import (
     prune_brick,
 )
 
-GRADIENT, NATURAL, BAYES, MERGE, COPY = 0, 1, 2, 3, 4
+GRADIENT, NATURAL, MIX, ADD, MERGE, COPY = 0, 1, 2, 3, 4, 5
 """Updates; octoreplay.mapping.consensus.team_step gives their equations."""
 
 
@@ -190,9 +190,50 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 
 @kernel
+def _add_flows(
+    mixed_at, base_at, map_at, scratch_at, terms_at, octets, num_shared, rows, num_classes, weight, share, quantum
+):
+    """Add the flow of one link to the mixed map: e trunc(weight (map - base) / e).
+
+    The step e of a cell is the largest power of two that is not above m, times ``share``, and at least the quantum; m
+    is the cell's largest |log-odds| in either map. Both ends of a link find the same amount with opposite signs,
+    because float32 differences, products with the same weight and truncation are odd functions.
+
+    - ``mixed_at``: address of the mixed map (rows, 8), in place.
+    - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
+    - ``scratch_at``, ``terms_at``: addresses of (rows, 8) float32 and of 64 float32.
+    - ``octets``, ``num_shared``, ``rows``, ``num_classes``: as for ``_add_gradient``.
+    - ``weight``, ``share``, ``quantum``: float32; ``share`` is 2^-flow_bits.
+    """
+    size, shared_size = rows * OCTETS, num_shared * OCTETS
+    mixed, base, other = float_array(mixed_at, (size,)), float_array(base_at, (size,)), float_array(map_at, (size,))
+    steps, terms = float_array(scratch_at, (size,)), float_array(terms_at, (shared_size,))
+    for i in range(size):
+        steps[i] = max(abs(base[i]), abs(other[i]))
+    for i in range(shared_size):
+        terms[i] = np.float32(num_classes)
+    for r in range(num_shared, rows):
+        for k in range(OCTETS):
+            terms[octets[r] * OCTETS + k] -= np.float32(1.0)
+    for i in range(shared_size):
+        # Where every class has a row of its own, the shared row stands for none.
+        steps[i] = steps[i] if terms[i] > np.float32(0.0) else np.float32(0.0)
+    for r in range(num_shared, rows):
+        max_octet(scratch_at + octets[r] * ROW_BYTES, scratch_at + r * ROW_BYTES)
+    for i in range(shared_size):
+        # Without its mantissa a float is the largest power of two that is not above it.
+        power = same_bits(np.int32(same_bits(steps[i]) & np.int32(0x7F800000)))
+        steps[i] = max(power * share, quantum)
+    for r in range(num_shared, rows):
+        copy_octet(scratch_at + r * ROW_BYTES, scratch_at + octets[r] * ROW_BYTES)
+    for i in range(size):
+        mixed[i] += steps[i] * np.trunc(weight * (other[i] - base[i]) / steps[i])
+
+
+@kernel
 def team_step(
-    start, end, table, columns, first_columns, weights, gammas, update, num_classes, clamp_min, clamp_max, layouts,
-    known, needs_update, scratch, int_scratch, changes, is_even,
+    start, end, table, columns, first_columns, weights, flow_weights, flow_shares, has_plain, quantum, gammas, update,
+    num_classes, clamp_min, clamp_max, layouts, known, needs_update, scratch, int_scratch, changes, is_even,
 ):  # fmt: skip
     """One iteration of R robots, in place in their own maps.
 
@@ -207,9 +248,13 @@ def team_step(
     - ``table``: BrickTable of all maps, (J, n).
     - ``columns`` int64: columns of the table, robot by robot: OWN, BASE, EVIDENCE, LAST_EVIDENCE, then its neighbours'.
     - ``first_columns`` (R + 1,) int64: robot r has the entries ``first_columns[r]`` to ``first_columns[r + 1]``.
-    - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours, parallel to ``columns``.
+    - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours without flows, parallel to ``columns``.
+    - ``flow_weights`` float32: 2 epsilon A_ij at the entries of neighbours with flows, parallel to ``columns``.
+    - ``flow_shares`` (R,) float32: 2^-flow_bits.
+    - ``has_plain`` (R,) bool: True where any of a robot's ``weights`` is not 0.
+    - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT and NATURAL; 0 for none.
     - ``gammas`` (R,) float32: gradient step sizes.
-    - ``update``: GRADIENT, NATURAL, BAYES, MERGE or COPY.
+    - ``update``: GRADIENT, NATURAL, MIX, ADD, MERGE or COPY.
     - ``num_classes``: C.
     - ``clamp_min``, ``clamp_max``: float32, limits of the log-odds, used by MERGE alone.
     - ``layouts`` (R n, W) uint64, ``known`` (R n,) uint64: class rows and known cells of the own bricks.
@@ -224,7 +269,10 @@ def team_step(
     room = (num_classes + 1) * BRICK_CELLS * 4
     mixed_at = np.int64(scratch.ctypes.data)
     delta_at, gradient_at = mixed_at + room, mixed_at + 2 * room
-    spare_at = mixed_at + NUM_SCRATCH_BLOCKS * room + 3 * BRICK_CELLS * 4
+    terms_at = mixed_at + NUM_SCRATCH_BLOCKS * room
+    spare_at = terms_at + 3 * BRICK_CELLS * 4
+    # Where a map is 0 there is no power of two.
+    least_step = max(quantum, np.float32(1e-30))
     octets, places = int_scratch[0], int_scratch[1]
     for b in range(start, end):
         for column in range(table.addresses.shape[0]):
@@ -238,7 +286,7 @@ def team_step(
             first = first_columns[robot]
             num_columns = first_columns[robot + 1] - first
             for k in range(num_columns):
-                if k == LAST_EVIDENCE and update != BAYES and update != MERGE:
+                if k == LAST_EVIDENCE and update != ADD and update != MERGE:
                     continue
                 places[k] = rows_at(table, b, columns[first + k], layouts, known, m, spare_at + k * room, num_classes)
             own_at, base_at = places[OWN], places[BASE]
@@ -248,7 +296,13 @@ def team_step(
             # The differences are summed before the own value is added: the sum is exactly 0 where all maps agree.
             for i in range(size):
                 mixed[i] = np.float32(0.0)
-            for k in range(FIRST_NEIGHBOUR, num_columns, 3):
+            for k in range(FIRST_NEIGHBOUR, num_columns):
+                if flow_weights[first + k] != np.float32(0.0):
+                    _add_flows(
+                        mixed_at, base_at, places[k], gradient_at, terms_at, octets, num_shared, rows, num_classes,
+                        flow_weights[first + k], flow_shares[robot], least_step,
+                    )  # fmt: skip
+            for k in range(FIRST_NEIGHBOUR, num_columns if has_plain[robot] else 0, 3):
                 b_at, b_weight, c_at, c_weight = base_at, np.float32(0.0), base_at, np.float32(0.0)
                 if k + 1 < num_columns:
                     b_at, b_weight = places[k + 1], weights[first + k + 1]
@@ -259,7 +313,10 @@ def team_step(
             if update == COPY:
                 for i in range(size):
                     mixed[i] = evidence[i]
-            elif update in (BAYES, MERGE):
+            elif update == MIX:
+                for i in range(size):
+                    mixed[i] += own[i]
+            elif update in (ADD, MERGE):
                 old = float_array(places[LAST_EVIDENCE], (size,))
                 for i in range(size):
                     mixed[i] += own[i] + (evidence[i] - old[i])
@@ -277,6 +334,9 @@ def team_step(
                     _add_gradient(
                         mixed_at, delta_at, gradient_at, room, octets, num_shared, rows, num_classes, gammas[robot]
                     )
+                if quantum > np.float32(0.0):
+                    for i in range(size):
+                        mixed[i] = np.rint(mixed[i] / quantum) * quantum
             # The bits of non-negative floats have the order of the floats.
             largest = np.int32(0)
             for i in range(size):

@@ -161,14 +161,15 @@ def apply_marks(
 
 @kernel
 def apply_weighted_marks(
-    bricks, indices, touched, words, strengths, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision,
+    bricks, indices, touched, words, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
     scratch,
 ):  # fmt: skip
-    """Add one scan's log-odds like apply_marks, with ``hit`` multiplied by the cell's strength / 255.
+    """Add one scan's log-odds like apply_marks, with a hit for each strength.
 
     - ``bricks``, ``indices``, ``touched``, ``words``: as for apply_marks.
     - ``strengths`` uint64: one byte for each cell of the scratch grid, parallel to ``words``.
-    - ``num_classes``, ``hit``, ``miss``, ``hit_other``, ``clamp_min``, ``clamp_max``, ``revision``: as for apply_marks.
+    - ``hits`` (256,) float32: log-odds increment of the hit class for each strength.
+    - ``num_classes``, ``miss``, ``hit_other``, ``clamp_min``, ``clamp_max``, ``revision``: as for apply_marks.
     - ``scratch`` (3, 9 + 8 C) uint64.
     """
     row_marks, row_hits, row_strengths = scratch[0], scratch[1], scratch[2]
@@ -186,8 +187,7 @@ def apply_weighted_marks(
         for i in range(rows * OCTETS):
             mark = all_marks[i]
             is_own = (mark == all_hits[i]) | (num_classes == 1)
-            weighted = hit * (np.float32(all_strengths[i]) / np.float32(255))
-            step = miss if mark == 1 else (weighted if is_own else hit_other)
+            step = miss if mark == 1 else (hits[all_strengths[i]] if is_own else hit_other)
             changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
             flat[first + i] = changed if mark > 0 else flat[first + i]
         _finish_brick(bricks, index, block, rows > num_shared, revision, num_classes)

@@ -82,20 +82,24 @@ def _total(cells):
 
 
 @kernel
-def _label_cells(rows, oracle, prior, labels, best, oracle_there):
-    """Find the most probable class of each cell; free is 0, ties go to the lower id.
+def _label_cells(rows, oracle, prior, tie_share, least_tie, labels, best, oracle_there, least_tied):
+    """Find the most probable class of each cell; free is 0, equal values go to the lower id.
 
     - ``rows`` (width, 64) float32: deviations of the map.
     - ``oracle`` (width, 64) float32: deviations of the oracle.
     - ``prior``: float32 log-odds h_0.
+    - ``tie_share``, ``least_tie``: float32, tolerance of ties as a share of the cell's largest |log-odds|, and its
+      least value.
     - ``labels`` (64,) int32: output, class ids.
     - ``best`` (64,) float32: output, log-odds of the label.
     - ``oracle_there`` (64,) float32: output, the oracle's log-odds of the same label.
+    - ``least_tied`` (64,) float32: output, least log-odds that ties with ``best``.
     """
     for i in range(BRICK_CELLS):
         labels[i] = np.int32(0)
         best[i] = np.float32(0.0)
         oracle_there[i] = np.float32(0.0)
+        least_tied[i] = np.float32(0.0)
     for c in range(rows.shape[0]):
         for i in range(BRICK_CELLS):
             value = rows[c, i] + prior
@@ -103,6 +107,43 @@ def _label_cells(rows, oracle, prior, labels, best, oracle_there):
             labels[i] = np.int32(c + 1) if higher else labels[i]
             oracle_there[i] = oracle[c, i] + prior if higher else oracle_there[i]
             best[i] = value if higher else best[i]
+            least_tied[i] = max(least_tied[i], abs(value))
+    for i in range(BRICK_CELLS):
+        least_tied[i] = best[i] - max(tie_share * least_tied[i], least_tie)
+
+
+@kernel
+def _num_differing(bricks, labels, least_tied, differs, prior):
+    """Number of cells in which two robots' labels differ and do not tie.
+
+    - ``bricks`` (N, width, 64) float32: deviations of the robots.
+    - ``labels`` (N, 64) int32: class ids, -1 where unknown.
+    - ``least_tied`` (N, 64) float32: least log-odds of each robot that ties with its largest.
+    - ``differs`` (64,) int32: not 0 where labels differ.
+    - ``prior``: float32 log-odds h_0.
+    """
+    num = 0
+    for i in range(BRICK_CELLS):
+        if differs[i] == 0:
+            continue
+        found = False
+        for r in range(1, labels.shape[0]):
+            for k in range(r):
+                one, other = labels[r, i], labels[k, i]
+                if one == other:
+                    continue
+                if one < 0 or other < 0:
+                    found = True
+                    break
+                there = bricks[r, min(other, bricks.shape[1]) - 1, i] + prior if other > 0 else np.float32(0.0)
+                here = bricks[k, min(one, bricks.shape[1]) - 1, i] + prior if one > 0 else np.float32(0.0)
+                if there < least_tied[r, i] and here < least_tied[k, i]:
+                    found = True
+                    break
+            if found:
+                break
+        num += np.int64(found)
+    return num
 
 
 @kernel
@@ -182,8 +223,9 @@ def _link_distance(bricks, link_ends, square):
 
 @kernel
 def compare_maps(
-    table, link_ends, prior, tie_tolerance, num_classes, scratch, int_scratch, places, distances, counts, entropies
-):
+    table, link_ends, prior, tie_share, least_tie, num_classes, scratch, int_scratch, places, distances,
+    counts, entropies,
+):  # fmt: skip
     """Contribution of each brick to the metrics.
 
     Loop invariant: the rows ``places[:b]`` of the outputs are complete, and no other row is written.
@@ -191,10 +233,11 @@ def compare_maps(
     - ``table``: BrickTable (N + 1, n) of the robots' maps and, in the last column, the oracle.
     - ``link_ends`` (L, 2) int64: robot indices.
     - ``prior``: float32 log-odds h_0.
-    - ``tie_tolerance``: float32 log-odds; a label agrees where the oracle's log-odds of it are this close to its best.
+    - ``tie_share``: float32, tolerance of ties as a share of a cell's largest |log-odds|.
+    - ``least_tie``: float32, least tolerance of ties.
     - ``num_classes``: C.
-    - ``scratch`` float32: room for N + 1 bricks of all classes and 5 of one class.
-    - ``int_scratch`` (5, 64) int32.
+    - ``scratch`` float32: room for N + 1 bricks of all classes and 6 + N of one class.
+    - ``int_scratch`` (3 + N, 64) int32.
     - ``places`` (n,) int64: row of each brick in the outputs.
     - ``distances`` (m, 2) float64: output, squared differences summed over the links and over all pairs of robots.
     - ``counts`` (m, 4 + 3 N) int32: output, cells known to any robot, of these the oracle's occupied ones, cells with
@@ -205,12 +248,12 @@ def compare_maps(
     robots = table.known.shape[0] - 1
     is_complete = link_ends.shape[0] == robots * (robots - 1) // 2
     cells_at = np.int64(scratch.ctypes.data)
-    bricks_at = cells_at + 5 * BRICK_CELLS * 4
+    bricks_at = cells_at + (6 + robots) * BRICK_CELLS * 4
     # Arrays are made from addresses: slices of arrays that own memory are reference-counted at every use.
-    cells = float_array(cells_at, (5, BRICK_CELLS))
+    cells = float_array(cells_at, (6 + robots, BRICK_CELLS))
     best, oracle_best, oracle_there, total, weighted = cells[0], cells[1], cells[2], cells[3], cells[4]
-    labels, first, differs = int_scratch[0], int_scratch[1], int_scratch[2]
-    occupied, seen = int_scratch[3], int_scratch[4]
+    oracle_tied, least_tied = cells[5], cells[6:]
+    differs, occupied, seen, labels = int_scratch[0], int_scratch[1], int_scratch[2], int_scratch[3:]
     for b in range(places.size):
         place = places[b]
         width = 1
@@ -229,11 +272,11 @@ def compare_maps(
         for k in range(link_ends.shape[0]):
             link_cells += count_ones(table.known[link_ends[k, 0], b] | table.known[link_ends[k, 1], b])
         oracle = bricks[robots]
-        _label_cells(oracle, oracle, prior, labels, oracle_best, oracle_there)
+        _label_cells(oracle, oracle, prior, tie_share, least_tie, labels[0], oracle_best, oracle_there, oracle_tied)
         num_occupied = np.int32(0)
         for i in range(BRICK_CELLS):
             in_any = np.int32(anyone >> np.uint64(i) & np.uint64(1))
-            occupied[i] = in_any if labels[i] > 0 else np.int32(0)
+            occupied[i] = in_any if labels[0, i] > 0 else np.int32(0)
             num_occupied = np.int32(num_occupied + occupied[i])
             differs[i] = np.int32(0)
         for r in range(robots):
@@ -241,27 +284,23 @@ def compare_maps(
             if r == 0 or mask != table.known[r - 1, b]:
                 for i in range(BRICK_CELLS):
                     seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
-            _label_cells(bricks[r], oracle, prior, labels, best, oracle_there)
+            _label_cells(bricks[r], oracle, prior, tie_share, least_tie, labels[r], best, oracle_there, least_tied[r])
             entropies[place, r] = _brick_entropy(bricks[r], terms, prior, best, seen, total, weighted)
             # Casts keep the sums int32; int64 sums use half as many vector lanes.
             agreeing, agreeing_occupied = np.int32(0), np.int32(0)
             for i in range(BRICK_CELLS):
-                agrees = seen[i] if oracle_there[i] >= oracle_best[i] - tie_tolerance else np.int32(0)
+                agrees = seen[i] if oracle_there[i] >= oracle_tied[i] else np.int32(0)
                 agreeing = np.int32(agreeing + agrees)
                 agreeing_occupied = np.int32(agreeing_occupied + (agrees & occupied[i]))
                 # Unknown counts as a label.
-                label = labels[i] if seen[i] > 0 else np.int32(-1)
-                first[i] = label if r == 0 else first[i]
-                differs[i] |= label ^ first[i]
+                labels[r, i] = labels[r, i] if seen[i] > 0 else np.int32(-1)
+                differs[i] |= labels[r, i] ^ labels[0, i]
             counts[place, 4 + 3 * r] = count_ones(mask)
             counts[place, 5 + 3 * r] = agreeing
             counts[place, 6 + 3 * r] = agreeing_occupied
-        num_differing = np.int32(0)
-        for i in range(BRICK_CELLS):
-            num_differing = np.int32(num_differing + (np.int32(1) if differs[i] != 0 else np.int32(0)))
         counts[place, 0] = count_ones(anyone)
         counts[place, 1] = num_occupied
-        counts[place, 2] = num_differing
+        counts[place, 2] = _num_differing(bricks[:robots], labels, least_tied, differs, prior)
         counts[place, 3] = link_cells
         repeats = num_classes if width == 1 else 1
         distances[place, 1] = repeats * _pair_distance(bricks[:robots], total, weighted)

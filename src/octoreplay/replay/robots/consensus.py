@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.mapping.consensus import Step, Update, gamma_at, team_step
+from octoreplay.mapping.consensus import Flows, Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import Float64Array
+from octoreplay.records import Float64Array, Frame, Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
+from octoreplay.replay.robots.anchor import Anchor
+from octoreplay.replay.robots.robot import Arrival, Phase, Robot, Team, Turn
 
 
 class ConsensusRobot(Robot):
@@ -32,55 +33,108 @@ class ConsensusRobot(Robot):
         self._last_step_tick = -1
         self._last_conditions: tuple[object, ...] = ()
         self._nothing = SemanticOctree(config.map.resolution, config.classes.num_classes)
+        # Bricks that got new evidence before the tick's publication, and those of them that kept its values since.
+        self._early: Int64Array = np.empty(0, np.int64)
+        self._unchanged: Int64Array = np.empty(0, np.int64)
+        self._receivers: frozenset[int] = frozenset()
+        self._anchor = Anchor(config)
+
+    def integrate(self, frames: Iterable[Frame], tick: int) -> None:
+        """Add the scans of one tick to the evidence, and to the map for rules that do so before they publish."""
+        super().integrate(frames, tick)
+        if not self._rule.adds_evidence_first or self._scan_tick < tick:
+            return
+        self._update_log_likelihood(tick)
+        step = Step(
+            self.map, (), (), self._log_likelihood, 0.0, last_log_likelihood=self._last_log_likelihood, since=tick
+        )
+        team_step([step], update=Update.ADD, revision=tick)
+        self._keep_log_likelihood(tick)
+        self._update_streams()
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Messages with the robot's map; without changes an empty delta, which keeps the link alive."""
-        self._published = self._public.advance(self.map, self.map.revisions, tick, streams=self.streams)
+        revisions = self.map.revisions.copy()
+        if self._published is not None:
+            # The last version has the values of these bricks already.
+            unchanged = self.map.find(self._unchanged)
+            unchanged = unchanged[revisions[unchanged] == self._published.version]
+            revisions[unchanged] = self._published.version - 1
+        self._early = self.map.codes[revisions == tick]
+        revisions[revisions == tick] = tick - 1
+        self._published = self._public.advance(self.map, revisions, tick, streams=self.streams)
+        self._receivers = frozenset(receivers)
         self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 
-    def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int) -> Step:
+    def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, tick: int) -> Step:
         """Step of a tick with the newest of the maps that ``arrived``; ``end_step`` must follow."""
         newest = {arrival.source: arrival for arrival in arrived}
         arrived = [newest[source] for source in sorted(newest)]
-        self._update_log_likelihood(tick)
-        gamma = factor * gamma_at(self._config.consensus, self.num_iterations)
+        self._begin_step(arrived, tick)
+        gamma = phase.gamma_factor * gamma_at(self._config.consensus, self.num_iterations)
         # Differences of published maps keep the sum over the robots in spite of rounding in packets.
         base = None if self._public.is_exact else self._published_octree(tick)
         # A brick rests if the same step with the same values changed nothing in it.
-        conditions = (gamma, *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived))
+        conditions = (
+            gamma, phase.extra_flow_bits, phase.is_settling, self._has_published(tick), self._receivers,
+            self._anchor.absent,
+            *((source, tick - held.version, step_weights[source.origin]) for source, held in arrived),
+        )  # fmt: skip
         is_steady = conditions == self._last_conditions and all(held.version == tick for _, held in arrived)
         since = self._last_step_tick if is_steady and base is None else None
         self._last_conditions, self._last_step_tick = conditions, tick
-        return self._step(arrived, step_weights, gamma, base, since)
+        return self._step(arrived, step_weights, phase, gamma, base, tick, since)
 
     def end_step(self, tick: int) -> None:
         """Complete the iteration of ``next_step``."""
         self._finish_step(tick)
-        self._update_streams()
+        self._end_tick(tick)
 
     def iterate_on_arrival(
-        self, arrived: Sequence[Arrival], step_weights: Float64Array, factor: float, tick: int
+        self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, tick: int
     ) -> float:
         """Iterate once for each of the maps that ``arrived``, in order; the largest change of a log-odds."""
         consensus = self._config.consensus
-        self._update_log_likelihood(tick)
-        # The sum over robots is kept only when both ends of a link exchange the same difference.
-        needs_base = self._rule.needs_symmetric_links or not self._public.is_exact
-        base = self._published_octree(tick) if needs_base else None
+        self._begin_step(arrived, tick)
+        factor = phase.gamma_factor
         share = factor / len(arrived) if consensus.gamma_per_arrival == "divided" else factor
         before = self.map.copy()
         for arrival in arrived:
-            step = self._step([arrival], step_weights, share * gamma_at(consensus, self.num_iterations), base)
-            team_step([step], update=self._update, revision=tick, clamp=self._config.sensor.clamp)
+            gamma = share * gamma_at(consensus, self.num_iterations)
+            # The sum over robots is kept only when both ends of a link exchange the same difference.
+            keeps_sum = self._rule.needs_symmetric_links and self._is_mutual(arrival, tick)
+            base = self._published_octree(tick) if keeps_sum or not self._public.is_exact else None
+            step = self._step([arrival], step_weights, phase, gamma, base, tick)
+            team_step(
+                [step], update=self._update, revision=tick, clamp=self._config.sensor.clamp,
+                quantum=quantum_in(self._config, phase),
+            )  # fmt: skip
             self._finish_step(tick)
-        self._update_streams()
+        self._end_tick(tick)
         # One arrival may undo the change of another, so the change over the whole tick counts.
         return self._change_since(before, tick)
 
+    def _begin_step(self, arrived: Sequence[Arrival], tick: int) -> None:
+        """Prepare the evidence for the iterations of a tick, and the revisions for what they change."""
+        if self._has_published(tick):
+            self.map.revisions[self.map.find(self._early)] = tick - 1
+        self._update_log_likelihood(tick)
+        origins = (source.origin for source, _ in arrived)
+        self._anchor.advance(origins, self.map, self._log_likelihood, self._last_log_likelihood, tick)
+
+    def _end_tick(self, tick: int) -> None:
+        """Restore the revisions of bricks with new evidence that the iterations did not change."""
+        if self._has_published(tick):
+            early = self.map.find(self._early)
+            unchanged = early[self.map.revisions[early] < tick]
+            self._unchanged = self.map.codes[unchanged]
+            self.map.revisions[unchanged] = tick
+        self._update_streams()
+
     def _step(
-        self, arrived: Sequence[Arrival], step_weights: Float64Array, gamma: float, base: SemanticOctree | None,
-        since: int | None = None,
+        self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, gamma: float,
+        base: SemanticOctree | None, tick: int, since: int | None = None,
     ) -> Step:  # fmt: skip
         """Step with the maps that ``arrived``; bricks at rest ``since`` a revision are skipped."""
         neighbours = [held.octree for _, held in arrived]
@@ -88,11 +142,27 @@ class ConsensusRobot(Robot):
             base = self._nothing
         elif base is not None and self._has_budget:
             neighbours = [self._used_once(base, source, held) for source, held in arrived]
+        target = self._log_likelihood if self._anchor.target is None else self._anchor.target
         return Step(
-            self.map, neighbours,
-            [float(step_weights[source.origin]) for source, _ in arrived], self._log_likelihood, gamma, base,
-            self._last_log_likelihood, since,
+            self.map, neighbours, [float(step_weights[source.origin]) for source, _ in arrived], target, gamma, base,
+            self._last_log_likelihood, since, self._flows(arrived, phase, tick),
         )  # fmt: skip
+
+    def _flows(self, arrived: Sequence[Arrival], phase: Phase, tick: int) -> Flows | None:
+        """Flows of the mutual links; None for a rule or a run without flows."""
+        bits = self._config.consensus.effective_flow_bits
+        if not bits:
+            return None
+        return Flows(bits + phase.extra_flow_bits, [self._is_mutual(arrival, tick) for arrival in arrived])
+
+    def _is_mutual(self, arrival: Arrival, tick: int) -> bool:
+        """True where both ends of a link published to each other in this tick."""
+        has_sent = self._has_published(tick) and arrival.source.origin in self._receivers
+        return has_sent and arrival.held.version == tick
+
+    def _has_published(self, tick: int) -> bool:
+        """True where the robot published in this tick."""
+        return self._published is not None and self._published.version == tick
 
     def _published_octree(self, tick: int) -> SemanticOctree | None:
         """The published map of this tick; None where nothing was published or, without budget, an older version."""
@@ -117,7 +187,7 @@ class ConsensusRobot(Robot):
     def _finish_step(self, tick: int) -> None:
         """Count an iteration and store its evidence."""
         self.num_iterations += 1
-        if self._rule.keeps_last_evidence:
+        if self._rule.keeps_last_evidence or self._anchor.is_used:
             self._keep_log_likelihood(tick)
 
 
@@ -131,21 +201,32 @@ class ConsensusTeam(Team[ConsensusRobot]):
     def _new_robot(self, index: int, epoch: int) -> ConsensusRobot:
         return ConsensusRobot(index, self._config, self._packet_codec, epoch, self._update)
 
-    def iterate(
-        self, turns: Sequence[Turn[ConsensusRobot]], gamma_factor: float, tick: int, threads: Executor
-    ) -> list[float]:
+    def iterate(self, turns: Sequence[Turn[ConsensusRobot]], phase: Phase, tick: int, threads: Executor) -> list[float]:
         """One iteration per robot, all robots brick by brick; in mode 'on-arrival' one iteration per arrived map."""
         consensus, clamp = self._config.consensus, self._config.sensor.clamp
         turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
         is_sync = consensus.mode == "sync"
         together = [turn for turn in turns if is_sync or not turn.arrived]
         alone = [turn for turn in turns if not is_sync and turn.arrived]
-        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, gamma_factor, tick), together))
-        changes = team_step(steps, update=self._update, revision=tick, clamp=clamp, threads=threads)
+        steps = list(threads.map(lambda t: t.robot.next_step(t.arrived, t.step_weights, phase, tick), together))
+        changes = team_step(
+            steps,
+            update=self._update,
+            revision=tick,
+            clamp=clamp,
+            quantum=quantum_in(self._config, phase),
+            threads=threads,
+        )
         list(threads.map(lambda turn: turn.robot.end_step(tick), together))
         return changes + list(
-            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, gamma_factor, tick), alone)
+            threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, phase, tick), alone)
         )
+
+
+def quantum_in(config: ResolvedRun, phase: Phase) -> float:
+    """Quantum of the iterations: rules without flows do not round while the team settles."""
+    consensus = config.consensus
+    return 0.0 if phase.is_settling and not consensus.traits.has_flows else consensus.effective_quantum
 
 
 def _from_neighbours(turn: Turn[Robot]) -> list[Arrival]:

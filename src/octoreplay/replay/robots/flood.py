@@ -18,7 +18,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
+from octoreplay.replay.robots.robot import Arrival, Phase, Robot, Team, Turn
 
 
 class FloodRobot(Robot):
@@ -80,9 +80,7 @@ class FloodTeam(Team[FloodRobot]):
     def _new_robot(self, index: int, epoch: int) -> FloodRobot:
         return FloodRobot(index, self._config, self._packet_codec, epoch)
 
-    def iterate(
-        self, turns: Sequence[Turn[FloodRobot]], gamma_factor: float, tick: int, threads: Executor
-    ) -> list[float]:
+    def iterate(self, turns: Sequence[Turn[FloodRobot]], phase: Phase, tick: int, threads: Executor) -> list[float]:
         """Sum the evidence that each robot holds; the rule has no gamma."""
-        del gamma_factor
+        del phase
         return list(threads.map(lambda turn: turn.robot.sum_up(turn.arrived, tick), turns))

@@ -12,7 +12,7 @@ from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
-from octoreplay.replay.robots.robot import Arrival, Robot, Team, Turn
+from octoreplay.replay.robots.robot import Arrival, Phase, Robot, Team, Turn
 
 REST = 8.0
 """Change of a map below which it rests [units]: rounding keeps moving masses by up to six units a tick."""
@@ -80,7 +80,7 @@ class RatioRobot(Robot):
         else:
             # Most of the mass is in transit and the rest is too coarse: new evidence is added to the last map instead.
             step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
-            (change,) = team_step([step], update=Update.BAYES, revision=tick)
+            (change,) = team_step([step], update=Update.ADD, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
         self._update_streams()
@@ -125,11 +125,9 @@ class RatioTeam(Team[RatioRobot]):
     def _new_robot(self, index: int, epoch: int) -> RatioRobot:
         return RatioRobot(index, self._config, self._packet_codec, epoch)
 
-    def iterate(
-        self, turns: Sequence[Turn[RatioRobot]], gamma_factor: float, tick: int, threads: Executor
-    ) -> list[float]:
+    def iterate(self, turns: Sequence[Turn[RatioRobot]], phase: Phase, tick: int, threads: Executor) -> list[float]:
         """Add the growth of the received sums and the new evidence to each robot's mass; the rule has no gamma."""
-        del gamma_factor
+        del phase
         masses = [(turn.robot.mass, turn.robot.growths(turn.arrived)) for turn in turns]
         running_sums.receive_team(masses, tick, threads)
         return list(threads.map(lambda turn: turn.robot.end_iteration(tick), turns))

@@ -39,6 +39,22 @@ RobotT = TypeVar("RobotT", bound="Robot")
 RobotT_co = TypeVar("RobotT_co", bound="Robot", covariant=True)
 
 
+@dataclass(frozen=True)
+class Phase:
+    """Part of a run that a tick belongs to.
+
+    ``gamma_factor`` scales gamma, and ``extra_flow_bits`` are added to ``flow_bits``, while the team settles.
+    """
+
+    gamma_factor: float = 1.0
+    extra_flow_bits: int = 0
+    is_settling: bool = False
+
+
+REPLAY = Phase()
+"""Phase of the ticks before settling."""
+
+
 @dataclass(frozen=True, eq=False)
 class Turn(Generic[RobotT_co]):
     """A robot's iterations in one tick.
@@ -121,7 +137,7 @@ class Robot(ABC):
         self.exchange = Exchange(config.packet, packet_codec)
         self._config = config
         self._caster = ScanCaster(config.sensor, config.map, num_classes)
-        self._increments = clamped_increments(config.sensor)
+        self._increments = clamped_increments(config.sensor, config.consensus.effective_quantum)
         self._is_average = config.consensus.evidence != "sum"
         if self._is_average:
             self._increments = unclamped_increments(config.sensor)
@@ -194,9 +210,7 @@ class Robot(ABC):
 
     def is_due(self, tick: int) -> bool:
         """True when the robot publishes in a tick, by its publish_period and publish_phase."""
-        robot, period = self._config.robots[self.index], self._config.network.publish_period
-        every = round((robot.publish_period or period) / period)
-        return tick % every == round(robot.publish_phase / period) % every
+        return num_due(self._config, self.index, tick - 1, tick) > 0
 
     def publication(self, receivers: Sequence[int], tick: int, *, with_unpruned: bool) -> Publication:
         """The robot's messages to its receivers in one tick, and the sizes of its map."""
@@ -233,6 +247,10 @@ class Robot(ABC):
 
     # --- iterations ---------------------------------------------------------------------------------------------------
 
+    def largest_log_odds(self) -> float:
+        """Largest |log-odds| of the map, relative to the prior."""
+        return self._change_since(SemanticOctree(self.map.resolution, self.map.num_classes), 0)
+
     def _change_since(self, before: SemanticOctree, tick: int) -> float:
         """Largest change of a log-odds since the map was ``before``; overwrites ``before``."""
         return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
@@ -240,6 +258,14 @@ class Robot(ABC):
     def _update_streams(self) -> None:
         """Update ``streams`` with the map of this tick."""
         self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
+
+
+def num_due(config: ResolvedRun, index: int, after: int, tick: int) -> int:
+    """Number of publications due after one tick up to another, by a robot's publish_period and publish_phase."""
+    robot, period = config.robots[index], config.network.publish_period
+    every = round((robot.publish_period or period) / period)
+    phase = round(robot.publish_phase / period)
+    return (tick - phase) // every - (after - phase) // every
 
 
 class Team(ABC, Generic[RobotT]):
@@ -287,8 +313,8 @@ class Team(ABC, Generic[RobotT]):
         """A robot without evidence, in a restart epoch."""
 
     @abstractmethod
-    def iterate(self, turns: Sequence[Turn[RobotT]], gamma_factor: float, tick: int, threads: Executor) -> list[float]:
+    def iterate(self, turns: Sequence[Turn[RobotT]], phase: Phase, tick: int, threads: Executor) -> list[float]:
         """Iterations of one tick at several robots; each robot's largest change of a log-odds.
 
-        ``gamma_factor`` scales gamma. The result does not depend on ``threads``.
+        The result does not depend on ``threads``.
         """

@@ -18,7 +18,7 @@ from octoreplay.replay.robots.robot import Robot, Team
 TEAMS: Mapping[str, Callable[[ResolvedRun, PacketCodec], Team[Any]]] = MappingProxyType(
     {
         "gradient": partial(ConsensusTeam, update=Update.GRADIENT),
-        "bayes": partial(ConsensusTeam, update=Update.BAYES),
+        "bayes": partial(ConsensusTeam, update=Update.MIX),
         "natural": partial(ConsensusTeam, update=Update.NATURAL),
         "merge": partial(ConsensusTeam, update=Update.MERGE),
         "local": partial(ConsensusTeam, update=Update.COPY),

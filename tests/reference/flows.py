@@ -1,0 +1,51 @@
+"""Flows: coarse amounts of log-odds that two robots exchange, equal and opposite at both ends of a link.
+
+Maps are deviations from the prior, (M, K) float64, column 0 zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from octoreplay.records import Float64Array
+
+BITS_PER_SETTLING_TICK = 2
+"""Growth of flow_bits in every settling tick."""
+EXTRA_SETTLING_TICKS = 8
+"""Least addition to the default maximum number of settling ticks."""
+
+
+def num_finer_ticks(maps: Float64Array, flow_bits: int, quantum: float) -> int:
+    """Return the number of settling ticks until every step of ``maps`` (N, M, K) is the quantum; 0 without flows."""
+    largest = np.abs(maps).max(initial=0.0)
+    if not flow_bits or largest == 0.0:
+        return 0
+    num_ticks = 0
+    while flow_step(largest, flow_bits + BITS_PER_SETTLING_TICK * num_ticks) > quantum:
+        num_ticks += 1
+    return num_ticks
+
+
+def flow_step(largest: float | Float64Array, flow_bits: int) -> Float64Array:
+    """Return 2^(floor(log2 m) - flow_bits) of the largest |log-odds| m; 0 where m is 0."""
+    # m = fraction * 2^exponent with a fraction in [1/2, 1), so that floor(log2 m) is exponent - 1, exactly.
+    _, exponent = np.frexp(largest)
+    return np.where(largest > 0.0, np.ldexp(1.0, exponent - 1 - flow_bits), 0.0)
+
+
+def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: float) -> Float64Array:
+    """Return e (M, 1) of two published maps: max(2^(floor(log2 m) - flow_bits), quantum), m their largest |log-odds|.
+
+    It is ``quantum`` where both maps are 0.
+    """
+    largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1, keepdims=True)
+    return np.maximum(flow_step(largest, flow_bits), quantum)
+
+
+def flow(own: Float64Array, other: Float64Array, weight: float, steps: Float64Array) -> Float64Array:
+    """Return f = e trunc(w (h_j - h_i) / e) with w = 2 epsilon A_ij, towards zero; -f at the other end.
+
+    w and the product w (h_j - h_i) are float32: another precision would give other flows by a whole step.
+    """
+    amounts = np.float32(weight) * (other - own).astype(np.float32)
+    return np.trunc(amounts.astype(np.float64) / steps) * steps
