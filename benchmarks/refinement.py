@@ -113,6 +113,5 @@ def _aligned(config: RunConfig) -> RunConfig:
     return aligned_config(config, align_logs(config).teams[0])
 
 
-
 if __name__ == "__main__":
     main()
