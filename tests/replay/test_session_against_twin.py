@@ -55,7 +55,7 @@ def test_six_robots(rule, mode, topology):
     assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
 
 
-@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(7, RULES, MODES, TOPOLOGIES))
+@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(9, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""
     outcome = compare(
@@ -74,7 +74,7 @@ def test_settling_ends_at_its_maximum(settle_max, num_settling_ticks):
 
 
 @pytest.mark.parametrize(
-    ("rule", "mode", "topology"), one_in(2, ["gradient", "natural"], MODES, ["ring", "line", "complete"])
+    ("rule", "mode", "topology"), one_in(5, ["gradient", "natural"], MODES, ["ring", "line", "complete"])
 )
 def test_maps_rounded_to_the_quantum(rule, mode, topology):
     """Near the middle of two multiples float32 and float64 round apart; the rule's contraction keeps that small."""
@@ -85,7 +85,7 @@ def test_maps_rounded_to_the_quantum(rule, mode, topology):
     assert outcome.num_compared_maps >= 4 * 16
 
 
-@pytest.mark.parametrize(("rule", "evidence", "mode"), one_in(5, RULES, ["time-average", "cell-average"], MODES))
+@pytest.mark.parametrize(("rule", "evidence", "mode"), one_in(7, RULES, ["time-average", "cell-average"], MODES))
 def test_average_readings(rule, evidence, mode):
     compare(SMALL, topology="line", rule=rule, mode=mode, evidence=evidence, settle=0, with_metrics=True, every=5)
 
@@ -126,7 +126,7 @@ def test_kinds_of_sensors(sensors):
     compare(shape, seed=4, topology="line", rule="gradient", settle=0, every=8)
 
 
-@pytest.mark.parametrize(("rule", "topology", "mode"), one_in(5, RULES, ["complete", "star"], MODES))
+@pytest.mark.parametrize(("rule", "topology", "mode"), one_in(7, RULES, ["complete", "star"], MODES))
 def test_robots_that_leave(rule, topology, mode):
     outcome = compare(
         SMALL, topology=topology, rule=rule, mode=mode, after_end="leave", settle=4, settle_tolerance=1e-3, every=3,
@@ -142,7 +142,7 @@ STEPS_AND_SCHEDULES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("mode", "parameters"), one_in(4, MODES, STEPS_AND_SCHEDULES), ids=str)
+@pytest.mark.parametrize(("mode", "parameters"), one_in(5, MODES, STEPS_AND_SCHEDULES), ids=str)
 def test_steps_and_schedules(parameters, mode):
     compare(SMALL, topology="star", rule="natural", mode=mode, settle=0, every=9, **parameters)
     compare(SMALL, topology="star", rule="gradient", mode=mode, settle=0, every=9, **parameters)
