@@ -107,17 +107,11 @@ def align_with_bar(
     guesses: Mapping[str, Sequence[float]] | None = None,
 ) -> Alignment:
     """Align the robots of a configuration from the evidence in their own frames, with a progress bar."""
-    from octoreplay.replay.alignment import align_robots
-    from octoreplay.replay.own_maps import own_maps
+    from octoreplay.replay.alignment import align_evidence
 
     with progress_bar("align") as update:
-        return align_robots(
-            config,
-            own_maps(config, evidence),
-            dof=dof,
-            guesses=guesses,
-            sightings=[own.sightings for own in evidence],
-            progress=lambda share: update(share, None, ""),
+        return align_evidence(
+            config, evidence, dof=dof, guesses=guesses, progress=lambda share: update(share, None, "")
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from octoreplay.config.fields import check_ranges, parameter
 from octoreplay.errors import ConfigError
@@ -52,13 +53,13 @@ def rounded_sensor(sensor: SensorConfig, quantum: float) -> SensorConfig:
     """
     if quantum == 0.0:
         return sensor
-    rounded: dict[str, float | None] = {}
+    rounded: dict[str, Any] = {}
     for name in ("hit", "miss", "hit_other", "clamp_min", "clamp_max"):
         value = getattr(sensor, name)
         rounded[name] = None if value is None else round(value / quantum) * quantum
         if value and rounded[name] == 0.0:
             raise ConfigError(f"quantum: {quantum:g} rounds {name} {value:g} to 0; choose a smaller quantum, or 0")
-    return dataclasses.replace(sensor, **rounded)  # type: ignore[arg-type]
+    return dataclasses.replace(sensor, **rounded)
 
 
 @dataclass(frozen=True)

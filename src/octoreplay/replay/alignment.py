@@ -25,7 +25,7 @@ from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots
 from octoreplay.registration.team import TeamAlignment, align_team
-from octoreplay.replay.own_maps import own_evidences, own_map_of, own_maps
+from octoreplay.replay.own_maps import OwnEvidence, own_evidences, own_map_of, own_maps
 from octoreplay.replay.priors import Priors
 from octoreplay.result import Result
 from octoreplay.transforms import inverse, numbers_of, pose_difference, transform_of
@@ -165,13 +165,29 @@ def align_logs(
 
     resolved = resolve(config.with_parameters({"strict_frames": False}))
     evidence = own_evidences(resolved, progress=lambda share: show(share / 2), num_threads=num_threads)
+    return align_evidence(
+        config, evidence, dof=dof, guesses=guesses, progress=lambda share: show((1 + share) / 2),
+        num_threads=num_threads,
+    )  # fmt: skip
+
+
+def align_evidence(
+    config: RunConfig,
+    evidence: Sequence[OwnEvidence],
+    *,
+    dof: int = 4,
+    guesses: Frames | None = None,
+    progress: Callable[[float], None] | None = None,
+    num_threads: int | None = None,
+) -> Alignment:
+    """Return the frames of a team's robots from the evidence that their logs give, as ``align_robots`` does."""
     return align_robots(
         config,
         own_maps(config, evidence),
         dof=dof,
         guesses=guesses,
         sightings=[own.sightings for own in evidence],
-        progress=lambda share: show((1 + share) / 2),
+        progress=progress,
         num_threads=num_threads,
     )
 
@@ -335,7 +351,7 @@ def _configured(config: RunConfig) -> list[Float64Array]:
 def _candidates(
     config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames, priors: Priors
 ) -> dict[tuple[int, int], list[Float64Array]]:
-    """Known transforms between the maps of pairs: those those of the configuration, guesses, and those of the logs."""
+    """Known transforms between the maps of pairs: those of the configuration, guesses, and those of the logs."""
     configured = _configured(config)
     # A robot with a frame and one without are not related by the identity.
     is_known = [robot.T_team_map is not None for robot in config.robots]
