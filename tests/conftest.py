@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from support import long_suite
 from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
@@ -18,6 +19,11 @@ if not IS_COMPILED:
     from support import plain_intrinsics
 
     plain_intrinsics.install()
+
+# Random tests try the same examples in every run. `--hypothesis-profile explore` tries new ones.
+settings.register_profile("fixed", derandomize=True, deadline=None)
+settings.register_profile("explore", deadline=None)
+settings.load_profile("fixed")
 
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
 

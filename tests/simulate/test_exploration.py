@@ -140,7 +140,7 @@ def reference_dijkstra(passable: np.ndarray, start: tuple[int, int]) -> dict[tup
     return best
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.integers(2, 9), st.floats(0.3, 1.0))
 def test_shortest_paths_equal_the_reference(seed, rows, columns, density):
     rng = np.random.default_rng(seed)

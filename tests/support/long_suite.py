@@ -26,6 +26,6 @@ def examples(number: int) -> Callable[[Any], Any]:
 
     def decorate(test: Any) -> Any:
         max_examples = number if is_long_suite else -(-number // 5)
-        return pytest.mark.examples(settings(max_examples=max_examples, deadline=None)(test))
+        return pytest.mark.examples(settings(max_examples=max_examples)(test))
 
     return decorate

@@ -115,7 +115,7 @@ def test_topics_are_filtered_and_iterators_are_independent(tmp_path):
     st.sampled_from([CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD]),
     st.booleans(), st.booleans(), st.booleans(),
 )  # fmt: skip
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 def test_messages_of_any_mcap_are_in_log_time_order(
     tmp_path, stamps, compression, use_chunking, has_index, has_summary
 ):
@@ -183,7 +183,7 @@ def test_complete_messages_of_a_cut_uncompressed_chunk_are_read(tmp_path):
 
 
 @given(st.binary(max_size=200), st.integers(0, 2000), st.integers(1, 40))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
 def test_damaged_mcaps_raise_only_input_errors(tmp_path, noise, position, length):
     path = tmp_path / "damaged.mcap"
     data = bytearray(write_plain_mcap(path, [("/a", i, text(str(i))) for i in range(20)], chunk_size=200).read_bytes())
@@ -234,7 +234,7 @@ def test_all_complete_messages_before_the_cut_of_a_bag_are_read(tmp_path, compre
 
 
 @given(st.binary(max_size=60), st.integers(0, 20000), st.integers(1, 40))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
 def test_damaged_bags_raise_only_input_errors(tmp_path, noise, position, length):
     path = tmp_path / "damaged.bag"
     path.unlink(missing_ok=True)

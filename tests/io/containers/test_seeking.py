@@ -197,7 +197,7 @@ def test_a_range_gives_the_messages_of_the_whole_log_in_it(name, first, last, sh
 
 
 @given(st.lists(st.tuples(st.sampled_from(TOPICS), st.integers(0, 20)), max_size=30), st.integers(0, 20), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_mcap_gives_any_range(stamps, start, data):
     stop = data.draw(st.integers(start, 21))
     use_chunking = data.draw(st.booleans())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -148,7 +148,6 @@ def test_more_binary_points_than_the_header_gives_are_refused(tmp_path):
     read_pcd(save(tmp_path / "a.pcd", HEADER.format("binary"), POINTS.tobytes() + b"\n"))
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=400))
 def test_random_data_is_refused_in_one_sentence(tmp_path_factory, body):
     path = tmp_path_factory.getbasetemp() / "any.pcd"
@@ -164,7 +163,6 @@ literals = st.binary(min_size=1, max_size=32)
 copies = st.tuples(st.integers(3, 264), st.integers(1, 8192))
 
 
-@settings(deadline=None)
 @given(st.lists(st.one_of(literals, copies), max_size=30))
 def test_lzf_literals_and_copies_are_unpacked(pieces):
     packed, plain = bytearray(), bytearray()

@@ -185,7 +185,7 @@ def test_counts_are_reset():
     assert links.take_counts()[0, 1] == LinkCounts()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     sends=st.lists(st.tuples(st.integers(0, 20), st.integers(1, 300), st.booleans()), max_size=40),
     rate=st.sampled_from([None, 50.0, 500.0]),
