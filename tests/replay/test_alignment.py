@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,36 @@ def test_a_guess_is_verified_and_never_trusted():
     guess = {"ant": numbers_of(np.eye(4)), "bee": numbers_of(T_village_map((1.0, 0.0)))}
     with pytest.raises(InputError, match="no two of the 2 robots could be aligned; the best pair is ant and bee"):
         check_aligned(align_robots(team_config("ant", "bee"), empty, guesses=guess))
+
+
+def test_each_guess_is_confirmed_or_named(maps):
+    far = T_village_map((20.0, 0.0), turns=3)
+    for guess, is_right in ((TRUTH["bee"], True), (far, False)):
+        guesses = {"ant": numbers_of(TRUTH["ant"]), "bee": numbers_of(guess)}
+        aligned = align_robots(team_config("ant", "bee"), maps[:2], guesses=guesses)
+        assert aligned.teams[0][1].origin.endswith("; agrees with the guesses") == is_right
+        assert len(aligned.notes) == (0 if is_right else 1)
+    assert aligned.notes[0].startswith("bee is aligned with ant ")
+    assert aligned.notes[0].endswith(" and 180.0 degrees from where the guesses place it: they are not used")
+    (alone,) = align_robots(team_config("ant", "bee"), maps[:2], guesses={"bee": numbers_of(far)}).notes
+    assert alone == "the guess for bee is not used: it needs that of another robot"
+
+
+def test_a_given_pose_that_tilts_the_team_is_named(maps):
+    upside_down = TRUTH["ant"] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    aligned = align_robots(team_config(given("ant", upside_down), "bee"), maps[:2])
+    tilted = "the T_team_map given for ant tilts its z axis by 180 degrees; --dof 4 expects vertical axes"
+    assert tilted in aligned.notes
+
+
+def test_refusals_name_the_option_that_may_help():
+    nothing = [empty_map(), empty_map()]
+    for dof, remedy in (
+        (4, "fewer than 150; where the z axis of a map is not vertical, use --dof 6 (docs"),
+        (6, "fewer than 1600; finer cells may give enough (--resolution 0.15) (docs"),
+    ):
+        with pytest.raises(InputError, match=re.escape(remedy)):
+            check_aligned(align_robots(team_config("ant", "bee"), nothing, dof=dof))
 
 
 def test_equal_maps_are_aligned_exactly_and_named(maps):

@@ -47,9 +47,19 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
             yield word
         else:
             following = next(words, None)
-            yield f"--align={following}" if following in _ALIGN_VALUES else "--align=before"
-            if following is not None and following not in _ALIGN_VALUES:
+            if following in _ALIGN_VALUES:
+                yield f"--align={following}"
+                continue
+            yield "--align=before"
+            if following is not None:
+                _check_input(following)
                 yield from _with_align_values([following, *words])
+
+
+def _check_input(word: str) -> None:
+    """Raise UsageError for a word after ``--align`` that is neither an option nor a path that exists."""
+    if not word.startswith("-") and not Path(word).exists():
+        raise click.UsageError(f"'{word}' is no file and no value of --align ({', '.join(_ALIGN_VALUES)})")
 
 
 @with_parameters()

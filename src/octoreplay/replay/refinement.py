@@ -169,7 +169,8 @@ def _check_frames(config: ResolvedRun) -> None:
     if frames_warning([(robot, robot.frame) for robot in config.robots if robot.frame is not None]) is not None:
         names = ", ".join(robot.robot_id for robot in config.robots if robot.T_team_map is None)
         raise ConfigError(
-            f"T_team_map: {names} have none, and nothing relates their map frames; find it with 'octoreplay align'"
+            f"T_team_map: {names} have none, and nothing relates their map frames; find it with 'octoreplay align', or"
+            " give it in the team file"
         )
 
 
