@@ -181,9 +181,7 @@ def test_robots_without_frames_that_are_related_are_refused(tmp_path: Path) -> N
     poses = tmp_path / "p.tum"
     robots = tuple(dataclasses.replace(robot, pose_topic=None, pose_file=poses) for robot in pair_robots())
     poses.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
-    message = (
-        "T_team_map: husky_1, husky_2 have none, and nothing relates their map frames; find it with"
-    )
+    message = "T_team_map: husky_1, husky_2 have none, and nothing relates their map frames; find it with"
     refused(tmp_path, robots, 2, message)
 
 

@@ -19,7 +19,7 @@ from octoreplay.config.subteam import subteam
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.sightings import Sightings
-from octoreplay.records import Float64Array
+from octoreplay.records import TEAM_ORIGIN, Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
@@ -397,7 +397,7 @@ def _robot_frame(
     if robot.partner is None:
         is_given = robot.index in given
         verified = " and verified by its overlaps" if robot.is_verified else ""
-        origin = f"given in the team file{verified}" if is_given else "frame of the team"
+        origin = f"given in the team file{verified}" if is_given else TEAM_ORIGIN
         return RobotFrame(robot_id, T, None, origin, None, is_given)
     turn = np.kron(np.eye(2), T_team_own[:3, :3])
     # From the origin of the map to that of the map frame.
