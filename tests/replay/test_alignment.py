@@ -17,8 +17,8 @@ from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.replay.alignment import Alignment, align_robots, aligned_config, check_aligned
 from octoreplay.report.alignment_files import PAIR_COLUMNS, write_alignment
-from octoreplay.report.alignment_plots import write_alignment_figures
-from octoreplay.report.alignment_tables import alignment_tables
+from octoreplay.report.alignment_plots import pair_figure, team_figure, write_alignment_figures
+from octoreplay.report.alignment_tables import alignment_tables, pair_numbers
 from octoreplay.report.tables import terminal
 from octoreplay.transforms import inverse, numbers_of, pose_difference
 from support.village_maps import T_village_map, empty_map, team_config, village_map
@@ -200,3 +200,33 @@ def test_figures_are_of_the_team_and_of_every_pair(alignment, tmp_path):
     written = write_alignment_figures(dataclasses.replace(alignment, pairs=alignment.pairs[:1]), tmp_path)
     assert written == [tmp_path / "team.png", tmp_path / "pair_ant_bee.png"]
     assert all(path.stat().st_size > 1000 for path in written)
+
+
+def test_figures_name_robots_verdicts_and_frames_and_keep_the_colours(alignment):
+    team = team_figure(alignment)
+    assert team.get_suptitle() == "3 of 4 robots aligned"
+    assert [text.get_text() for text in team.legends[0].get_texts()] == ["ant", "bee", "cow", "dog (left out)"]
+    before, after = team.axes
+    assert (before.get_xlabel(), after.get_xlabel()) == ("x [m], frames as configured", "x [m], map frame of ant")
+    assert np.ptp(before.get_xlim()) == pytest.approx(np.ptp(after.get_xlim()))
+    colors = [collection.get_facecolor()[0].tolist() for collection in after.collections[::2]]
+    refused = next(pair for pair in alignment.pairs if not pair.is_accepted)
+    for pair, title in ((alignment.pairs[1], "after"), (refused, "best pose (refused)")):
+        figure = pair_figure(alignment, pair)
+        first, second = IDS[pair.first], IDS[pair.second]
+        assert figure.get_suptitle().startswith(
+            f"{first} and {second}: {'accepted' if pair.is_accepted else 'refused'}"
+        )
+        assert figure.axes[1].get_title(loc="left") == title
+        assert figure.axes[1].get_xlabel() == f"x [m], map frame of {first}"
+        assert figure.axes[1].collections[0].get_facecolor()[0].tolist() == colors[pair.first]
+    squares = figure.axes[0].collections[0].get_paths()[0].get_extents()
+    assert (squares.width, squares.height) == pytest.approx((0.3, 0.3))
+
+
+def test_without_a_vertical_axis_numbers_that_do_not_count_are_left_out(alignment):
+    assert pair_numbers(alignment.pairs[0], 4)["L"] != "-"
+    numbers = pair_numbers(alignment.pairs[0], 6)
+    assert (numbers["q_g"], numbers["L"]) == ("-", "-")
+    figure = team_figure(dataclasses.replace(alignment, dof=6))
+    assert figure.axes[1].get_xlabel() == "longest extent [m], map frame of ant"
