@@ -190,9 +190,9 @@ def test_files_hold_every_pair_and_frame(alignment, tmp_path):
     assert [row["accepted"] for row in rows] == ["True", "True", "False", "True", "False", "False"]
     content = json.loads(json_path.read_text())
     assert content["left_out"] == ["dog"]
-    frame = content["teams"][0][1]
+    frame = content["components"][0][1]
     assert frame["T_team_map"] == list(numbers_of(alignment.teams[0][1].T_team_map))
-    assert np.array(frame["covariance"]).shape == (6, 6)
+    assert np.sqrt(np.diag(frame["covariance"])) == pytest.approx(frame["T_team_map_sigma"], abs=1e-6)
     assert len(content["pairs"]) == 6
 
 

@@ -51,7 +51,7 @@ dof_option = click.option(
 @click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
               help="transforms T_team_map to try, which are used only where the maps verify them")  # fmt: skip
 @click.option("--components", is_flag=True,
-              help="write further groups of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
+              help="write further components of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
 @click.option("--csv", type=existing_path, metavar="FILE.csv", help="write the numbers of all pairs as CSV")
 @click.option("--json", type=existing_path, metavar="FILE.json",
               help="write frames, covariances and pairs as JSON")  # fmt: skip
