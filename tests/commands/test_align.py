@@ -136,6 +136,13 @@ def test_wrong_inputs_are_named(tmp_path):
     assert not out.exists()
 
 
+@pytest.mark.parametrize(("own", "following"), [((), "run"), (("--own-frames",), "align")])
+def test_simulate_names_the_next_command(own, following, tmp_path):
+    size = ("--robots", 1, "--duration", 1, "--rate", 1, "--image", "16x12", "--world-size", 20)
+    done = octoreplay("simulate", "team", *size, *own, folder=tmp_path)
+    assert f"next: octoreplay {following} team/team.yaml -o team/" in done.stdout
+
+
 @long
 def test_a_simulated_team_with_frames_of_its_own_is_aligned(tmp_path):
     simulate_team(tmp_path / "team", SimulationConfig(num_robots=3, duration=60.0, own_frames=True, seed=0))

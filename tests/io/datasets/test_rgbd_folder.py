@@ -242,6 +242,14 @@ def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
     assert list((tmp_path / "out").iterdir()) == []
 
 
+def test_the_poses_are_in_the_named_frame(tmp_path):
+    folder = seven_scenes(tmp_path / "in")
+    for options, name in (({}, "map"), ({"map_frame": "odom"}, "odom")):
+        import_rgbd(folder, tmp_path / "a.mcap", rate=1.0, **options)
+        messages = read_messages(tmp_path / "a.mcap")
+        assert {odometry.header.frame_id for _, odometry in messages["/a/odom"]} == {name}
+
+
 def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
     folder = seven_scenes(tmp_path / "in")
     import_rgbd(folder, tmp_path / "a.mcap", rate=1.0)
