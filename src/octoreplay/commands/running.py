@@ -57,7 +57,7 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
 
 
 def _check_input(word: str) -> None:
-    """Raise UsageError for a word after ``--align`` that is no option, has no file suffix, and is no existing folder."""
+    """Raise UsageError for a word after ``--align`` that is no option, has no suffix, and is no existing folder."""
     if not word.startswith("-") and not Path(word).suffix and not Path(word).exists():
         raise click.UsageError(f"'{word}' is no file and no value of --align ({', '.join(_ALIGN_VALUES)})")
 
