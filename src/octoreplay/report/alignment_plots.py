@@ -88,7 +88,8 @@ def pair_figure(alignment: Alignment, pair: PairAlignment) -> Figure:
         for T in (T_before, pair.T_first_second)
     )
     verdict = "accepted" if pair.is_accepted else f"refused: {pair.refusal}"
-    numbers = ", ".join(f"{name} {value}" for name, value in pair_numbers(pair, alignment.dof).items())
+    shown = pair_numbers(pair, alignment.dof).items()
+    numbers = ", ".join(f"{name} {value}" for name, value in shown if value != "-")
     titles = ("before", "after" if pair.is_accepted else "best pose (refused)")
     frames, edge = (f"map frame of {first}",) * 2, alignment.maps[i].resolution
     return _before_and_after(f"{first} and {second}: {verdict}\n{numbers}", view, (before, after), titles, frames, edge)
