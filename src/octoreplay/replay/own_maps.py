@@ -15,6 +15,7 @@ from octoreplay.io.robots.sightings import Sightings, read_sightings
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
+from octoreplay.records import FrameCounts
 from octoreplay.registration.measured_points import MeasuredPoints
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.run_metrics import PairMetrics
@@ -23,11 +24,12 @@ _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class OwnEvidence(NamedTuple):
-    """Evidence of one robot in its own map frame, its measured points, and places from its logs."""
+    """Evidence of one robot in its own map frame, its measured points, places from its logs, and its frames."""
 
     octree: SemanticOctree
     measured: MeasuredPoints
     sightings: Sightings
+    counts: FrameCounts
 
 
 def own_maps(config: RunConfig, evidence: Sequence[OwnEvidence]) -> list[OwnMap]:
@@ -71,7 +73,7 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
             measured.add_scan(frame, config.sensor)
-        return OwnEvidence(octree, measured, read_sightings(log, config.time))
+        return OwnEvidence(octree, measured, read_sightings(log, config.time), log.counts)
 
 
 def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence]) -> tuple[PairMetrics, ...]:
