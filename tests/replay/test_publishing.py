@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from octoreplay.config.network import ScheduleEntry
+from octoreplay.config.rules import RULES
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.replay import session as session_module
@@ -135,3 +136,16 @@ def test_frames_beyond_the_largest_number_of_ticks_end_the_run(monkeypatch):
     sources = [FrameList((*frames, ages_later)), *(FrameList(()) for _ in config.robots[1:])]
     with pytest.raises(InputError, match=r"span more than 50 ticks of 1 s; check the stamps, or give clock"):
         list(Session(config, sources, ThreadPoolExecutor(1)).ticks())
+
+
+@pytest.mark.parametrize("rule", ["gradient", "bayes", "flood", "ratio", "merge", "local"])
+@pytest.mark.parametrize("mode", ["sync", "on-arrival"])
+def test_leaves_and_sizes_are_those_of_the_whole_map(rule, mode):
+    if mode not in RULES[rule].modes:
+        pytest.skip("the rule has no such mode")
+    schedule = (ScheduleEntry(4.0, 7.0, robots_off=("robot_1",), forget=rule != "ratio"),)
+    config = configured(rule=rule, mode=mode, topology="ring", schedule=schedule, packets="full", settle_max=6)
+    session = session_of(config)
+    for _ in session.ticks():
+        for robot in session.team.robots:
+            assert robot.size == robot.map.streams().size

@@ -210,9 +210,7 @@ class SemanticOctree:
         Eight sibling leaves whose values differ by at most ``tolerance`` become one leaf. Without ``prune``, every
         known finest cell is a leaf.
         """
-        return encode_bricks(
-            self.bricks, _code_order(self, indices), self.num_classes, prune=prune, tolerance=tolerance
-        )
+        return encode_bricks(self.bricks, code_order(self, indices), self.num_classes, prune=prune, tolerance=tolerance)
 
     def leaves(self, prior: float = 0.0, *, occupied_only: bool = False) -> LeafTable:
         """Return all leaves in Morton order, or those with a class that is more probable than free.
@@ -315,7 +313,7 @@ def brick_table(octrees: Sequence[SemanticOctree], codes: Int64Array, since: int
     return table
 
 
-def _code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int64Array:
+def code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int64Array:
     """Return the indices (n,) of the bricks (all, or ``indices``) with a known cell, in the order of their codes."""
     chosen = np.arange(octree.num_bricks) if indices is None else indices
     chosen = chosen[octree.bricks.known[chosen] != 0]

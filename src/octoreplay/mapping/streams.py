@@ -12,6 +12,20 @@ from octoreplay.mapping.kernels.storage import Bricks
 from octoreplay.records import BoolArray, Float32Array, Int32Array, Int64Array, UInt8Array, UInt64Array, read_only
 
 
+class StreamSize(NamedTuple):
+    """Numbers of words, leaves, vector leaves and other values of a stream."""
+
+    num_words: int = 0
+    num_leaves: int = 0
+    num_vectors: int = 0
+    num_own_values: int = 0
+
+    def num_bytes(self, num_classes: int) -> int:
+        """Size of the stream's four arrays [byte]."""
+        num_values = self.num_leaves + self.num_own_values
+        return 2 * self.num_words + 4 * num_values + mask_bytes(num_classes) * self.num_vectors
+
+
 class TreeStreams(NamedTuple):
     """Depth-first octree of L leaves and C classes.
 
@@ -33,9 +47,9 @@ class TreeStreams(NamedTuple):
         return self.values.size
 
     @property
-    def num_bytes(self) -> int:
-        """Size of the four arrays [byte]."""
-        return sum(array.nbytes for array in self)
+    def size(self) -> StreamSize:
+        """Numbers of elements of the four arrays."""
+        return StreamSize(self.words.size, self.values.size, len(self.masks), self.own_values.size)
 
 
 class BrickMasks(NamedTuple):
@@ -74,6 +88,16 @@ def encode_bricks(
     Eight sibling leaves whose values differ by at most ``tolerance`` become one leaf. Without ``prune``, every known
     finest cell is a leaf.
     """
+    streams = empty_streams(bricks, order, num_classes, prune=prune)
+    totals = np.zeros(4, np.int64)
+    scratch = encoder_scratch(num_classes, is_lossy=prune and tolerance > 0)
+    packets.encode_bricks(bricks, order, num_classes, prune, np.float32(tolerance), scratch, *streams, totals)
+    words, values, masks, own_values = streams
+    return TreeStreams(words[: totals[0]], values[: totals[1]], masks[: totals[2]], own_values[: totals[3]])
+
+
+def empty_streams(bricks: Bricks, order: Int64Array, num_classes: int, *, prune: bool = True) -> TreeStreams:
+    """Return memory for the stream of the bricks ``order`` (n,), with room for what the encoder writes."""
     # Upper bounds: every known cell is a leaf, and the cells of every class row are different.
     num_cells = np.bitwise_count(bricks.known[order])
     has_rows = bricks.masks[order].any(axis=1)
@@ -81,20 +105,15 @@ def encode_bricks(
     num_leaves = int(np.where(one_leaf, 1, num_cells).sum())
     num_masks = int(num_cells[has_rows].sum())
     num_own = int(np.bitwise_count(bricks.masks[order]).sum()) * storage.OCTETS
-    streams = TreeStreams(
+    return TreeStreams(
         np.empty(order.size * (storage.BRICK_DEPTH + 9) + 1, np.uint16),
         np.empty(num_leaves + 1, np.float32),
         np.empty((num_masks + 1, mask_bytes(num_classes)), np.uint8),
         np.empty(num_own + num_classes, np.float32),
     )
-    totals = np.zeros(4, np.int64)
-    scratch = _encoder_scratch(num_classes, is_lossy=prune and tolerance > 0)
-    packets.encode_bricks(bricks, order, num_classes, prune, np.float32(tolerance), scratch, *streams, totals)
-    words, values, masks, own_values = streams
-    return TreeStreams(words[: totals[0]], values[: totals[1]], masks[: totals[2]], own_values[: totals[3]])
 
 
-def _encoder_scratch(num_classes: int, *, is_lossy: bool) -> packets.EncoderScratch:
+def encoder_scratch(num_classes: int, *, is_lossy: bool = False) -> packets.EncoderScratch:
     """Return scratch memory for the encoder."""
     most_rows = storage.OCTETS * (num_classes + 1)
     low = np.empty((storage.BRICK_DEPTH + 1, 8, num_classes), np.float32)

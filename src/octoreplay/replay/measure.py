@@ -215,7 +215,7 @@ class TickMeasurer:
             num_iterations=robot.num_iterations,
             agreement=float(comparison.agreement[robot.index]),
             agreement_occupied=float(comparison.agreement_occupied[robot.index]),
-            num_leaves=robot.streams.num_leaves,
+            num_leaves=robot.size.num_leaves,
             num_cells=num_cells,
             observed_volume=num_cells * robot.map.resolution**3,
             entropy_bits=float(comparison.entropy_bits[robot.index]),

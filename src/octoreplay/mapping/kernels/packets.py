@@ -461,6 +461,38 @@ def encode_bricks(bricks, order, num_classes, prune, tolerance, scratch, words, 
 
 
 @kernel
+def measure_chunks(
+    bricks, order, starts, rows, num_classes, scratch, words, values, masks, own_values, chunk_depth, totals,
+    leaf_values,
+):  # fmt: skip
+    """Count the lossless streams of some chunks: nodes at one depth.
+
+    - ``bricks``, ``order``, ``num_classes``, ``scratch``: as for encode_bricks; the bricks of a chunk are consecutive.
+    - ``starts`` (m + 1,) int64: position of each chunk's first brick in ``order``, then n.
+    - ``rows`` (m,) int64: row of each chunk in ``totals`` and ``leaf_values``.
+    - ``words``, ``values``, ``masks``, ``own_values``: scratch, as for encode_bricks.
+    - ``chunk_depth``: depth of the chunks.
+    - ``totals`` (r, 4) int64: output, numbers of each array's elements; the words include those of the nodes above.
+    - ``leaf_values`` (r, C) float32: output, values of each chunk that is one leaf.
+    """
+    for n in range(rows.size):
+        counts, leaf = totals[rows[n]], leaf_values[rows[n]]
+        for i in range(4):
+            counts[i] = 0
+        encode_bricks(
+            bricks, order[starts[n] : starts[n + 1]], num_classes, True, np.float32(0.0), scratch, words, values, masks,
+            own_values, counts,
+        )  # fmt: skip
+        if counts[0] == chunk_depth:
+            own = 0
+            for c in range(num_classes):
+                leaf[c] = values[0]
+                if counts[2] > 0 and masks[0, c >> 3] >> np.uint8(c & 7) & np.uint8(1):
+                    leaf[c] = own_values[own]
+                    own += 1
+
+
+@kernel
 def _even_bits(word):
     """Return the even bits of ``word`` uint64 as 8 bits."""
     x = word & np.uint64(0x5555)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.mapping.streams import TreeStreams
 
 
 class Source(NamedTuple):
@@ -21,14 +20,12 @@ class Source(NamedTuple):
 class HeldMap:
     """Immutable state of a robot's map, at the robot itself or at another.
 
-    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio',
-    ``streams`` the octree's streams if they are computed already.
+    All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio'.
     """
 
     octree: SemanticOctree
     version: int
     weight: int = 0
-    streams: TreeStreams | None = None
 
 
 def _with_flipped_bit(data: bytes, place: int) -> bytes:

@@ -56,7 +56,7 @@ class PacketCodec:
         """Encode a packet; ``indices`` (n,) int64 selects bricks in place of all changed ones."""
         version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
         if base is None:
-            return codec.pack(held.octree, held.streams or held.octree.streams(), codec.FULL, self._format, version)
+            return codec.pack(held.octree, held.octree.streams(), codec.FULL, self._format, version)
         if indices is None:
             indices = np.flatnonzero(held.octree.revisions >= base)
         return codec.encode_delta(held.octree, indices, packet_format=self._format, map_version=version)

@@ -12,7 +12,7 @@ from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
-from octoreplay.mapping.streams import TreeStreams, mask_bytes
+from octoreplay.mapping.streams import mask_bytes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
@@ -58,24 +58,16 @@ class PublicMap:
         self._filled = 0
         self._bytes_per_brick = 100.0
 
-    def advance(
-        self,
-        octree: SemanticOctree,
-        revisions: Int64Array,
-        version: int,
-        *,
-        streams: TreeStreams | None = None,
-        num_shares: int = 1,
-    ) -> HeldMap:
+    def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, *, num_shares: int = 1) -> HeldMap:
         """Next version of the map.
 
-        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``. ``streams`` are the
-        octree's streams if they are computed already. ``num_shares`` maps share the budget.
+        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``. ``num_shares``
+        maps share the budget.
         """
         octree = octree.copy()
         octree.revisions[:] = revisions
         if self.is_exact:
-            return HeldMap(octree, version, streams=streams)
+            return HeldMap(octree, version)
         target = self._rounded(octree)
         if self._octree is None:
             self._octree = SemanticOctree(octree.resolution, octree.num_classes)

@@ -50,7 +50,7 @@ class ConsensusRobot(Robot):
         )
         team_step([step], update=Update.ADD, revision=tick)
         self._keep_log_likelihood(tick)
-        self._update_streams()
+        self._measure_map(tick)
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Messages with the robot's map; without changes an empty delta, which keeps the link alive."""
@@ -62,7 +62,7 @@ class ConsensusRobot(Robot):
             revisions[unchanged] = self._published.version - 1
         self._early = self.map.codes[revisions == tick]
         revisions[revisions == tick] = tick - 1
-        self._published = self._public.advance(self.map, revisions, tick, streams=self.streams)
+        self._published = self._public.advance(self.map, revisions, tick)
         self._receivers = frozenset(receivers)
         self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
@@ -130,7 +130,7 @@ class ConsensusRobot(Robot):
             unchanged = early[self.map.revisions[early] < tick]
             self._unchanged = self.map.codes[unchanged]
             self.map.revisions[unchanged] = tick
-        self._update_streams()
+        self._measure_map(tick)
 
     def _step(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, gamma: float,

@@ -61,7 +61,7 @@ class FloodRobot(Robot):
         before = self.map.copy()
         sum_of_evidence(self.map, terms, np.unique(np.concatenate(changed)), tick)
         self.num_iterations += 1
-        self._update_streams()
+        self._measure_map(tick)
         return self._change_since(before, tick)
 
     def _is_behind(self, mine: HeldMap | None) -> bool:

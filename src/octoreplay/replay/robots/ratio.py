@@ -83,7 +83,7 @@ class RatioRobot(Robot):
             (change,) = team_step([step], update=Update.ADD, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1
-        self._update_streams()
+        self._measure_map(tick)
         return change
 
     def _sum_for(self, receiver: int, tick: int) -> HeldMap:

@@ -21,7 +21,8 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
-from octoreplay.mapping.streams import TreeStreams
+from octoreplay.mapping.stream_size import StreamMeter
+from octoreplay.mapping.streams import StreamSize
 from octoreplay.records import Float64Array, Frame, Int64Array
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
@@ -113,8 +114,8 @@ class Robot(ABC):
         Robot and restart epoch of the published map.
     map : SemanticOctree
         h_i - h_0.
-    streams : TreeStreams
-        Streams of the map with its leaves merged.
+    size : StreamSize
+        Size of the map's stream, with its leaves merged.
     exchange : Exchange
         Maps that the robot holds, and versions that its neighbours hold.
     T_team_sensor : (4, 4) float64 array or None
@@ -153,7 +154,8 @@ class Robot(ABC):
         self._likelihood_tick = -1
         self._arrived: list[Arrival] = []
         self.map = octree()
-        self.streams: TreeStreams = self.map.streams()
+        self.size = StreamSize()
+        self._meter = StreamMeter(self.map)
 
     @property
     def evidence(self) -> Evidence:
@@ -218,11 +220,12 @@ class Robot(ABC):
 
     def map_sizes(self, *, with_unpruned: bool) -> MapSizes:
         """Sizes of the robot's map. The sizes without pruning are costly, and 0 unless ``with_unpruned``."""
+        num_classes = self.map.num_classes
         unpruned = self.map.streams(prune=False) if with_unpruned else None
         return MapSizes(
-            octree_bytes=codec.HEADER_BYTES + self.streams.num_bytes,
-            grid_bytes=codec.grid_bytes(self.map.num_cells, self.map.num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + unpruned.num_bytes if unpruned else 0,
+            octree_bytes=codec.HEADER_BYTES + self.size.num_bytes(num_classes),
+            grid_bytes=codec.grid_bytes(self.map.num_cells, num_classes),
+            unpruned_bytes=codec.HEADER_BYTES + unpruned.size.num_bytes(num_classes) if unpruned else 0,
             unpruned_compressed_bytes=len(codec.pack(self.map, unpruned, codec.FULL)) if unpruned else 0,
         )
 
@@ -255,9 +258,13 @@ class Robot(ABC):
         """Largest change of a log-odds since the map was ``before``; overwrites ``before``."""
         return team_step([Step(before, (), (), self.map, 0.0, since=tick)], update=Update.COPY, revision=tick)[0]
 
-    def _update_streams(self) -> None:
-        """Update ``streams`` with the map of this tick."""
-        self.streams = self.map.streams(tolerance=self._config.map.prune_tolerance)
+    def _measure_map(self, tick: int) -> None:
+        """Update ``size`` with the map of this tick; bricks that changed in it have its number as revision."""
+        tolerance = self._config.map.prune_tolerance
+        if tolerance == 0.0:
+            self.size = self._meter.update(tick)
+        else:
+            self.size = self.map.streams(tolerance=tolerance).size
 
 
 def num_due(config: ResolvedRun, index: int, after: int, tick: int) -> int:

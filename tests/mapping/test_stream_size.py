@@ -1,0 +1,87 @@
+"""Sizes of streams that are counted where octrees change, compared with those of whole streams."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from octoreplay.mapping.kernels import storage
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.stream_size import StreamMeter
+from octoreplay.mapping.streams import StreamSize
+from support.long_suite import examples
+from support.octree_factory import cube, octree_of
+from support.packet_format import octrees
+
+
+@examples(60)
+@given(octree=octrees())
+def test_the_size_is_that_of_the_whole_stream(octree):
+    assert StreamMeter(octree).update(0) == octree.streams().size
+
+
+@examples(60)
+@given(maps=st.lists(octrees(num_classes=3), min_size=2, max_size=4))
+def test_changes_are_counted_where_they_are(maps):
+    octree = SemanticOctree(maps[0].resolution, 3)
+    meter = StreamMeter(octree)
+    for revision, change in enumerate(maps, start=1):
+        octree.overwrite(change, np.arange(change.num_bricks), revision)
+        assert meter.update(revision) == octree.streams().size
+
+
+def uniform(side, value, num_classes=2):
+    """Octree of a cube of ``side`` x ``side`` x ``side`` bricks of one value."""
+    octree = SemanticOctree(0.25, num_classes)
+    bricks = np.stack(np.meshgrid(*[np.arange(side)] * 3), axis=-1).reshape(-1, 3)
+    codes = np.empty(len(bricks), np.int64)
+    storage.keys_to_codes(bricks * storage.BRICK_EDGE, codes)
+    octree.find_or_add(codes >> storage.CELL_BITS)
+    octree.known[:], octree.bricks.values[: octree.num_bricks] = storage.ALL_CELLS, value
+    octree.revisions[:] = 1
+    return octree
+
+
+@pytest.mark.parametrize("side", [4, 8, 16])
+def test_leaves_above_the_chunks_are_merged(side):
+    octree = uniform(side, -2.0)
+    meter = StreamMeter(octree)
+    assert meter.update(0) == octree.streams().size
+    assert meter.update(0).num_leaves == 1
+    # One other cell divides the leaf; the next change restores it.
+    other, same = octree_of(cube((3, 3, 3), 1, (1.0, 0.0))), uniform(1, -2.0)
+    octree.overwrite(other, np.arange(1), 2)
+    assert meter.update(2) == octree.streams().size
+    octree.overwrite(same, np.arange(1), 3)
+    assert meter.update(3) == octree.streams().size
+    assert meter.update(4).num_leaves == 1
+
+
+def test_equal_leaves_with_several_values_are_merged_above_the_chunks():
+    octree = octree_of(cube((0, 0, 0), 32, (1.0, -2.0)))
+    size = StreamMeter(octree).update(0)
+    assert size == octree.streams().size
+    assert (size.num_leaves, size.num_vectors) == (1, 1)
+
+
+def test_eight_different_leaves_stay():
+    octree = uniform(8, 1.0)
+    octree.bricks.values[octree.find(np.array([0]))[0]] = 1.5
+    octree.bricks.values[: octree.num_bricks][octree.codes >= 448] = 2.0
+    assert StreamMeter(octree).update(0) == octree.streams().size
+
+
+def test_an_empty_octree_has_no_stream():
+    octree = SemanticOctree(0.25, 2)
+    assert StreamMeter(octree).update(0) == octree.streams().size == StreamSize()
+
+
+def test_unchanged_chunks_are_not_counted_again():
+    octree = uniform(8, 1.0)
+    meter = StreamMeter(octree)
+    before = meter.update(0)
+    # A change without a new revision stays unseen.
+    octree.bricks.values[:1] = 3.0
+    assert meter.update(2) == before
