@@ -115,7 +115,6 @@ class ResolvedRun(RunConfig):
         super().__post_init__()
         if self.merge_classes or self.ignore_hits:
             raise ConfigError("merge_classes, ignore_hits: must be empty in a resolved run; edit its classes instead")
-        object.__setattr__(self, "sensor", self.effective_sensor)
 
     @classmethod
     def from_config(
