@@ -26,7 +26,7 @@ from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.log_odds import best_labels, class_probabilities
 from octoreplay.mapping.codec import apply_delta, decode_packet
-from octoreplay.mapping.consensus import Evidence, sum_of_evidence
+from octoreplay.mapping.consensus import scaled_map
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CENTRAL,
@@ -112,9 +112,7 @@ class StoredMap:
             raise ValueError(f"map_kind: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
         if map_kind == MEAN or self.num_robots == 1:
             return self.octree
-        scaled = SemanticOctree(self.octree.resolution, self.octree.num_classes)
-        sum_of_evidence(scaled, [Evidence(self.octree, scale=float(self.num_robots))], self.octree.codes, 0)
-        return scaled
+        return scaled_map(self.octree, float(self.num_robots))
 
     def title(self, map_kind: str = POSTERIOR) -> str:
         """Return a phrase that says which form of the map is shown."""
