@@ -176,7 +176,8 @@ def test_a_definition_that_no_version_wrote_is_damage() -> None:
 
 def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:
     values = {
-        "resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7, "quantum": 0.0,
+        "resolution": 0.1 + 0.2, "miss": -1 / 3, "quantum": 0.0, "prob_free": 0.7, "bounds": (-1.5, 1e-3),
+        "settle_max": 7,
     }  # fmt: skip
     config = team(tmp_path).with_parameters(values)
     with ResultWriter(tmp_path / "out.mcap", config) as writer:
