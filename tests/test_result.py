@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +38,7 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Result:
 def test_a_result_has_the_configuration_metrics_and_ticks_of_the_run(result: Result, tmp_path: Path) -> None:
     assert result.robots == ("alpha", "beta")
     assert result.class_table == CLASSES
-    config = team(tmp_path)
-    assert result.config == dataclasses.replace(config.to_config(), sensor=config.effective_sensor)
+    assert result.config == team(tmp_path).to_config()
     assert result.metrics == [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
     assert result.summary.stop_reason == summary(result.metrics).stop_reason
     assert result.stored_ticks("alpha") == [1, 2, 4]

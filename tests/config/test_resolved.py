@@ -58,8 +58,9 @@ def test_plain_configurations_are_the_same_without_the_span():
     assert ResolvedRobot.from_config(plain, (1, 2)).to_config() == plain
     config = RunConfig((plain,), merge_classes=(("plant", ("tree",)),)).with_parameters({"rule": "bayes"})
     run = ResolvedRun.from_config(config, [ResolvedRobot.from_config(plain, (1, 2))], CLASSES)
-    assert run.to_config() == dataclasses.replace(config, classes=CLASSES, merge_classes=())
-    assert run.effective_sensor.miss == -19661 * 2.0**-16
+    effective = {"classes": CLASSES, "merge_classes": (), "sensor": config.effective_sensor}
+    assert run.to_config() == dataclasses.replace(config, **effective)
+    assert run.effective_sensor.miss == run.to_config().sensor.miss == -19661 * 2.0**-16
 
 
 def test_parameters_keep_the_resolution():

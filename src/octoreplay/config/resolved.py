@@ -125,9 +125,12 @@ class ResolvedRun(RunConfig):
         return cls(**{**_values(config, RunConfig), **resolved}, warnings=tuple(warnings))
 
     def to_config(self) -> RunConfig:
-        """Return the plain configuration, which compares equal to the one that a result stores."""
+        """Return the plain configuration, which compares equal to the one that a result stores.
+
+        Its sensor model has the rounded increments and clamps of the run.
+        """
         robots = tuple(robot.to_config() for robot in self.robots)
-        return RunConfig(**{**_values(self, RunConfig), "robots": robots})
+        return RunConfig(**{**_values(self, RunConfig), "robots": robots, "sensor": self.effective_sensor})
 
     @property
     def total_ns(self) -> int | None:

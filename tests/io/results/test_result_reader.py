@@ -9,8 +9,6 @@ import yaml
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.packets import PacketConfig
 from octoreplay.config.parameters import PARAMETERS
-from octoreplay.config.resolved import ResolvedRun
-from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import InputError
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
@@ -44,18 +42,13 @@ class CountedFile:
 METRICS = [tick_metrics(tick, settling=tick == 4) for tick in range(1, 5)]
 
 
-def stored_config(config: ResolvedRun) -> RunConfig:
-    """Configuration of a result: the sensor model has the rounded values that the run used."""
-    return dataclasses.replace(config.to_config(), sensor=config.effective_sensor)
-
-
 def test_a_written_result_is_read(tmp_path: Path) -> None:
     path = write_result(tmp_path)
     with ResultReader(path) as reader:
         assert reader.metrics() == METRICS
         assert reader.robots == ("alpha", "beta")
         assert reader.class_table == CLASSES
-        assert reader.config == stored_config(team(tmp_path))
+        assert reader.config == team(tmp_path).to_config()
         assert reader.prior == 0.0
         written = summary(METRICS)
         read = reader.summary(reader.metrics())

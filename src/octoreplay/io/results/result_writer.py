@@ -321,7 +321,6 @@ class ResultWriter:
         """Write the metadata: format, configuration, classes and fingerprints of the inputs."""
         config, folder = self._config, self.path.parent.resolve()
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
-        used = dataclasses.replace(config, robots=robots, sensor=config.effective_sensor)
         self._writer.write_metadata(
             "octoreplay",
             {
@@ -334,6 +333,7 @@ class ResultWriter:
                 "rule": config.consensus.rule,
             },
         )
+        used = dataclasses.replace(config, robots=robots, sensor=config.effective_sensor)
         self._writer.write_metadata("config", {"team_file": dump_team(used, folder, with_defaults=True)})
         classes = [{"id": 0, "name": "free", "color": None}]
         classes += [{"id": c.class_id, "name": c.name, "color": list(c.color)} for c in self._class_table.classes]
