@@ -57,11 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(_exit_code(arguments))
 
 
+_REPLACED_OPTIONS = {"--team-posterior": "--map", "--max-team-calibration-error": "--max-calibration-error"}
+"""Options of earlier versions, and those in their place."""
+
+
 def _exit_code(arguments: Sequence[str] | None) -> int:
     """Run one command and return its exit code; errors are reported in one sentence on stderr."""
     try:
         code = cli.main(args=arguments, prog_name="octoreplay", standalone_mode=False)
     except click.ClickException as error:
+        if isinstance(error, click.NoSuchOption) and error.option_name in _REPLACED_OPTIONS:
+            error.possibilities = [_REPLACED_OPTIONS[error.option_name]]
         error.show()
         return error.exit_code
     except (KeyboardInterrupt, click.Abort) as error:
