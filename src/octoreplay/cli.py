@@ -67,7 +67,8 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
         code = cli.main(args=arguments, prog_name="octoreplay", standalone_mode=False)
     except click.ClickException as error:
         if isinstance(error, click.NoSuchOption) and error.option_name in _REPLACED_OPTIONS:
-            error.possibilities = [_REPLACED_OPTIONS[error.option_name]]
+            possibilities = [_REPLACED_OPTIONS[error.option_name]]
+            error = click.NoSuchOption(error.option_name, possibilities=possibilities, ctx=error.ctx)
         error.show()
         return error.exit_code
     except (KeyboardInterrupt, click.Abort) as error:
