@@ -40,4 +40,4 @@ def test_the_posterior_is_shown_and_the_mean_on_request(pair_result: Path) -> No
     ).stdout  # fmt: skip
     removed = octoreplay("query", pair_result, "--at", *place, "--team-posterior")
     assert removed.returncode == 2
-    assert "No such option '--team-posterior'. Did you mean '--map'?" in removed.stderr
+    assert "No such option '--team-posterior': the posterior of the team is the default; '--map mean'" in removed.stderr
