@@ -76,11 +76,11 @@ class StoredMap:
     ``frame_id`` is the name of its frame: 'team', or '<robot>/map' for the map frame of a robot where robots find each
     other's frames during the run.
 
-    A map on which robots agree is the mean over ``num_robots`` robots, N: those that links connected at the time, or
-    all with rule 'flood'. ``map_kind`` 'posterior' (the default of all methods) gives h_0 + N (h - h_0), the posterior
-    of the evidence of these robots, and 'mean' the map h as the robot holds it. Both are the same where N is 1: for a
-    robot without links, for the centralised map, for evidence, for rules whose map is no mean ('local', 'merge'), and
-    where ``evidence`` is an average. ``octree`` holds h - h_0.
+    A map on which robots agree is the mean over ``num_robots`` robots, N: those that reached it over links at the time,
+    or all with rule 'flood'. ``map_kind`` 'posterior' (the default of all methods) gives h_0 + N (h - h_0), the
+    posterior of the evidence of these robots, and 'mean' the map h as the robot holds it. Both are the same where N is
+    1: for a robot without links, for the centralised map, for evidence, for rules whose map is no mean ('local',
+    'merge'), and where ``evidence`` is an average. ``octree`` holds h - h_0.
     """
 
     def __init__(

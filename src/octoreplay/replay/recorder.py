@@ -176,7 +176,7 @@ class Recorder:
         self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
 
     def _count_averaged(self, graph: CommunicationGraph) -> None:
-        """Update N of each active robot: the robots of its component, or the team where evidence goes by origin.
+        """Update N of each active robot: the robots that reach it, or the team where evidence goes by origin.
 
         The map of a dormant robot stays as it is, and so does its N.
         """
@@ -187,7 +187,7 @@ class Recorder:
             self._num_averaged[:] = len(graph.robot_ids)
             return
         active = list(graph.active)
-        self._num_averaged[active] = graph.component_sizes[active]
+        self._num_averaged[active] = graph.num_reaching[active]
 
     def _is_due(self, tick: Tick, every: float) -> bool:
         """True when a multiple of ``every`` seconds of log time lies in the period that ends with this tick."""

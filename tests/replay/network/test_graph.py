@@ -263,16 +263,19 @@ def test_importing_the_module_does_not_import_networkx():
     assert done.stdout.strip() == "False"
 
 
-def test_components_are_connected_over_other_robots_and_in_either_direction():
+def test_robots_reach_others_over_robots_in_between_and_in_the_direction_of_the_links():
     a, b, c, d, e, _ = NAMES[:6]
     edges = ((a, b, None), (b, c, None), (d, e, None))
     network = NetworkConfig(topology="edges", edges=edges, one_way=((a, b), (c, b)))
     graph = TeamNetwork(network, ConsensusConfig(), NAMES[:6]).at(0.0, [True] * 6, nowhere(6))
-    assert graph.component_sizes.tolist() == [3, 3, 3, 2, 2, 1]
+    # Robot b receives from a and c, which receive nothing.
+    assert graph.num_reaching.tolist() == [1, 3, 1, 2, 2, 1]
+    both_ways = TeamNetwork(NetworkConfig(topology="edges", edges=edges), ConsensusConfig(), NAMES[:6])
+    assert both_ways.at(0.0, [True] * 6, nowhere(6)).num_reaching.tolist() == [3, 3, 3, 2, 2, 1]
     part = TeamNetwork(network, ConsensusConfig(), NAMES[:6]).at(
         0.0, [True, False, True, True, True, False], nowhere(6)
     )
-    assert part.component_sizes.tolist() == [1, 1, 1, 2, 2, 1]
+    assert part.num_reaching.tolist() == [1, 1, 1, 2, 2, 1]
 
 
 def test_a_constant_weight_of_received_maps_replaces_those_of_the_graph():

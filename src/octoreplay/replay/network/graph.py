@@ -63,15 +63,15 @@ class CommunicationGraph:
         return len(self._senders[robot_index])
 
     @cached_property
-    def component_sizes(self) -> Int64Array:
-        """Number (N,) of robots in each robot's component: itself, and those that links connect to it either way."""
-        connects = np.eye(len(self.robot_ids), dtype=bool)
-        for i, j in self.pairs:
-            connects[i, j] = connects[j, i] = True
+    def num_reaching(self) -> Int64Array:
+        """Number (N,) of robots whose maps reach each robot, directly or over others; itself counts."""
+        reaches = np.eye(len(self.robot_ids), dtype=bool)
+        for link in self.links:
+            reaches[link] = True
         for middle in range(len(self.robot_ids)):
-            connects |= connects[:, middle, None] & connects[middle]
-        sizes: Int64Array = connects.sum(axis=1)
-        return sizes
+            reaches |= reaches[:, middle, None] & reaches[middle]
+        counts: Int64Array = reaches.sum(axis=0)
+        return counts
 
     @cached_property
     def is_symmetric(self) -> bool:
