@@ -41,9 +41,9 @@ from octoreplay.records import (
     Frame,
     UInt8Array,
 )
-from octoreplay.registration.cell_means import CellMeans
+from octoreplay.registration.measured_points import MeasuredPoints
 from octoreplay.registration.own_map import OwnMap
-from octoreplay.registration.pairs import PairAlignment, align_pair
+from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.team import align_team
 from octoreplay.replay.alignment import align_logs
 from octoreplay.replay.run import replay_team
@@ -280,13 +280,13 @@ def _map(
     T_own_village[:3, 3] = (*rng.uniform(-30, 30, 2), rng.uniform(-1, 1))
     num_classes = NUM_CLASSES if condition.is_labelled else 1
     grid = MapConfig(resolution=condition.resolution)
-    means = CellMeans(grid.resolution)
+    measured = MeasuredPoints(grid.resolution)
     octree, caster = SemanticOctree(grid.resolution, num_classes), ScanCaster(sensor, grid, num_classes)
     for frame in frames:
         pose = T_own_village @ drift[frame.stamp_ns] @ frame.T_team_sensor
         add_scan(octree, caster.cast(replace(frame, T_team_sensor=pose)), clamped_increments(sensor), 0)
-        means.add_scan(replace(frame, T_team_sensor=pose), sensor)
-    own = OwnMap.of_evidence(octree, hit=sensor.hit, miss=sensor.miss, means=means)
+        measured.add_scan(replace(frame, T_team_sensor=pose), sensor)
+    own = OwnMap.of_evidence(octree, hit=sensor.hit, miss=sensor.miss, measured=measured)
     return OwnFrame(own, inverse(T_own_village))
 
 
@@ -320,9 +320,9 @@ def _across(a: OwnFrame, b: OwnFrame) -> Outcome:
 def _timed(a: OwnFrame, b: OwnFrame) -> tuple[PairAlignment, float]:
     """Alignment of a pair, and its processor time [s]; surfaces of the maps are made before."""
     for frame in (a, b):
-        _ = frame.own.upright_surface.tree, frame.own.columns.known, frame.own.classes_nearby
+        _ = frame.own.upright_surface.tree, frame.own.columns.known, frame.own.classes_nearby, frame.own.planes
     started = time.process_time()
-    return align_pair([a.own, b.own], 0, 1), time.process_time() - started
+    return align_team([a.own, b.own]).pairs[0], time.process_time() - started
 
 
 def overlap(a: OwnMap, b: OwnMap, T_a_b: Float64Array) -> float:

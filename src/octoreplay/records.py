@@ -25,6 +25,9 @@ ArrayT = TypeVar("ArrayT", bound=npt.NDArray[Any])
 TEAM = "team"
 """Frame of all maps and poses in a result, except of robots that begin a run in their own frames."""
 
+TEAM_ORIGIN = "frame of the team"
+"""Phrase on the origin of the place of the robot whose map frame is the team's frame."""
+
 CENTRAL = "central"
 """Name of the centralised map in a result: the sum of all robots' evidence."""
 

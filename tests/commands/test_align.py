@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from octoreplay.config.frames_file import load_frames_file
-from octoreplay.config.team_file import load_team_file
+from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.result import open_result
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 from octoreplay.transforms import inverse, pose_difference, transform_of
@@ -72,8 +73,47 @@ def test_run_align_stores_the_origin_of_each_frame_and_align_reads_the_stored_ev
     assert again.returncode == 0, again.stderr
     T = transform_of(load_team_file(tmp_path / "again.yaml").robots[1].T_team_map)
     assert pose_difference(T, np.eye(4))[0] < 0.02
+    result = "r.mcap is a result of octoreplay, not a log; --config-from .*r.mcap repeats its run"
+    assert_fails(2, result, "run", tmp_path / "r.mcap", "-o", tmp_path / "x.mcap")
     assert_fails(2, "holds finished maps; leave out --resolution", "align", tmp_path / "r.mcap", "-o",
                  tmp_path / "x.yaml", "--resolution", 0.5)  # fmt: skip
+
+
+def test_run_align_of_a_team_file_names_and_leaves_out_a_robot_that_is_not_connected(twins, tmp_path):
+    config = load_team_file(twins / "team.yaml")
+    (robot,) = (robot.with_absolute_paths() for robot in config.robots)
+    far = load_team_file(PAIR_TEAM).robots[0].with_absolute_paths()
+    robots = (
+        robot,
+        dataclasses.replace(far, robot_id="far"),
+        dataclasses.replace(robot, robot_id="twin", logs=(twins / "twin.mcap",)),
+    )
+    (tmp_path / "team.yaml").write_text(dump_team(dataclasses.replace(config, robots=robots)))
+    done = octoreplay("run", "team.yaml", "--align", "-o", "r.mcap", "--settle", 0, "--duration", 5, folder=tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert "far is not connected; its best pair is" in done.stderr
+    with open_result(tmp_path / "r.mcap") as result:
+        assert result.robots == ("husky_1", "twin")
+
+
+def test_a_cut_log_is_named_and_the_exit_code_says_that_data_was_lost(twins, tmp_path):
+    for name in ("husky_1.mcap", "twin.mcap"):
+        shutil.copy(twins / name, tmp_path)
+    log = tmp_path / "twin.mcap"
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.7)])
+    done = octoreplay("align", "husky_1.mcap", "twin.mcap", "-o", "aligned.yaml", folder=tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert "warning: twin.mcap: cut before its end" in done.stderr
+    assert (tmp_path / "aligned.yaml").exists()
+
+
+def test_words_of_run_align_that_do_not_fit_are_named(twins, tmp_path):
+    out = tmp_path / "out.mcap"
+    sideways = r"'sideways' is no file and no value of --align \(before, on-air, off\)"
+    assert_fails(2, sideways, "run", PAIR_TEAM, "--align", "sideways", "-o", out)
+    assert_fails(2, "--dof needs --align$", "run", PAIR_TEAM, "--dof", 6, "-o", out)
+    assert_fails(2, "--dof needs --align; robots that align on air", "run", PAIR_TEAM, "--align", "on-air",
+                 "--dof", 6, "-o", out)  # fmt: skip
 
 
 def test_robots_without_overlap_give_a_reason_and_no_team_file(tmp_path):
@@ -94,6 +134,13 @@ def test_wrong_inputs_are_named(tmp_path):
     assert_fails(1, "is an input of this command", "align", PAIR_TEAM, "-o", PAIR_TEAM)
     assert_fails(1, "is a file; name a folder", "align", PAIR_TEAM, "-o", out, "--plot", guess)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("own", "following"), [((), "run"), (("--own-frames",), "align")])
+def test_simulate_names_the_next_command(own, following, tmp_path):
+    size = ("--robots", 1, "--duration", 1, "--rate", 1, "--image", "16x12", "--world-size", 20)
+    done = octoreplay("simulate", "team", *size, *own, folder=tmp_path)
+    assert f"next: octoreplay {following} team/team.yaml -o team/" in done.stdout
 
 
 @long

@@ -28,7 +28,7 @@ def test_demo_finds_the_frames_and_writes_every_file(tmp_path: Path) -> None:
         assert (tmp_path / "show" / name).stat().st_size > 0
     assert "Foxglove" in done.stdout
     assert f"octoreplay run {Path('show/aligned.yaml')} -o {Path('show/gradient.mcap')} --rule gradient" in done.stdout
-    before, after = re.findall(r"^(?:assumed|aligned) .*", done.stdout, re.M)
+    before, after = re.findall(r"^(?:as in the logs|found) .*", done.stdout, re.M)
     assert "%" in before
     assert "%" in after
     assert_fails(1, "show.*logs: is not empty; use a new folder", "demo", tmp_path / "show")

@@ -50,6 +50,18 @@ def test_the_truth_beside_the_logs_is_suggested_and_not_used(trio_result: Path, 
     )  # fmt: skip
 
 
+def test_a_truth_in_another_frame_is_named(trio_result: Path, tmp_path: Path) -> None:
+    shutil.copy(TRIO / "world.npz", tmp_path)
+    frames = tmp_path / "frames.yaml"
+    near, far = "[0.5, 0, 0, 0, 0, 0, 1]", "[9, 0, 0, 0, 0, 0, 1]"
+    for places, is_named in (((near, far, far), False), ((far, far, far), True)):
+        frames.write_text("T_team_map:\n" + "".join(f"  husky_{n}: {place}\n" for n, place in enumerate(places, 1)))
+        done = octoreplay("evaluate", trio_result, "--truth", tmp_path, "--last")
+        assert done.returncode == 0, done.stderr
+        named = f"so the scores mean nothing: give husky_1 its T_team_map from {frames}, then align and run again"
+        assert (named in done.stderr) == is_named
+
+
 def test_a_rule_against_the_centralised_map_of_another_run(trio_result: Path, tmp_path: Path) -> None:
     local = tmp_path / "local.mcap"
     assert octoreplay("run", "--config-from", trio_result, "-o", local, "--rule", "local").returncode == 0

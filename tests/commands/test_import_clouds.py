@@ -48,6 +48,21 @@ def test_a_folder_of_clouds_becomes_a_log_that_can_be_mapped(walls: Path, tmp_pa
     assert re.search(r"1\.5, 0\.05, 0\.55 +free", done.stdout), done.stdout
 
 
+def test_the_map_frame_is_named_and_a_log_is_never_overwritten_by_accident(walls: Path, tmp_path: Path) -> None:
+    one, other = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    words = ("import-clouds", walls, "--rate", 10, "--map-frame")
+    for path in (one, other):
+        assert octoreplay(*words, "odom", "-o", path).returncode == 0
+    assert "nothing relates the map frames of a ('odom') and b ('odom')" in octoreplay("info", one, other).stderr
+    before = one.read_bytes()
+    assert_fails(1, "a.mcap: already exists; name another file, or use --force", *words, "map", "-o", one)
+    assert one.read_bytes() == before
+    for path in (one, other):
+        assert octoreplay(*words, "map", "-o", path, "--force").returncode == 0
+    assert "nothing relates" not in octoreplay("info", one, other).stderr
+    assert_fails(2, "map_frame: '' must not be empty", *words, "", "-o", one, "--force")
+
+
 def test_odd_and_skipped_clouds_are_warned_of(walls: Path, tmp_path: Path) -> None:
     save_wall(walls / "1.pcd", "0 0 0 0 0 0 0", extra=" -1")
     save_wall(walls / "2.pcd", "0 0 1 1 0 0 0", extra=" -1")

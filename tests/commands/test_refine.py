@@ -169,8 +169,20 @@ def pair_robots() -> tuple[RobotConfig, ...]:
 def test_a_pose_file_without_times_in_common_is_refused(tmp_path: Path) -> None:
     poses = tmp_path / "old.tum"
     poses.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
-    robots = tuple(dataclasses.replace(robot, pose_topic=None, pose_file=poses) for robot in pair_robots())
+    identity = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    robots = tuple(
+        dataclasses.replace(robot, pose_topic=None, pose_file=poses, T_team_map=identity) for robot in pair_robots()
+    )
     refused(tmp_path, robots, 1, "no robot has a frame that can be used")
+
+
+def test_robots_without_frames_that_are_related_are_refused(tmp_path: Path) -> None:
+    # A trajectory file names no frame.
+    poses = tmp_path / "p.tum"
+    robots = tuple(dataclasses.replace(robot, pose_topic=None, pose_file=poses) for robot in pair_robots())
+    poses.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    message = "T_team_map: husky_1, husky_2 have none, and nothing relates their map frames; find it with"
+    refused(tmp_path, robots, 2, message)
 
 
 @pytest.mark.long

@@ -84,8 +84,8 @@ def test_a_voxel_has_its_most_frequent_class_and_points_without_class_are_left_o
     points = np.array([[0.01, 0.01, 0.01]] * 4 + [[0.11, 0.11, 0.11]] * 3 + [[0.9, 0.9, 0.9]] * 9)
     classes = np.array([2] * 4 + [1] * 3 + [0] * 9, np.uint8)
     found = Submap.of_points(0, 0, np.eye(4), points, classes, VOXEL)
-    np.testing.assert_allclose(found.points, [[0.01, 0.01, 0.01]])
-    np.testing.assert_array_equal(found.class_ids, [2])
+    np.testing.assert_allclose(found.planes.points, [[0.01, 0.01, 0.01]])
+    np.testing.assert_array_equal(found.planes.class_ids, [2])
 
 
 @pytest.mark.parametrize("num_points", [0, 2])

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,8 @@ from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.replay.alignment import Alignment, align_robots, aligned_config, check_aligned
 from octoreplay.report.alignment_files import PAIR_COLUMNS, write_alignment
-from octoreplay.report.alignment_plots import write_alignment_figures
-from octoreplay.report.alignment_tables import alignment_tables
+from octoreplay.report.alignment_plots import pair_figure, team_figure, write_alignment_figures
+from octoreplay.report.alignment_tables import alignment_tables, pair_numbers
 from octoreplay.report.tables import terminal
 from octoreplay.transforms import inverse, numbers_of, pose_difference
 from support.village_maps import T_village_map, empty_map, team_config, village_map
@@ -110,6 +111,36 @@ def test_a_guess_is_verified_and_never_trusted():
         check_aligned(align_robots(team_config("ant", "bee"), empty, guesses=guess))
 
 
+def test_each_guess_is_confirmed_or_named(maps):
+    far = T_village_map((20.0, 0.0), turns=3)
+    for guess, is_right in ((TRUTH["bee"], True), (far, False)):
+        guesses = {"ant": numbers_of(TRUTH["ant"]), "bee": numbers_of(guess)}
+        aligned = align_robots(team_config("ant", "bee"), maps[:2], guesses=guesses)
+        assert aligned.teams[0][1].origin.endswith("; agrees with the guesses") == is_right
+        assert len(aligned.notes) == (0 if is_right else 1)
+    assert aligned.notes[0].startswith("bee is aligned with ant ")
+    assert aligned.notes[0].endswith(" and 180.0 degrees from where the guesses place it: they are not used")
+    (alone,) = align_robots(team_config("ant", "bee"), maps[:2], guesses={"bee": numbers_of(far)}).notes
+    assert alone == "the guess for bee is not used: it needs that of another robot"
+
+
+def test_a_given_pose_that_tilts_the_team_is_named(maps):
+    upside_down = TRUTH["ant"] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    aligned = align_robots(team_config(given("ant", upside_down), "bee"), maps[:2])
+    tilted = "the T_team_map given for ant tilts its z axis by 180 degrees; --dof 4 expects vertical axes"
+    assert tilted in aligned.notes
+
+
+def test_refusals_name_the_option_that_may_help():
+    nothing = [empty_map(), empty_map()]
+    for dof, remedy in (
+        (4, "fewer than 150; where the z axis of a map is not vertical, use --dof 6 (docs"),
+        (6, "fewer than 1600; finer cells may give enough (--resolution 0.15) (docs"),
+    ):
+        with pytest.raises(InputError, match=re.escape(remedy)):
+            check_aligned(align_robots(team_config("ant", "bee"), nothing, dof=dof))
+
+
 def test_equal_maps_are_aligned_exactly_and_named(maps):
     twins = align_robots(team_config("ant", "twin"), [maps[0], maps[0]])
     assert pose_difference(twins.teams[0][1].T_team_map, np.eye(4)) == pytest.approx((0, 0), abs=1e-6)
@@ -159,9 +190,9 @@ def test_files_hold_every_pair_and_frame(alignment, tmp_path):
     assert [row["accepted"] for row in rows] == ["True", "True", "False", "True", "False", "False"]
     content = json.loads(json_path.read_text())
     assert content["left_out"] == ["dog"]
-    frame = content["teams"][0][1]
+    frame = content["components"][0][1]
     assert frame["T_team_map"] == list(numbers_of(alignment.teams[0][1].T_team_map))
-    assert np.array(frame["covariance"]).shape == (6, 6)
+    assert np.sqrt(np.diag(frame["covariance"])) == pytest.approx(frame["T_team_map_sigma"], abs=1e-6)
     assert len(content["pairs"]) == 6
 
 
@@ -169,3 +200,33 @@ def test_figures_are_of_the_team_and_of_every_pair(alignment, tmp_path):
     written = write_alignment_figures(dataclasses.replace(alignment, pairs=alignment.pairs[:1]), tmp_path)
     assert written == [tmp_path / "team.png", tmp_path / "pair_ant_bee.png"]
     assert all(path.stat().st_size > 1000 for path in written)
+
+
+def test_figures_name_robots_verdicts_and_frames_and_keep_the_colours(alignment):
+    team = team_figure(alignment)
+    assert team.get_suptitle() == "3 of 4 robots aligned"
+    assert [text.get_text() for text in team.legends[0].get_texts()] == ["ant", "bee", "cow", "dog (left out)"]
+    before, after = team.axes
+    assert (before.get_xlabel(), after.get_xlabel()) == ("x [m], frames as configured", "x [m], map frame of ant")
+    assert np.ptp(before.get_xlim()) == pytest.approx(np.ptp(after.get_xlim()))
+    colors = [collection.get_facecolor()[0].tolist() for collection in after.collections[::2]]
+    refused = next(pair for pair in alignment.pairs if not pair.is_accepted)
+    for pair, title in ((alignment.pairs[1], "after"), (refused, "best pose (refused)")):
+        figure = pair_figure(alignment, pair)
+        first, second = IDS[pair.first], IDS[pair.second]
+        assert figure.get_suptitle().startswith(
+            f"{first} and {second}: {'accepted' if pair.is_accepted else 'refused'}"
+        )
+        assert figure.axes[1].get_title(loc="left") == title
+        assert figure.axes[1].get_xlabel() == f"x [m], map frame of {first}"
+        assert figure.axes[1].collections[0].get_facecolor()[0].tolist() == colors[pair.first]
+    squares = figure.axes[0].collections[0].get_paths()[0].get_extents()
+    assert (squares.width, squares.height) == pytest.approx((0.3, 0.3))
+
+
+def test_without_a_vertical_axis_numbers_that_do_not_count_are_left_out(alignment):
+    assert pair_numbers(alignment.pairs[0], 4)["L"] != "-"
+    numbers = pair_numbers(alignment.pairs[0], 6)
+    assert (numbers["q_g"], numbers["L"]) == ("-", "-")
+    figure = team_figure(dataclasses.replace(alignment, dof=6))
+    assert figure.axes[1].get_xlabel() == "longest extent [m], map frame of ant"

@@ -96,7 +96,7 @@ def test_contradicting_robots_are_named_with_the_remedy():
     apart = dataclasses.replace(PAIR, first="c", second="d")
     agreeing = dataclasses.replace(PAIR, second="c", clear_contradiction=0.0)
     (sentence,) = frame_warnings([PAIR, apart, agreeing], cells("abcd"))
-    assert "(1 more pair): try" in sentence
+    assert "(and c and d): try" in sentence
 
 
 def test_robots_with_other_labels_are_named():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from octoreplay.commands.exit_codes import EXIT_ERROR
+from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import (
     SectionedCommand,
     check_folder,
@@ -17,7 +17,7 @@ from octoreplay.commands.options import (
     existing_path,
     with_parameters,
 )
-from octoreplay.commands.progress import progress_bar, warn
+from octoreplay.commands.progress import lost_data, progress_bar, warn
 from octoreplay.commands.team_options import base_config, save_team_file
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from octoreplay.config.resolved import ResolvedRun
     from octoreplay.config.run import RunConfig
     from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.records import FrameCounts
     from octoreplay.replay.alignment import Alignment
     from octoreplay.replay.own_maps import OwnEvidence
 
@@ -50,7 +51,7 @@ dof_option = click.option(
 @click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
               help="transforms T_team_map to try, which are used only where the maps verify them")  # fmt: skip
 @click.option("--components", is_flag=True,
-              help="write further groups of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
+              help="write further components of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
 @click.option("--csv", type=existing_path, metavar="FILE.csv", help="write the numbers of all pairs as CSV")
 @click.option("--json", type=existing_path, metavar="FILE.json",
               help="write frames, covariances and pairs as JSON")  # fmt: skip
@@ -66,7 +67,8 @@ def align(
 
     Writes the team file again with the frames, their standard deviations and their origins. Robots that no accepted
     pair connects are named and left out. Exit code 0 if all robots are connected and no given T_team_map contradicts
-    the maps; else 1, and nothing is written if no two robots are connected.
+    the maps; else 1, and no team file is written if no two robots are connected. Exit code 3: all robots are connected,
+    but data of the logs was lost.
     """
     from octoreplay.report import tables
     from octoreplay.report.alignment_files import write_alignment
@@ -80,16 +82,18 @@ def align(
         check_folder(plot)
     out, err = tables.terminal(), tables.terminal(stderr=True)
     given = {name: value for name, value in parameters.items() if value is not None}
-    config, alignment, warnings = _aligned(inputs, int(dof or 4), guess, classes, given, err)
+    config, alignment, warnings, counts = _aligned(inputs, int(dof or 4), guess, classes, given, err)
     tables.show(out, alignment_tables(alignment))
     written = write_alignment(alignment, csv_path=csv, json_path=json)
     written += write_alignment_figures(alignment, plot) if plot is not None else []
-    for sentence in (*warnings, *alignment.warnings):
+    for sentence in (*warnings, *lost_data(counts), *alignment.warnings):
         warn(err, sentence)
     written = [*_write_teams(config, alignment, output, components=components), *written]
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
-    return 0 if alignment.is_whole else EXIT_ERROR
+    if not alignment.is_whole:
+        return EXIT_ERROR
+    return EXIT_DATA_LOST if any(count.lost_data for count in counts.values()) else 0
 
 
 def evidence_with_bar(config: ResolvedRun) -> list[OwnEvidence]:
@@ -137,8 +141,8 @@ def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys, out: Console) 
 
 def _aligned(
     inputs: tuple[Path, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any], err: Console
-) -> tuple[RunConfig, Alignment, tuple[str, ...]]:
-    """The configuration of the inputs, the alignment of its robots, and warnings of the logs."""
+) -> tuple[RunConfig, Alignment, tuple[str, ...], Mapping[str, FrameCounts]]:
+    """The configuration of the inputs, the alignment of its robots, and warnings and counts of the logs."""
     from octoreplay.config.frames_file import load_frames_file
     from octoreplay.io.results.result_reader import is_result
     from octoreplay.io.robots import discover
@@ -151,14 +155,17 @@ def _aligned(
             raise click.UsageError(f"name one result alone, without {inputs[1]}")
         if given or classes is not None:
             raise ConfigError(f"{inputs[0]}: holds finished maps; leave out {_option(given)}, or name its logs")
-        return (*_aligned_result(inputs[0], dof, guesses), ())
+        return (*_aligned_result(inputs[0], dof, guesses), (), {})
     with LogSurveys() as surveys:
         config = base_config(inputs, None, err, surveys)
         config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
         check_alignable(config, guesses or {})
         resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)
-        alignment = align_with_bar(config, evidence_with_bar(resolved), dof, guesses)
-        return config, alignment, discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings
+        evidence = evidence_with_bar(resolved)
+        alignment = align_with_bar(config, evidence, dof, guesses)
+        warnings = discover.resolve(aligned_config(config, alignment.teams[0]), surveys).warnings
+        counts = {robot.robot_id: own.counts for robot, own in zip(config.robots, evidence, strict=True)}
+        return config, alignment, warnings, counts
 
 
 def _option(given: Mapping[str, Any]) -> str:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
     """Simulate a team, find its frames, replay it, and export its map and figures into DIR (default: octoreplay-demo).
 
-    The robots' logs are in frames of their own, as those of real robots. Takes less than two minutes. Lists the files
+    The robots' logs are in frames of their own, as those of real robots. Takes about two minutes. Lists the files
     written and the programs that open them.
     """
     from octoreplay.report import export, plots, tables
@@ -52,7 +52,7 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
     save_figures({"frames.png": team_figure(alignment, before=titles[0], after=titles[1])}, figures)
     export.export_ply(result_path, ply, what="voxels")
     tables.show(out, tables.results(summary))
-    tables.show(out, contradiction_table({"assumed": before, "aligned": after}))
+    tables.show(out, contradiction_table({"as in the logs": before, "found": after}))
     show_warnings(err, summary)
     for sentence in alignment.warnings:
         warn(err, sentence)

@@ -8,16 +8,20 @@ from typing import Any
 import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
-from octoreplay.commands.options import check_output, existing_path, numbers
+from octoreplay.commands.options import check_new, check_output, existing_path, force_option, numbers
 from octoreplay.commands.progress import progress_bar
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.run import RunConfig
-from octoreplay.errors import InputError, OutputError
+from octoreplay.errors import InputError
 from octoreplay.io.text_files import write_whole
 
 _strict_frames = click.option(
     "--strict-frames", is_flag=True, help=f"{PARAMETERS['strict_frames'].help}, instead of a warning"
 )
+_map_frame = click.option(
+    "--map-frame", default="map", show_default=True, metavar="NAME",
+    help="name of the frame of the poses; logs that say 'map' share one frame, logs that say 'odom' do not",
+)  # fmt: skip
 
 
 @click.command(short_help="Show the contents of logs and what is missing for a run.")
@@ -45,7 +49,7 @@ def info(logs: tuple[Path, ...], strict_frames: bool) -> int:
 @click.command(short_help="Write a team file for logs, to be edited by hand.")
 @click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="TEAM.yaml", help="team file to write")
-@click.option("--force", is_flag=True, help="overwrite an existing file")
+@force_option
 @_strict_frames
 def init(logs: tuple[Path, ...], output: Path, force: bool, strict_frames: bool) -> int:
     """Write a team file with the robots and topics found in logs, and every other setting as a comment.
@@ -57,8 +61,7 @@ def init(logs: tuple[Path, ...], output: Path, force: bool, strict_frames: bool)
     from octoreplay.io.robots.describe import describe
 
     check_output(output, ".yaml", logs)
-    if output.exists() and not force:
-        raise OutputError(f"{output}: already exists; name another file, or use --force to overwrite it")
+    check_new(output, force=force)
     description = describe(logs, strict_frames=strict_frames)
     for log in description.logs:
         if log.error is not None:
@@ -99,12 +102,17 @@ def init(logs: tuple[Path, ...], output: Path, force: bool, strict_frames: bool)
 @click.option("--first", type=int, default=0, show_default=True, help="index of the first image to import, from 0")
 @click.option("--last", type=int, default=None, help="index of the last image to import  [default: the last]")
 @click.option("--every", type=int, default=1, show_default=True, help="import every n-th image")
-def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, **options: Any) -> int:
+@_map_frame
+@force_option
+def import_rgbd(
+    folder: Path, output: Path, intrinsics: str | None, classes_from: Path | None, force: bool, **options: Any
+) -> int:
     """Convert a folder of depth images with poses (7-Scenes, TUM RGB-D, ScanNet) to a robot's log."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import rgbd_folder
 
     check_output(output, ".mcap")
+    check_new(output, force=force)
     camera = None if intrinsics is None else numbers("intrinsics", intrinsics, 4)
     table = None if classes_from is None else load_team_file(classes_from).classes
     with progress_bar("import") as update:
@@ -140,12 +148,15 @@ def import_rgbd(folder: Path, output: Path, intrinsics: str | None, classes_from
 @click.option("--first", type=int, default=0, show_default=True, help="index of the first cloud to import, from 0")
 @click.option("--last", type=int, default=None, help="index of the last cloud to import  [default: the last]")
 @click.option("--every", type=int, default=1, show_default=True, help="import every n-th cloud")
-def import_clouds(folder: Path, output: Path, classes_from: Path | None, **options: Any) -> int:
+@_map_frame
+@force_option
+def import_clouds(folder: Path, output: Path, classes_from: Path | None, force: bool, **options: Any) -> int:
     """Convert a folder of point clouds with poses (PCD, PLY, KITTI) to a robot's log."""
     from octoreplay.config.team_file import load_team_file
     from octoreplay.io.datasets import cloud_folder
 
     check_output(output, ".mcap")
+    check_new(output, force=force)
     table = None if classes_from is None else load_team_file(classes_from).classes
     with progress_bar("import") as update:
         summary = cloud_folder.import_clouds(

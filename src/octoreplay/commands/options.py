@@ -106,6 +106,16 @@ def check_folder(path: Path) -> None:
         raise OutputError(f"{path}: is a file; name a folder")
 
 
+force_option = click.option("--force", is_flag=True, help="overwrite existing files")
+
+
+def check_new(*paths: Path, force: bool) -> None:
+    """Check that outputs do not exist, unless ``force`` is set. Raises OutputError."""
+    for path in paths:
+        if path.exists() and not force:
+            raise OutputError(f"{path}: already exists; name another file, or use --force to overwrite it")
+
+
 def check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
     """Check, before any work is done, that an output file can be written and is not an input of the command.
 

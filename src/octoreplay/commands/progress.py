@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,16 +95,21 @@ def show_warnings(err: Console, summary: RunSummary, shown: Sequence[str] = ()) 
     for sentence in summary.warnings:
         if sentence not in shown:
             warn(err, sentence)
-    # Robots may share a log.
-    for sentence in dict.fromkeys(s for counts in summary.frame_counts.values() for s in counts.truncated_files):
+    for sentence in lost_data(summary.frame_counts):
         warn(err, sentence)
-    for robot_id, counts in summary.frame_counts.items():
-        for sentence in losses(counts):
-            warn(err, f"{robot_id}: {sentence}")
 
 
-def losses(counts: FrameCounts) -> Iterator[str]:
-    """Yield a sentence for each kind of data of one robot's logs that could not be used."""
+def lost_data(counts_by_robot: Mapping[str, FrameCounts]) -> Iterator[str]:
+    """Yield a sentence for each cut file, and for each kind of data of each robot's logs that could not be used."""
+    # Robots may share a log.
+    yield from dict.fromkeys(s for counts in counts_by_robot.values() for s in counts.truncated_files)
+    for robot_id, counts in counts_by_robot.items():
+        for sentence in _losses(counts):
+            yield f"{robot_id}: {sentence}"
+
+
+def _losses(counts: FrameCounts) -> Iterator[str]:
+    """Sentences on each kind of data of one robot's logs that could not be used."""
     for cause, reason in (
         ("no_pose", "had no pose: none within pose_gap on both sides, or one outside the map's range"),
         ("no_label", "had no labels or confidences within pair_tolerance"),

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import check_folder, check_output, existing_path, numbers
-from octoreplay.commands.progress import losses, progress_bar, warn
+from octoreplay.commands.options import check_folder, check_new, check_output, existing_path, force_option, numbers
+from octoreplay.commands.progress import lost_data, progress_bar, warn
 from octoreplay.commands.team_options import is_team_file, save_team_file
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option("--truth", type=existing_path, metavar="DIR",
               help="folder with the true trajectories ROBOT.tum, to show the errors")  # fmt: skip
 @click.option("--plot", type=existing_path, metavar="FILE.png", help="write a figure of the trajectories")
-@click.option("--force", is_flag=True, help="overwrite existing files")
+@force_option
 def refine(
     team: Path, output: Path, drift: str, frame_sigma: str, submap_seconds: float, hold_back: int, truth: Path | None,
     plot: Path | None, force: bool,
@@ -71,9 +71,8 @@ def refine(
         f"{refinement.num_submaps} submaps, {refinement.num_edges} registrations accepted,"
         f" {refinement.num_rejected} rejected", soft_wrap=True,
     )  # fmt: skip
-    for robot_id, counts in refinement.frame_counts.items():
-        for sentence in (*losses(counts), *counts.truncated_files):
-            warn(err, f"{robot_id}: {sentence}")
+    for sentence in lost_data(refinement.frame_counts):
+        warn(err, sentence)
     _write(config, refinement, output, poses)
     out.print(f"wrote {output}", soft_wrap=True)
     if plot is not None:
@@ -88,9 +87,7 @@ def _check_outputs(team: Path, output: Path, poses: Path, plot: Path | None, *, 
     check_folder(poses)
     if plot is not None:
         check_output(plot, ".png")
-    for path in (output, poses):
-        if path.exists() and not force:
-            raise OutputError(f"{path}: already exists; name another file, or use --force to overwrite it")
+    check_new(output, poses, force=force)
 
 
 def _write(config: RunConfig, refinement: Refinement, output: Path, folder: Path) -> None:

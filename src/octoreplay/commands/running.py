@@ -47,9 +47,19 @@ def _with_align_values(args: Sequence[str]) -> Iterator[str]:
             yield word
         else:
             following = next(words, None)
-            yield f"--align={following}" if following in _ALIGN_VALUES else "--align=before"
-            if following is not None and following not in _ALIGN_VALUES:
+            if following in _ALIGN_VALUES:
+                yield f"--align={following}"
+                continue
+            yield "--align=before"
+            if following is not None:
+                _check_input(following)
                 yield from _with_align_values([following, *words])
+
+
+def _check_input(word: str) -> None:
+    """Raise UsageError for a word after ``--align`` that is no option, has no suffix, and is no existing folder."""
+    if not word.startswith("-") and not Path(word).suffix and not Path(word).exists():
+        raise click.UsageError(f"'{word}' is no file and no value of --align ({', '.join(_ALIGN_VALUES)})")
 
 
 @with_parameters()
@@ -89,7 +99,9 @@ def run(
     if output is None and save_team is None:
         raise click.UsageError("name the result with -o OUT.mcap (or use --save-team TEAM.yaml to stop before the run)")
     if dof is not None and align != _BEFORE:
-        raise click.UsageError("--dof goes with --align before; robots that align on air know their vertical axes")
+        raise click.UsageError(
+            "--dof needs --align" + ("; robots that align on air know their vertical axes" if align == ON_AIR else "")
+        )
     if output is not None:
         check_output(output, ".mcap")
     if save_team is not None:
@@ -129,8 +141,10 @@ def run(
 
 def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
     """Lines on the robots whose poses TF transforms to a map frame that the configuration does not name."""
-    for robot, resolved in zip(given.robots, config.robots, strict=True):
-        if robot.map_frame is None and resolved.frame is not None and resolved.frame.origin:
+    named = {robot.robot_id for robot in given.robots if robot.map_frame is not None}
+    # An alignment may have left robots out.
+    for resolved in config.robots:
+        if resolved.robot_id not in named and resolved.frame is not None and resolved.frame.origin:
             yield f"{resolved.robot_id}: map frame {resolved.map_frame} ({resolved.frame.origin})"
 
 
@@ -167,7 +181,10 @@ def simulate(folder: Path, robots: int, image: str, odometry_drift: str, **optio
     """
     values = {"num_robots": robots, "image": _image_size(image), "odometry_drift": _drift(odometry_drift)}
     team_file = simulate_with_bar(folder, {**values, **options})
-    click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
+    if options["own_frames"]:
+        click.echo(f"next: octoreplay align {team_file} -o {folder / 'aligned.yaml'}")
+    else:
+        click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
     return 0
 
 

@@ -28,7 +28,7 @@ def is_team_file(inputs: Sequence[Path]) -> bool:
 def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console, surveys: LogSurveys) -> RunConfig:
     """Return the configuration before options: from a stored result, from a team file, or detected in logs."""
     from octoreplay.config.team_file import load_team_file
-    from octoreplay.io.results.result_reader import ResultReader
+    from octoreplay.io.results.result_reader import ResultReader, is_result
     from octoreplay.io.robots import discover
 
     if config_from is not None:
@@ -45,6 +45,8 @@ def base_config(inputs: tuple[Path, ...], config_from: Path | None, err: Console
             raise click.UsageError("name one team file or several logs, not both")
         return load_team_file(inputs[0])
     for path in inputs:
+        if is_result(path):
+            raise click.UsageError(f"{path} is a result of octoreplay, not a log; --config-from {path} repeats its run")
         if (path / "team.yaml").is_file():
             raise ConfigError(f"{path}: contains a team file; name {path / 'team.yaml'}, or its logs one by one")
     return RunConfig(robots=discover.discover(inputs, surveys))

@@ -16,6 +16,7 @@ from octoreplay.evaluate.morton_intervals import Region
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.evaluate.scores import agreement, truth_scores
 from octoreplay.evaluate.truth import WORLD_FILE, Truth, load_truth
+from octoreplay.evaluate.truth_frame import truth_frame_warning
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
@@ -76,9 +77,10 @@ def evaluate_result(
             ticks.append(evaluator.evaluate(maps))
             if progress is not None:
                 progress(min(1.0, (ticks[-1].tick + 1) / (result.metrics[-1].tick + 1)))
+        misplaced = None if truth is None else truth_frame_warning(result, Path(truth))
         return Evaluation(
             str(path), None if truth is None else str(truth), str(against), map_kind, result.class_table.names,
-            tuple(ticks), evaluator.warnings,
+            tuple(ticks), (*evaluator.warnings, *([misplaced] if misplaced is not None else [])),
         )  # fmt: skip
 
 

@@ -96,7 +96,7 @@ def repair_drift(
         def edge_of(pair: tuple[int, int], poses: Float64Array = poses, gate: float = gate) -> PoseGraphEdge | None:
             first, second = submaps[pair[0]], submaps[pair[1]]
             guess = inverse(poses[pair[0]]) @ poses[pair[1]]
-            found = register(first, second, guess, gate * first.voxel, is_final=gate < _FINAL_GATE)
+            found = register(first, second, guess, gate * first.planes.spacing, is_final=gate < _FINAL_GATE)
             return None if found is None else PoseGraphEdge(*pair, found.T_first_second, found.information)
 
         found = run(edge_of, overlapping_pairs(submaps, poses))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -17,12 +18,21 @@ from octoreplay.registration.icp import (
     moved_pose,
     weighted_pulls,
 )
+from octoreplay.registration.planes import PlanePoints, plane_distances
+from octoreplay.registration.rigid import rotation_logs
 from octoreplay.transforms import inverse
 
 _NUM_ITERATIONS = 12
 # Iterations of a stage end where no pose moves by more than this [m], or [rad] times ten metres.
 _LEAST_STEP = 1e-3
 _LEVER = 10.0
+# Planes, lengths in spacings of the points: largest distances between correspondences in each stage, and under the
+# guess; least cosine between normals; standard deviation of a distance; distance at which a weight is 1/4, as a share
+# of the gate; standard deviations of the guesses, rotations in radians.
+_PLANE_GATES, _SEARCH_GATE = (8 / 3, 4 / 3, 2 / 3), 4.0
+_LEAST_COSINE = 0.95
+_PLANE_SIGMA, _ROBUST_SHARE = 1 / 3, 1 / 3
+_GUESS_SHIFT, _GUESS_ANGLE = 2 / 3, math.radians(1.0)
 
 
 def register_together(
@@ -44,9 +54,8 @@ def register_together(
                 T[:3, :3] @ surface.points.mean(axis=0) + T[:3, 3] for T, surface in zip(poses, surfaces, strict=True)
             ]
             motions = _motions(surfaces, poses, centres, gate, tilt_sigma)
-            moved = [moved_pose(T, *step) for T, *step in zip(poses, motions, centres, strict=True)]
-            poses = [poses[0], *moved[1:]]
-            if max(np.abs(motions[:, :3]).max() * _LEVER, np.abs(motions[:, 3:]).max()) < _LEAST_STEP:
+            poses = _moved(poses, motions, centres)
+            if _is_still(motions):
                 break
     return poses
 
@@ -79,9 +88,91 @@ def _motions(
         for n in range(1, num):
             own = slice(6 * n, 6 * n + 6)
             add_tilt_prior(hessian[own, own], gradient[own], inverse(poses[0]) @ poses[n], tilt_sigma)
-    free = slice(6, None)
+    return _solved(hessian, gradient)
+
+
+def register_planes(planes: Sequence[PlanePoints], poses: Sequence[Float64Array]) -> list[Float64Array]:
+    """Return the poses (4, 4) of a team's planes in the frame of the first one, refined from close guesses ``poses``.
+
+    The distances of points to planes count for every pair of robots, weighted by Geman and McClure's function. A
+    direction that the planes leave free stays near the guess.
+    """
+    guesses = [np.array(T, np.float64) for T in poses]
+    spacing = planes[0].spacing
+    middles = [own.points.mean(axis=0) if len(own.points) else np.zeros(3) for own in planes]
+    pairs = _close_samples(planes, guesses, _SEARCH_GATE * spacing)
+    prior = np.diag([_GUESS_ANGLE**-2.0] * 3 + [(_GUESS_SHIFT * spacing) ** -2.0] * 3)
+    poses = guesses
+    for gate in _PLANE_GATES:
+        for _ in range(_NUM_ITERATIONS):
+            centres = [T[:3, :3] @ middle + T[:3, 3] for T, middle in zip(poses, middles, strict=True)]
+            hessian, gradient = _plane_equations(planes, pairs, poses, centres, gate * spacing)
+            for n, (T, guess) in enumerate(zip(poses, guesses, strict=True)):
+                own = slice(6 * n, 6 * n + 6)
+                turn = rotation_logs((T[:3, :3] @ guess[:3, :3].T)[None])[0]
+                shift = centres[n] - guess[:3, :3] @ middles[n] - guess[:3, 3]
+                hessian[own, own] += prior
+                gradient[own] += prior @ np.concatenate([turn, shift])
+            motions = _solved(hessian, gradient)
+            poses = _moved(poses, motions, centres)
+            if _is_still(motions):
+                break
+    return poses
+
+
+def _close_samples(
+    planes: Sequence[PlanePoints], poses: Sequence[Float64Array], gate: float
+) -> dict[tuple[int, int], PlanePoints]:
+    """Planes of the second robot of each pair with the samples that are close to the first robot's points."""
+    close = {}
+    for a, b in itertools.permutations(range(len(planes)), 2):
+        T = inverse(poses[a]) @ poses[b]
+        points = planes[b].sample_points @ T[:3, :3].T + T[:3, 3]
+        distances, _ = planes[a].nearest(points, planes[b].class_ids[planes[b].samples], gate)
+        samples = planes[b].samples[np.isfinite(distances)]
+        if samples.size >= MIN_CORRESPONDENCES:
+            close[a, b] = planes[b].with_samples(samples)
+    return close
+
+
+def _plane_equations(
+    planes: Sequence[PlanePoints],
+    pairs: Mapping[tuple[int, int], PlanePoints],
+    poses: Sequence[Float64Array],
+    centres: Sequence[Float64Array],
+    gate: float,
+) -> tuple[Float64Array, Float64Array]:
+    """Gauss-Newton's matrix (6n, 6n) and gradient (6n,) of the distances for motions about the ``centres``."""
+    hessian, gradient = np.zeros((6 * len(planes), 6 * len(planes))), np.zeros(6 * len(planes))
+    for (a, b), moving in pairs.items():
+        found = plane_distances(moving, planes[a], inverse(poses[a]) @ poses[b], gate, least_cosine=_LEAST_COSINE)
+        points = found.points @ poses[a][:3, :3].T + poses[a][:3, 3]
+        normals = found.normals @ poses[a][:3, :3].T
+        sigma = _PLANE_SIGMA * moving.spacing
+        weights = (sigma * (1.0 + np.square(found.distances / (_ROBUST_SHARE * gate)))) ** -2.0
+        jacobian = np.concatenate(
+            [-np.cross(points - centres[a], normals), -normals, np.cross(points - centres[b], normals), normals], axis=1
+        )
+        rows = np.r_[6 * a : 6 * a + 6, 6 * b : 6 * b + 6]
+        hessian[np.ix_(rows, rows)] += (jacobian * weights[:, None]).T @ jacobian
+        gradient[rows] += jacobian.T @ (weights * found.distances)
+    return hessian, gradient
+
+
+def _moved(poses: Sequence[Float64Array], motions: Float64Array, centres: Sequence[Float64Array]) -> list[Float64Array]:
+    """Poses after the motions (n, 6) about the centres; the first one stays."""
+    return [poses[0], *(moved_pose(T, *step) for T, *step in list(zip(poses, motions, centres, strict=True))[1:])]
+
+
+def _is_still(motions: Float64Array) -> bool:
+    """True where no motion (n, 6) is large enough to go on."""
+    return max(float(np.abs(motions[:, :3]).max()) * _LEVER, float(np.abs(motions[:, 3:]).max())) < _LEAST_STEP
+
+
+def _solved(hessian: Float64Array, gradient: Float64Array) -> Float64Array:
+    """Motions (n, 6) of Gauss and Newton's step; the first one is 0."""
+    motions = np.zeros_like(gradient)
     # A surface without correspondences stays where it is.
-    damping = max(1e-9 * np.trace(hessian), 1e-9) * np.eye(6 * num - 6)
-    motions = np.zeros(6 * num)
-    motions[free] = -np.linalg.solve(hessian[free, free] + damping, gradient[free])
-    return motions.reshape(num, 6)
+    damping = max(1e-9 * np.trace(hessian), 1e-9) * np.eye(gradient.size - 6)
+    motions[6:] = -np.linalg.solve(hessian[6:, 6:] + damping, gradient[6:])
+    return motions.reshape(-1, 6)

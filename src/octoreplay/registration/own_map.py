@@ -14,7 +14,6 @@ from scipy import ndimage
 
 from octoreplay.mapping.octree import SemanticOctree, codes_to_keys
 from octoreplay.records import BoolArray, Float64Array, Int64Array, UInt8Array, UInt64Array
-from octoreplay.registration.cell_means import CellMeans
 from octoreplay.registration.cells import (
     COLUMN_CELLS,
     FREE,
@@ -31,6 +30,8 @@ from octoreplay.registration.cells import (
 from octoreplay.registration.columns import Columns
 from octoreplay.registration.features import DescribedPoints
 from octoreplay.registration.icp import Surface
+from octoreplay.registration.measured_points import MeasuredPoints
+from octoreplay.registration.planes import PlanePoints
 
 MAX_CELLS = 1 << 27
 """Largest number of cells in a map's bounding box; a larger map is halved in resolution until it fits."""
@@ -57,7 +58,7 @@ class OwnMap:
     - ``low`` (3,) int64: key of the first cell.
     - ``resolution``: edge of a cell [m].
     - ``num_classes``: number of occupied classes, at most 253.
-    - ``means``: means of the measured points; occupied cells without them stand at their centres.
+    - ``measured``: measured points; occupied cells without them stand at their centres.
     """
 
     def __init__(
@@ -66,9 +67,9 @@ class OwnMap:
         low: Int64Array,
         resolution: float,
         num_classes: int,
-        means: CellMeans | None = None,
+        measured: MeasuredPoints | None = None,
     ) -> None:
-        self._means = means
+        self.measured = measured
         self.states = states
         self.low = low
         self.resolution = resolution
@@ -81,7 +82,7 @@ class OwnMap:
         states: UInt8Array,
         resolution: float,
         num_classes: int,
-        means: CellMeans | None = None,
+        measured: MeasuredPoints | None = None,
     ) -> OwnMap:
         """Return the map of known cells with ``keys`` (n, 3) and ``states`` (n,)."""
         # An empty border spares the neighbourhood operations the edges.
@@ -89,11 +90,11 @@ class OwnMap:
         shape = keys.max(axis=0) - low + 3 if len(keys) else np.ones(3, np.int64)
         grid = np.zeros(shape, np.uint8)
         grid[tuple((keys - low).T)] = states
-        return cls(grid, low, resolution, num_classes, means)
+        return cls(grid, low, resolution, num_classes, measured)
 
     @classmethod
     def of_evidence(
-        cls, evidence: SemanticOctree, *, hit: float, miss: float, means: CellMeans | None = None
+        cls, evidence: SemanticOctree, *, hit: float, miss: float, measured: MeasuredPoints | None = None
     ) -> OwnMap:
         """Return the map of a robot's evidence s_i, given the sensor model's increments [log-odds]."""
         spans = evidence.spans()
@@ -107,8 +108,8 @@ class OwnMap:
         resolution = evidence.resolution
         while len(keys) and float(np.prod(keys.max(axis=0) - keys.min(axis=0) + 5.0)) > MAX_CELLS:
             keys, states = halved(keys, states)
-            resolution, means = resolution * 2, None
-        return cls.of_cells(keys, states, resolution, evidence.num_classes, means)
+            resolution, measured = resolution * 2, None
+        return cls.of_cells(keys, states, resolution, evidence.num_classes, measured)
 
     @cached_property
     def is_occupied(self) -> BoolArray:
@@ -120,8 +121,7 @@ class OwnMap:
         """Indices (n, 3) of the occupied cells, and the cells."""
         indices = np.argwhere(self.is_occupied)
         keys = indices + self.low
-        means = CellMeans(self.resolution) if self._means is None else self._means
-        points = means.at(keys)
+        points = (MeasuredPoints(self.resolution) if self.measured is None else self.measured).cell_means(keys)
         return indices, OccupiedCells(points, self.states[tuple(indices.T)])
 
     @property
@@ -184,6 +184,11 @@ class OwnMap:
             spacing=self.resolution,
             radius=_SURFACE_RADIUS * self.resolution,
         )
+
+    @cached_property
+    def planes(self) -> PlanePoints | None:
+        """Planes around the measured points; None without them."""
+        return None if self.measured is None else self.measured.planes()
 
     @cached_property
     def surface(self) -> Surface:

@@ -56,7 +56,7 @@ class AcceptLimits:
     max_tilt : float
         Largest angle between the vertical axes [rad].
     min_shape_cells : int
-        Least number of cells of each map that count, without a vertical axis.
+        Least number of cells that count, without a vertical axis, mean of both maps.
     min_shape_same : float
         Least share q of each map's cells that are the same, without a vertical axis.
     min_shape_spread : float
@@ -207,7 +207,7 @@ class _Matcher:
         """The number for which a pose without a vertical axis is refused; empty where it is accepted."""
         limits = self._limits
         if agreement.least_same < limits.min_shape_same:
-            return f"q {agreement.least_same:.3f} below {limits.min_shape_same:g}"
+            return f"q {agreement.least_same:.3f} in one direction, below {limits.min_shape_same:g}"
         spread = spread_of_normals(self._first, self._second, T)
         is_fixed = spread >= limits.min_shape_spread
         return (

@@ -11,7 +11,7 @@ import numpy as np
 
 from octoreplay.mapping.octree import Run
 from octoreplay.records import Float64Array
-from octoreplay.registration.joint import register_together
+from octoreplay.registration.joint import register_planes, register_together
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import FINE_GATES, TILT_SIGMA, AcceptLimits, PairAlignment, align_pair
 from octoreplay.registration.verify import verify
@@ -71,19 +71,24 @@ def align_team(
 
 
 def refine_components(maps: Sequence[OwnMap], alignment: TeamAlignment, *, is_upright: bool = True) -> TeamAlignment:
-    """Return an alignment whose poses are registered together in each component of three robots and more.
+    """Return an alignment whose poses are registered together in each component.
 
-    The pairs through which robots got their poses are changed with them.
+    The cells of three robots and more are registered first, and then the planes around the measured points where all
+    maps have them. The pairs through which robots got their poses are changed with them.
     """
     poses = list(alignment.T_component_map)
     for component in alignment.components:
+        own = [maps[index] for index in component]
+        found = [poses[index] for index in component]
         if len(component) > 2:
-            surfaces = [maps[index].upright_surface if is_upright else maps[index].surface for index in component]
-            gates = [gate * maps[component[0]].resolution for gate in FINE_GATES]
-            sigma = TILT_SIGMA if is_upright else None
-            found = register_together(surfaces, [poses[index] for index in component], gates=gates, tilt_sigma=sigma)
-            for index, T in zip(component, found, strict=True):
-                poses[index] = T
+            surfaces = [map_.upright_surface if is_upright else map_.surface for map_ in own]
+            gates = [gate * own[0].resolution for gate in FINE_GATES]
+            found = register_together(surfaces, found, gates=gates, tilt_sigma=TILT_SIGMA if is_upright else None)
+        planes = [map_.planes for map_ in own if map_.planes is not None]
+        if len(planes) == len(component) > 1:
+            found = register_planes(planes, found)
+        for index, T in zip(component, found, strict=True):
+            poses[index] = T
 
     def refined(pair: PairAlignment) -> PairAlignment:
         i, j = pair.first, pair.second

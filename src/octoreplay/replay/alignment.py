@@ -19,12 +19,20 @@ from octoreplay.config.subteam import subteam
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.sightings import Sightings
-from octoreplay.records import Float64Array
+from octoreplay.records import TEAM_ORIGIN, Float64Array
 from octoreplay.registration.covariance import about_point
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
-from octoreplay.registration.placing import PlacedRobot, Refusal, place_robots
+from octoreplay.registration.placing import PlacedRobot, place_robots
 from octoreplay.registration.team import TeamAlignment, align_team
+from octoreplay.replay.alignment_notes import (
+    difference,
+    odd_maps,
+    problem,
+    refusal_with_remedy,
+    tilted,
+    unverified,
+)
 from octoreplay.replay.own_maps import OwnEvidence, own_evidences, own_map_of, own_maps
 from octoreplay.replay.priors import Priors
 from octoreplay.result import Result
@@ -139,9 +147,13 @@ class Alignment:
         for robot_id in self.left_out if len(self.teams[0]) > 1 else ():
             pair = self.best_refused(robot_id)
             first, second = self.robot_ids[pair.first], self.robot_ids[pair.second]
-            reason = pair.refusal or "accepted, and they are a team of their own"
+            reason = self.refusal(pair) or "accepted, and they are a component of their own"
             sentences.append(f"{robot_id} is not connected; its best pair is {first} and {second}: {reason}")
         return tuple(sentences)
+
+    def refusal(self, pair: PairAlignment) -> str:
+        """Return the refusal of a pair, with a remedy where an option of the alignment may help."""
+        return refusal_with_remedy(pair, self.dof, self.maps[pair.first].resolution)
 
 
 def align_logs(
@@ -216,8 +228,9 @@ def align_robots(
     robot_ids = tuple(robot.robot_id for robot in config.robots)
     check_alignable(config, guesses or {})
     placed = tuple(T_map_own) if T_map_own is not None else tuple(np.eye(4) for _ in robot_ids)
-    priors = Priors(robot_ids, maps, sightings, is_upright=dof == 4)
-    candidates = _candidates(config, placed, guesses or {}, priors)
+    guessed = _guessed(robot_ids, placed, guesses or {})
+    priors = Priors(robot_ids, maps, sightings, guessed, is_upright=dof == 4)
+    candidates = _candidates(config, placed, guessed, priors)
     aligned = _align_pairs(maps, robot_ids, dof, candidates, progress, num_threads)
     given = _given(config)
     placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
@@ -241,10 +254,11 @@ def align_robots(
         tuple(T @ own for T, own in zip(_configured(config), placed, strict=True)),
         aligned.pairs,
         tuple(frames(team) for team in placement.teams),
-        tuple(_problem(refusal, robot_ids) for refusal in placement.refusals),
+        tuple(problem(refusal, robot_ids) for refusal in placement.refusals),
         (
-            *_unverified(placement.teams[0], given, robot_ids),
-            *_odd_maps(maps, robot_ids),
+            *(tilted(_given(config), robot_ids) if dof == 4 else ()),
+            *unverified(placement.teams[0], given, robot_ids),
+            *odd_maps(maps, robot_ids),
             *priors.notes(aligned.pairs, [robot.index for robot in placement.teams[0]]),
         ),
     )
@@ -318,7 +332,7 @@ def check_aligned(alignment: Alignment) -> None:
         first, second = alignment.robot_ids[best.first], alignment.robot_ids[best.second]
         raise InputError(
             f"no two of the {len(alignment.robot_ids)} robots could be aligned; the best pair is {first} and {second}:"
-            f" {best.refusal}; their maps must overlap (docs/frames.md has remedies)"
+            f" {alignment.refusal(best)} (docs/frames.md has remedies)"
         )
 
 
@@ -348,24 +362,28 @@ def _configured(config: RunConfig) -> list[Float64Array]:
     return [transform_of(robot.T_team_map_or_identity) for robot in config.robots]
 
 
+def _guessed(robot_ids: Sequence[str], T_map_own: Sequence[Float64Array], guesses: Frames) -> dict[int, Float64Array]:
+    """Guessed poses (4, 4) of the maps, by position of the robot."""
+    return {
+        index: transform_of(guesses[robot_id]) @ T_map_own[index]
+        for index, robot_id in enumerate(robot_ids)
+        if robot_id in guesses
+    }
+
+
 def _candidates(
-    config: RunConfig, T_map_own: Sequence[Float64Array], guesses: Frames, priors: Priors
+    config: RunConfig, T_map_own: Sequence[Float64Array], guessed: Mapping[int, Float64Array], priors: Priors
 ) -> dict[tuple[int, int], list[Float64Array]]:
     """Known transforms between the maps of pairs: those of the configuration, guesses, and those of the logs."""
-    configured = _configured(config)
+    configured = [T @ own for T, own in zip(_configured(config), T_map_own, strict=True)]
     # A robot with a frame and one without are not related by the identity.
     is_known = [robot.T_team_map is not None for robot in config.robots]
-    guessed = {robot_id: transform_of(numbers) for robot_id, numbers in guesses.items()}
     found: dict[tuple[int, int], list[Float64Array]] = {}
     for i, j in combinations(range(len(config.robots)), 2):
-        poses = []
-        if is_known[i] == is_known[j]:
-            poses.append((configured[i], configured[j]))
-        ids = config.robots[i].robot_id, config.robots[j].robot_id
-        if all(robot_id in guessed for robot_id in ids):
-            poses.append((guessed[ids[0]], guessed[ids[1]]))
-        found[i, j] = [inverse(one @ T_map_own[i]) @ other @ T_map_own[j] for one, other in poses]
-        found[i, j] += priors.candidates(i, j)
+        poses = [inverse(configured[i]) @ configured[j]] if is_known[i] == is_known[j] else []
+        if i in guessed and j in guessed:
+            poses.append(inverse(guessed[i]) @ guessed[j])
+        found[i, j] = [*poses, *priors.candidates(i, j)]
     return found
 
 
@@ -379,7 +397,7 @@ def _robot_frame(
     if robot.partner is None:
         is_given = robot.index in given
         verified = " and verified by its overlaps" if robot.is_verified else ""
-        origin = f"given in the team file{verified}" if is_given else "frame of the team"
+        origin = f"given in the team file{verified}" if is_given else TEAM_ORIGIN
         return RobotFrame(robot_id, T, None, origin, None, is_given)
     turn = np.kron(np.eye(2), T_team_own[:3, :3])
     # From the origin of the map to that of the map frame.
@@ -389,7 +407,7 @@ def _robot_frame(
     first, second = sorted((robot.index, robot.partner))
     origin = f"aligned with {partner}, {qualities[first, second]}"
     if robot.index in given:
-        origin += f"; the given pose differs by {_difference(*pose_difference(T, given[robot.index]))}"
+        origin += f"; the given pose differs by {difference(*pose_difference(T, given[robot.index]))}"
     return RobotFrame(robot_id, T, covariance, origin, partner, False)
 
 
@@ -399,43 +417,3 @@ def _quality(pair: PairAlignment, dof: int, priors: Priors) -> str:
     number = f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
     agreeing = priors.agreeing(pair)
     return f"{number}; agrees with {' and '.join(agreeing)}" if agreeing else number
-
-
-def _difference(shift: float, angle: float) -> str:
-    """Difference of two poses as text."""
-    return f"{shift:.2f} m and {math.degrees(angle):.1f} degrees"
-
-
-def _problem(refusal: Refusal, robot_ids: Sequence[str]) -> str:
-    """Sentence on a given pose that the maps contradict."""
-    robot_id, other = robot_ids[refusal.index], robot_ids[refusal.other]
-    if refusal.share_contra is None:
-        return (
-            f"the T_team_map given for {robot_id} is not used: it disagrees with that of {other}, from which the maps"
-            f" place {robot_id} {_difference(refusal.shift, refusal.angle)} elsewhere"
-        )
-    return (
-        f"the T_team_map given for {robot_id} is not used: under it the maps of {robot_id} and {other} contradict each"
-        f" other (q_c {refusal.share_contra:.3f})"
-    )
-
-
-def _unverified(
-    team: Sequence[PlacedRobot], given: Mapping[int, Float64Array], robot_ids: Sequence[str]
-) -> Iterator[str]:
-    """Sentences on robots of the team with given poses that no overlap verifies."""
-    for robot in team:
-        is_alone = not any(other.anchor == robot.index != other.index for other in team)
-        if robot.index in given and robot.partner is None and is_alone and not robot.is_verified:
-            yield f"{robot_ids[robot.index]} keeps its given T_team_map, which no overlap with other maps verifies"
-
-
-def _odd_maps(maps: Sequence[OwnMap], robot_ids: Sequence[str]) -> Iterator[str]:
-    """Sentences on empty and on equal maps."""
-    for own, robot_id in zip(maps, robot_ids, strict=True):
-        if not own.states.any():
-            yield f"the map of {robot_id} is empty: check max_range, body_box and the poses"
-    for i, j in combinations(range(len(maps)), 2):
-        is_equal = np.array_equal(maps[i].low, maps[j].low) and np.array_equal(maps[i].states, maps[j].states)
-        if is_equal and maps[i].states.any():
-            yield f"{robot_ids[i]} and {robot_ids[j]} have equal maps: are their logs the same?"

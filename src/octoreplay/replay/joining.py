@@ -134,7 +134,7 @@ class Joining:
         """Return a phrase on the origin of each robot's frame, by robot_id."""
         places = {place.robot_id: place.frame_id for place in self.frames.places}
         phrases = {
-            robot_id: "given in the team file" if frame_id == TEAM else f"frame '{frame_id}'"
+            robot_id: f"frame '{frame_id}'" + (" (given in the team file)" if frame_id == TEAM else "")
             for robot_id, frame_id in places.items()
         }
         for join in self.joins:

@@ -15,7 +15,8 @@ from octoreplay.io.robots.sightings import Sightings, read_sightings
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments, sensor_reach
-from octoreplay.registration.cell_means import CellMeans
+from octoreplay.records import FrameCounts
+from octoreplay.registration.measured_points import MeasuredPoints
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.run_metrics import PairMetrics
 
@@ -23,16 +24,17 @@ _OWN_FRAME = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class OwnEvidence(NamedTuple):
-    """Evidence of one robot in its own map frame, means of its measured points by cell, and places from its logs."""
+    """Evidence of one robot in its own map frame, its measured points, places from its logs, and its frames."""
 
     octree: SemanticOctree
-    means: CellMeans
+    measured: MeasuredPoints
     sightings: Sightings
+    counts: FrameCounts
 
 
 def own_maps(config: RunConfig, evidence: Sequence[OwnEvidence]) -> list[OwnMap]:
     """Return the map for registration of each robot's evidence."""
-    return [own_map_of(config, own.octree, own.means) for own in evidence]
+    return [own_map_of(config, own.octree, own.measured) for own in evidence]
 
 
 def own_evidences(
@@ -60,7 +62,7 @@ def own_evidences(
 def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     """Return the evidence of one robot's scans in the robot's own map frame, without ``bounds``."""
     num_classes = config.classes.num_classes
-    octree, means = SemanticOctree(config.map.resolution, num_classes), CellMeans(config.map.resolution)
+    octree, measured = SemanticOctree(config.map.resolution, num_classes), MeasuredPoints(config.map.resolution)
     # The bounds are in the team's frame, which is not known yet.
     region = dataclasses.replace(config.map, bounds=())
     sensor = config.effective_sensor
@@ -70,8 +72,8 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     with RobotLog(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
-            means.add_scan(frame, sensor)
-        return OwnEvidence(octree, means, read_sightings(log, config.time))
+            measured.add_scan(frame, sensor)
+        return OwnEvidence(octree, measured, read_sightings(log, config.time), log.counts)
 
 
 def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence]) -> tuple[PairMetrics, ...]:
@@ -81,7 +83,7 @@ def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence])
     return comparer.compare([own.octree for own in evidence], 0)
 
 
-def own_map_of(config: RunConfig, evidence: SemanticOctree, means: CellMeans | None = None) -> OwnMap:
-    """Return the map for registration of a robot's evidence. ``means`` make its surfaces more accurate."""
+def own_map_of(config: RunConfig, evidence: SemanticOctree, measured: MeasuredPoints | None = None) -> OwnMap:
+    """Return the map for registration of a robot's evidence. ``measured`` points make its surfaces more accurate."""
     sensor = config.effective_sensor
-    return OwnMap.of_evidence(evidence, hit=sensor.hit, miss=sensor.miss, means=means)
+    return OwnMap.of_evidence(evidence, hit=sensor.hit, miss=sensor.miss, measured=measured)

@@ -1,9 +1,9 @@
-"""Known transforms between robots from their logs: position fixes, and tags that two robots saw."""
+"""Known transforms between robots: position fixes and tags in their logs, and guesses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,10 +16,14 @@ from octoreplay.registration.known_places import KnownPose, fit_fixes, fit_tags,
 from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.search import climbed_pose
-from octoreplay.transforms import pose_difference
+from octoreplay.transforms import inverse, pose_difference
 
 # Difference from a known transform that is always explained [m], [rad], and that beyond it [standard deviations].
 _SAME_SHIFT, _SAME_ANGLE, _SAME_SIGMAS = 1.0, math.radians(5.0), 3.0
+
+# Standard deviations that a guess is taken to have [m], [rad].
+_GUESS_SHIFT, _GUESS_ANGLE = 0.5, math.radians(3.0)
+_GUESSES = "the guesses"
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +69,11 @@ class Prior:
 
 
 class Priors:
-    """Known transforms between a team's robots, from what each robot saw.
+    """Known transforms between a team's robots, from what each robot saw and from guesses.
 
-    ``maps`` are in the robots' map frames, ``sightings`` None where nothing is known. ``is_upright`` is True where the
-    map frames have a vertical z axis; fixes are used only there.
+    ``maps`` are in the robots' map frames, ``sightings`` None where nothing is known. ``guessed`` are poses (4, 4) of
+    maps by position of the robot, all in one frame. ``is_upright`` is True where the map frames have a vertical z axis;
+    fixes are used only there.
     """
 
     def __init__(
@@ -76,6 +81,7 @@ class Priors:
         robot_ids: Sequence[str],
         maps: Sequence[OwnMap],
         sightings: Sequence[Sightings] | None,
+        guessed: Mapping[int, Float64Array],
         *,
         is_upright: bool,
     ) -> None:
@@ -85,14 +91,22 @@ class Priors:
         tagged, tag_notes = _tag_priors(robot_ids, seen, is_upright)
         by_fixes = [Prior(i, j, fixed[j].relative_to(fixed[i]), "position fixes") for i, j in combinations(fixed, 2)]
         self._priors = [*by_fixes, *tagged]
+        self._guesses = [
+            Prior(i, j, KnownPose(inverse(guessed[i]) @ guessed[j], _GUESS_SHIFT, _GUESS_ANGLE), _GUESSES)
+            for i, j in combinations(guessed, 2)
+        ]
         self._notes = [*(note for robot in seen for note in robot.notes), *fix_notes, *tag_notes]
+        if len(guessed) == 1:
+            self._notes.append(
+                f"the guess for {robot_ids[next(iter(guessed))]} is not used: it needs that of another robot"
+            )
 
     def candidates(self, first: int, second: int) -> list[Float64Array]:
         """Return poses T_first_second (4, 4) to try.
 
-        These are the known ones, and for maps with a vertical axis the most likely one near each.
+        These are the known ones without guesses, and for maps with a vertical axis the most likely one near each.
         """
-        known = [prior.pose.T for prior in self._of(first, second)]
+        known = [prior.pose.T for prior in self._priors if (prior.first, prior.second) == (first, second)]
         if not self._is_upright:
             return known
         return [T for pose in known for T in (pose, climbed_pose(self._maps[first], self._maps[second], pose))]
@@ -115,9 +129,10 @@ class Priors:
                     refused.append(prior)
                 elif not prior.explains(pair, self._maps):
                     shift, angle = prior.difference(pair, self._maps)
+                    verdict = "they are not used" if prior.source == _GUESSES else "one is wrong"
                     yield (
                         f"{self._robot_ids[pair.second]} is aligned with {self._robot_ids[pair.first]} {shift:.1f} m "
-                        f"and {math.degrees(angle):.1f} degrees from where {prior.source} place it: one is wrong"
+                        f"and {math.degrees(angle):.1f} degrees from where {prior.source} place it: {verdict}"
                     )
         outside = [index for index in range(len(self._robot_ids)) if index not in team]
         nearest = (self._nearest(index, refused) for index in outside)
@@ -136,8 +151,9 @@ class Priors:
         return min(own, key=lambda prior: prior.gap(self._maps), default=None)
 
     def _of(self, first: int, second: int) -> list[Prior]:
-        """Known transforms between two robots."""
-        return [prior for prior in self._priors if (prior.first, prior.second) == (first, second)]
+        """Known transforms between two robots, guesses included."""
+        both = (*self._priors, *self._guesses)
+        return [prior for prior in both if (prior.first, prior.second) == (first, second)]
 
 
 def _tag_priors(

@@ -18,6 +18,7 @@ from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Transforms
 from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.team_frames import frames_warning
 from octoreplay.mapping.scan_points import scan_points
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import Float64Array, Frame, FrameCounts, Int64Array, UInt8Array
@@ -123,9 +124,10 @@ def refine_team(
 
     The recorded poses stay where the scans that were held back do not clearly contradict each other less under the
     corrected ones (``judge``). ``progress`` is called with the finished share, 0 to 1; ``num_threads`` does not change
-    the result. Raises InputError for logs without frames or poses, ConfigError for a robot whose body_box has no fixed
-    frame.
+    the result. Raises InputError for logs without frames or poses, ConfigError for robots whose map frames nothing
+    relates and for a robot whose body_box has no fixed frame.
     """
+    _check_frames(config)
     if config.time.rate_limit is None:
         config = dataclasses.replace(config, time=dataclasses.replace(config.time, rate_limit=_SCAN_RATE))
     show = progress or _ignore
@@ -160,6 +162,16 @@ def refine_team(
         trajectories = tuple(threads.map(trajectory, range(len(logs))))
         show(1.0)
     return Refinement(trajectories, len(submaps), len(repair.edges), repair.num_rejected, scores, counts)
+
+
+def _check_frames(config: ResolvedRun) -> None:
+    """Raise ConfigError where nothing relates the map frames of two robots."""
+    if frames_warning([(robot, robot.frame) for robot in config.robots if robot.frame is not None]) is not None:
+        names = ", ".join(robot.robot_id for robot in config.robots if robot.T_team_map is None)
+        raise ConfigError(
+            f"T_team_map: {names} have none, and nothing relates their map frames; find it with 'octoreplay align', or"
+            " give it in the team file"
+        )
 
 
 def _ignore(share: float) -> None:

@@ -137,9 +137,11 @@ def _others(pairs: Sequence[PairMetrics]) -> str:
     """Clause on the pairs after the first one."""
     if len(pairs) < 2:
         return ""
+    if len(pairs) == 2:
+        return f" (and {pairs[1].first} and {pairs[1].second})"
     common = set.intersection(*({pair.first, pair.second} for pair in pairs))
     names = f", all with {common.pop()}" if common else ""
-    return f" ({len(pairs) - 1} more {'pairs' if len(pairs) > 2 else 'pair'}{names})"
+    return f" ({len(pairs) - 1} more pairs{names})"
 
 
 def _groups_with_common_space(pairs: Sequence[PairMetrics], num_cells: Mapping[str, int]) -> list[list[str]]:

@@ -8,7 +8,10 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.records import Float64Array
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.replay.alignment import Alignment, RobotFrame
 from octoreplay.transforms import inverse, numbers_of
@@ -42,12 +45,14 @@ def alignment_csv(alignment: Alignment) -> str:
 
 
 def alignment_json(alignment: Alignment) -> str:
-    """Return an alignment as JSON text: its teams with frames and covariances, all pairs, and the sentences."""
+    """Return an alignment as JSON text: its components with frames and covariances, all pairs, and the sentences."""
     return json_text(
         {
-            "teams": [[_frame(frame) for frame in team] for team in alignment.teams],
+            "components": [[_frame(frame) for frame in team] for team in alignment.teams],
             "left_out": alignment.left_out,
-            "pairs": [_pair(alignment, pair) | {"information": pair.information.tolist()} for pair in alignment.pairs],
+            "pairs": [
+                _pair(alignment, pair) | {"information": _position_first(pair.information)} for pair in alignment.pairs
+            ],
             "problems": alignment.problems,
             "notes": alignment.notes,
         }
@@ -60,10 +65,16 @@ def _frame(frame: RobotFrame) -> dict[str, Any]:
         "robot": frame.robot_id,
         "T_team_map": numbers_of(frame.T_team_map),
         "T_team_map_sigma": frame.sigma,
-        "covariance": None if frame.covariance is None else frame.covariance.tolist(),
+        "covariance": None if frame.covariance is None else _position_first(frame.covariance),
         "from": frame.origin,
         "partner": frame.partner,
     }
+
+
+def _position_first(matrix: Float64Array) -> list[list[float]]:
+    """Matrix (6, 6) over rotation and position with the position first, in the order of ``T_team_map_sigma``."""
+    swapped: list[list[float]] = np.roll(matrix, 3, axis=(0, 1)).tolist()
+    return swapped
 
 
 def _pair(alignment: Alignment, pair: PairAlignment) -> dict[str, Any]:

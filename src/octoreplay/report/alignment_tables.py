@@ -17,6 +17,8 @@ from octoreplay.run_metrics import PAIR_SHARES, PairMetrics
 MAX_PAIRS = 30
 """Largest number of rows of the table of pairs."""
 
+_NUMBERS = ("overlap", "cells", "q", "q_c", "q_g", "L")
+
 
 def ranked(pairs: Sequence[PairAlignment]) -> list[PairAlignment]:
     """Return the accepted pairs before the refused ones, each with the largest L first."""
@@ -24,11 +26,11 @@ def ranked(pairs: Sequence[PairAlignment]) -> list[PairAlignment]:
 
 
 def alignment_tables(alignment: Alignment) -> RenderableType:
-    """Return the tables of an alignment: its pairs, and the frames of each team of two or more robots."""
+    """Return the tables of an alignment: its pairs, and the frames of each component of two or more robots."""
     parts: list[RenderableType] = [pairs_table(alignment)]
     teams = [team for team in alignment.teams if len(team) > 1]
     for number, team in enumerate(teams, start=1):
-        parts += ["", frames_table(team, f"Frames of team {number}" if len(teams) > 1 else "Frames")]
+        parts += ["", frames_table(team, f"Frames of component {number}" if len(teams) > 1 else "Frames")]
     return Group(*parts)
 
 
@@ -42,22 +44,34 @@ def contradiction_table(pairs_by_frames: Mapping[str, Sequence[PairMetrics]]) ->
     return table
 
 
+def pair_numbers(pair: PairAlignment, dof: int) -> dict[str, str]:
+    """Return the numbers behind the verdict on a pair as texts, by name; '-' where a number does not count."""
+    agreement, is_upright = pair.verification, dof == 4
+    texts = (
+        share(agreement.overlap),
+        f"{agreement.obstacles.total:,}",
+        f"{agreement.obstacles.share_same:.3f}",
+        f"{agreement.obstacles.share_contra:.3f}",
+        f"{agreement.ground.share_same:.3f}" if is_upright else "-",
+        f"{agreement.score:.0f}" if is_upright else "-",
+    )
+    return dict(zip(_NUMBERS, texts, strict=True))
+
+
 def pairs_table(alignment: Alignment) -> RenderableType:
     """Return a table of the pairs with the numbers behind each verdict (docs/frames.md)."""
     table = styled_table("Pairs")
     table.add_column("robots", overflow="fold")
-    for name in ("overlap", "cells", "q", "q_c", "q_g", "L"):
+    for name in _NUMBERS:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("verdict", overflow="fold")
     rows = ranked(alignment.pairs)
     for pair in rows[:MAX_PAIRS]:
-        agreement = pair.verification
         table.add_row(
             f"{alignment.robot_ids[pair.first]}, {alignment.robot_ids[pair.second]}",
-            share(agreement.overlap), f"{agreement.obstacles.total:,}", f"{agreement.obstacles.share_same:.3f}",
-            f"{agreement.obstacles.share_contra:.3f}", f"{agreement.ground.share_same:.3f}", f"{agreement.score:.0f}",
+            *pair_numbers(pair, alignment.dof).values(),
             Text("accepted", style="green") if pair.is_accepted else f"refused: {pair.refusal}",
-        )  # fmt: skip
+        )
     if len(rows) <= MAX_PAIRS:
         return table
     hidden = rows[MAX_PAIRS:]

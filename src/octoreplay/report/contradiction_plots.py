@@ -45,7 +45,11 @@ def contradiction_figure(metrics: Sequence[TickMetrics], times: Any) -> Figure:
         style(panel, y_label=y_label)
         _draw(panel, times, curves[name], worst)
         if limit is not None:
-            panel.axhline(100 * limit, color="#222222", linewidth=0.8, linestyle="--", label="limit of the warning")
+            # The limit may lie above all values.
+            top = panel.get_ylim()[1]
+            panel.axhline(100 * limit, color="#222222", linewidth=0.8, linestyle="--")
+            panel.set_ylim(0, top)
+            panel.set_title(f"warning above {100 * limit:g} % (dashed)", loc="right", fontsize=8)
     axes[0].set_title("Contradiction of evidence, share of the cells [%]", loc="left", fontsize=11)
     axes[-1].set_xlabel("log time [s]")
     handles = {

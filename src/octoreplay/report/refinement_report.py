@@ -48,18 +48,26 @@ def _change(before: str, after: str, *, is_known: bool = True) -> str:
 
 
 def write_trajectory_figure(refinement: Refinement, path: Path) -> None:
-    """Write a figure of the robots' trajectories from above, recorded (dashed) and corrected. Raises OutputError."""
-    figure = new_figure(width=7.0, height=7.0)
-    axes = style(figure.subplots(), title="Trajectories in the team's frame", x_label="x [m]", y_label="y [m]")
+    """Write a figure of the trajectories from above, recorded (dashed) and corrected, and of the corrections over time.
+
+    Raises OutputError.
+    """
+    figure = new_figure(width=7.0, height=9.5)
+    above, below = figure.subplots(2, 1, height_ratios=[3, 1])
+    style(above, title="Trajectories in the team's frame", x_label="x [m]", y_label="y [m]")
+    style(below, title="Distance between recorded and corrected position", x_label="log time [s]", y_label="[m]")
+    stamps = [trajectory.stamps_ns[0] for trajectory in refinement.trajectories if trajectory.stamps_ns.size]
     for number, trajectory in enumerate(refinement.trajectories):
         color = COLORS[number % len(COLORS)]
         recorded, corrected = trajectory.recorded[:, :2, 3].T, trajectory.corrected[:, :2, 3].T
-        axes.plot(*recorded, color=color, linewidth=0.9, linestyle="--", alpha=0.7)
-        axes.plot(*corrected, color=color, linewidth=1.5, label=trajectory.robot_id)
-        axes.plot(*corrected[:, :1], color=color, marker="o", markersize=4)
-    axes.plot([], [], color=GREY, linewidth=0.9, linestyle="--", label="recorded")
-    axes.set_aspect("equal", adjustable="datalim")
-    legend_below(figure, axes, columns=min(6, math.ceil((len(refinement.trajectories) + 1) / 2) + 1))
+        above.plot(*recorded, color=color, linewidth=0.9, linestyle="--", alpha=0.7)
+        above.plot(*corrected, color=color, linewidth=1.5, label=trajectory.robot_id)
+        above.plot(*corrected[:, :1], color=color, marker="o", markersize=4)
+        below.plot((trajectory.stamps_ns - min(stamps, default=0)) / 1e9, trajectory.shifts, color=color, linewidth=1.2)
+    above.plot([], [], color=GREY, linewidth=0.9, linestyle="--", label="recorded")
+    above.set_aspect("equal", adjustable="datalim")
+    below.set_ylim(bottom=0)
+    legend_below(figure, above, columns=min(6, math.ceil((len(refinement.trajectories) + 1) / 2) + 1))
     picture = io.BytesIO()
     figure.savefig(picture, metadata={"Software": None})
     write_whole(path, picture.getvalue())

@@ -264,7 +264,7 @@ def _team_table(summary: RunSummary) -> Table:
         if summary.frame_origins:
             table.add_row("frames", _frame_origins(summary.frame_origins))
         if last.places:
-            table.add_row("teams", _joined(summary))
+            table.add_row("components", _joined(summary))
     table.add_row("map packet, mean", f"{size(summary.mean_packet_bytes)} as sent")
     table.add_row("", f"{size(summary.mean_octree_bytes)} as octree, uncompressed")
     grid = f"{size(summary.mean_grid_bytes)} as uniform grid"
@@ -287,11 +287,11 @@ def _frame_origins(origins: Mapping[str, str]) -> str:
 
 
 def _joined(summary: RunSummary) -> str:
-    """When the robots became one team, or the groups that they are in at the end."""
+    """When the robots became one component, or the components at the end."""
     if summary.last.num_components == 1:
         return f"one from {summary.joins[-1].seconds:g} s on" if summary.joins else "one"
-    groups = "; ".join(", ".join(component) for component in summary.last.components)
-    return f"{summary.last.num_components} at the end, in different frames: {groups}"
+    names = "; ".join(", ".join(component) for component in summary.last.components)
+    return f"{summary.last.num_components} at the end, in different frames: {names}"
 
 
 _AGREEMENTS = ("agreement", "agreement_occupied")

@@ -93,7 +93,7 @@ def test_labels_that_begin_later_are_refused(tmp_path):
         ({"rate": 1.0, "times": Path("t.txt")}, ConfigError, "give one of them, not both"),
         ({"rate": 0.0}, ConfigError, "rate: 0 must be greater than 0"),
         ({"rate": 1e-11}, InputError, r"times must be below 2\^31 s"),
-        ({"first": 9}, ConfigError, "no frame between first 9 and last None; the folder has 3"),
+        ({"first": 9}, ConfigError, "first 9 is beyond the last frame, 2"),
         ({"robot_id": "a/b"}, ConfigError, "robot id 'a/b'"),
         ({"times": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),
         ({"poses": Path("missing.txt")}, InputError, r"missing\.txt: cannot be read"),

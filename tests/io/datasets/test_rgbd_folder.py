@@ -242,6 +242,14 @@ def test_damaged_files_are_named_and_no_log_is_left(tmp_path, spoiler, message):
     assert list((tmp_path / "out").iterdir()) == []
 
 
+def test_the_poses_are_in_the_named_frame(tmp_path):
+    folder = seven_scenes(tmp_path / "in")
+    for options, name in (({}, "map"), ({"map_frame": "odom"}, "odom")):
+        import_rgbd(folder, tmp_path / "a.mcap", rate=1.0, **options)
+        messages = read_messages(tmp_path / "a.mcap")
+        assert {odometry.header.frame_id for _, odometry in messages["/a/odom"]} == {name}
+
+
 def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
     folder = seven_scenes(tmp_path / "in")
     import_rgbd(folder, tmp_path / "a.mcap", rate=1.0)
@@ -259,8 +267,10 @@ def test_a_failed_import_leaves_an_older_log_as_it_was(tmp_path):
         ({"rate": 1.0, "times": Path("x")}, ConfigError, "give one of them, not both"),
         ({"rate": 0.0}, ConfigError, "rate: 0 must be greater than 0"),
         ({"rate": float("nan")}, ConfigError, "rate: nan must be"),
-        ({"rate": 1.0, "first": 9}, ConfigError, "no frame between first 9 and last None; the folder has 3"),
+        ({"rate": 1.0, "first": 9}, ConfigError, "first 9 is beyond the last frame, 2"),
+        ({"rate": 1.0, "first": 2, "last": 1}, ConfigError, "last 1 is before first 2"),
         ({"rate": 1.0, "first": -1}, ConfigError, "first: -1"),
+        ({"rate": 1.0, "map_frame": ""}, ConfigError, "map_frame: '' must not be empty"),
         ({"rate": 1.0, "every": 0}, ConfigError, "every: 0"),
         ({"rate": 1.0, "robot_id": "a/b"}, ConfigError, "robot id 'a/b'"),
         ({"rate": 1.0, "intrinsics": (0, 1, 2, 3)}, ConfigError, "intrinsics: expects 4 numbers"),

@@ -23,6 +23,7 @@ from octoreplay.io.datasets.cloud_files import FORMATS, read_cloud, read_kitti_l
 from octoreplay.io.datasets.frames_folder import (
     check_choice,
     check_folder,
+    check_map_frame,
     chosen_frames,
     entries_of_chosen,
     files_in,
@@ -35,7 +36,7 @@ from octoreplay.io.datasets.frames_folder import (
 )
 from octoreplay.io.datasets.pcd import read_viewpoint
 from octoreplay.io.datasets.pose_files import PoseReader, PoseTable, matrix_reader, read_poses
-from octoreplay.io.robots.robot_log_writer import RobotLogWriter
+from octoreplay.io.robots.robot_log_writer import MAP_FRAME, RobotLogWriter
 from octoreplay.io.sensors.labels import UNLABELLED
 from octoreplay.io.text_tables import seconds_to_ns
 from octoreplay.records import ClassTable, Float64Array
@@ -108,6 +109,7 @@ def import_clouds(
     first: int = 0,
     last: int | None = None,
     every: int = 1,
+    map_frame: str = MAP_FRAME,
     progress: Callable[[float], None] | None = None,
 ) -> CloudImportSummary:
     """Write the point clouds and poses of a folder as one robot's log (MCAP).
@@ -122,12 +124,13 @@ def import_clouds(
       that are not finite are left out.
     - Labels: ``labels`` is a folder of KITTI ``.label`` files named like the clouds (default: ``labels/`` beside the
       clouds' folder). ``class_table`` names the labels.
-    - ``robot_id`` defaults to the log's file name.
+    - ``robot_id`` defaults to the log's file name. ``map_frame`` names the frame of the poses.
 
     One cloud at a time is in memory. The same input gives the same bytes. Raises InputError for missing or damaged
     files, ConfigError for options that do not fit, OutputError where the log cannot be written; then no file is left.
     """
     check_choice(rate, times, first, every)
+    check_map_frame(map_frame)
     robot_id = robot_name(robot_id, output)
     clouds = _find_clouds(folder)
     chosen = chosen_frames(folder, len(clouds), first, last, every)
@@ -141,6 +144,7 @@ def import_clouds(
         readers=_readers(found, own, chosen, len(clouds)),
         label_files=_find_labels(paths, labels),
         is_in_world=(found.name == _VIEWPOINT) if frame is None else frame == "world",
+        map_frame=map_frame,
     )
     with unfinished(output) as path:
         job.write(path, robot_id, class_table, progress)
@@ -162,6 +166,7 @@ class _Import:
     readers: Sequence[PoseReader]
     label_files: Sequence[Path | None]
     is_in_world: bool
+    map_frame: str
     num_frames: int = 0
     num_points: int = 0
     num_labelled: int = 0
@@ -174,7 +179,10 @@ class _Import:
         self, path: Path, robot_id: str, class_table: ClassTable | None, progress: Callable[[float], None] | None
     ) -> None:
         """Write the log."""
-        with RobotLogWriter(path, robot_id, None, class_table, T_body_sensor=np.eye(4), start_ns=self.stamps[0]) as log:
+        with RobotLogWriter(
+            path, robot_id, None, class_table, T_body_sensor=np.eye(4), start_ns=self.stamps[0],
+            map_frame=self.map_frame,
+        ) as log:  # fmt: skip
             self.num_without_pose = write_frames(self.stamps, self.readers, partial(self._write_cloud, log), progress)
 
     def _write_cloud(self, log: RobotLogWriter, index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:

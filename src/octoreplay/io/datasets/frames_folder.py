@@ -37,15 +37,22 @@ def check_choice(rate: float | None, times: Path | None, first: int, every: int)
         raise ConfigError(f"every: {every} is below the least value 1")
 
 
+def check_map_frame(name: str) -> None:
+    """Raise ConfigError for a name that TF does not allow for a frame."""
+    if not name.strip() or name.startswith("/"):
+        raise ConfigError(f"map_frame: '{name}' must not be empty or begin with '/'")
+
+
 def chosen_frames(folder: Path, total: int, first: int, last: int | None, every: int) -> range:
     """Return the numbers of every ``every``-th frame from ``first`` to ``last`` (included).
 
     Raises ConfigError where none of the folder's ``total`` frames is chosen.
     """
-    chosen = range(first, total if last is None else min(last + 1, total), every)
-    if not chosen:
-        raise ConfigError(f"{folder}: no frame between first {first} and last {last}; the folder has {total}")
-    return chosen
+    if first >= total:
+        raise ConfigError(f"{folder}: first {first} is beyond the last frame, {total - 1}")
+    if last is not None and last < first:
+        raise ConfigError(f"{folder}: last {last} is before first {first}")
+    return range(first, total if last is None else min(last + 1, total), every)
 
 
 def robot_name(robot_id: str | None, output: Path) -> str:

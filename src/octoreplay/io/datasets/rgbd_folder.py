@@ -25,6 +25,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.datasets.frames_folder import (
     check_choice,
     check_folder,
+    check_map_frame,
     chosen_frames,
     frame_stamps,
     natural_order,
@@ -34,7 +35,7 @@ from octoreplay.io.datasets.frames_folder import (
     write_frames,
 )
 from octoreplay.io.datasets.pose_files import PoseReader, matrix_reader, read_tum_track, track_reader
-from octoreplay.io.robots.robot_log_writer import OPTICAL_IN_BODY, RobotLogWriter
+from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter
 from octoreplay.io.text_tables import read_matrix, rows, seconds_to_ns
 from octoreplay.records import CameraModel, ClassTable, Float64Array
 from octoreplay.transforms import inverse
@@ -97,6 +98,7 @@ def import_rgbd(
     first: int = 0,
     last: int | None = None,
     every: int = 1,
+    map_frame: str = MAP_FRAME,
     progress: Callable[[float], None] | None = None,
 ) -> ImportSummary:
     """Write the depth images and poses of a folder as one robot's log (MCAP).
@@ -108,12 +110,13 @@ def import_rgbd(
       as 32FC1 metres with NaN there.
     - ``intrinsics`` (fx, fy, cx, cy) in pixels and ``depth_unit`` in metres replace the folder's.
     - Labels: ``labels`` is a folder of label PNGs named like the depth images; ``class_table`` names their values.
-    - ``robot_id`` defaults to the log's file name.
+    - ``robot_id`` defaults to the log's file name. ``map_frame`` names the frame of the poses.
 
     The same input gives the same bytes. Raises InputError for missing or damaged files, ConfigError for options that do
     not fit, OutputError where the log cannot be written; then no file is left.
     """
     check_choice(rate, times, first, every)
+    check_map_frame(map_frame)
     _check_options(intrinsics, depth_unit)
     robot_id = robot_name(robot_id, output)
     layout = _find_layout(folder)
@@ -128,6 +131,7 @@ def import_rgbd(
             frames[chosen[0]].depth_file, intrinsics or layout.intrinsics, assumed=layout.assumed and intrinsics is None
         ),
         depth_unit=layout.depth_unit if depth_unit is None else depth_unit,
+        map_frame=map_frame,
     )
     with unfinished(output) as partial:
         job.write(partial, robot_id, class_table, progress)
@@ -147,6 +151,7 @@ class _Import:
     stamps: list[int]
     camera: CameraModel
     depth_unit: float
+    map_frame: str
     num_frames: int = 0
     num_labelled: int = 0
     num_without_pose: int = 0
@@ -159,8 +164,9 @@ class _Import:
         T_body_sensor[:3, :3] = OPTICAL_IN_BODY
         T_sensor_body = inverse(T_body_sensor)
         with RobotLogWriter(
-            path, robot_id, self.camera, class_table, T_body_sensor=T_body_sensor, start_ns=self.stamps[0]
-        ) as log:
+            path, robot_id, self.camera, class_table, T_body_sensor=T_body_sensor, start_ns=self.stamps[0],
+            map_frame=self.map_frame,
+        ) as log:  # fmt: skip
 
             def write_frame(index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:
                 frame = self.frames[index]
