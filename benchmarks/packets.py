@@ -338,7 +338,7 @@ def _table(report: Report, options: argparse.Namespace) -> None:
     for topology, (fault, link), rule in itertools.product(TOPOLOGIES, FAULTS.items(), RULES):
         one_way = ((ids[0], ids[1]),) if fault == "one-way link" else ()
         network = {"topology": topology, "rule": rule, "resolution": resolution, "settle_max": TABLE_TICKS, **link}
-        config = run_config(duration, one_way=one_way, **network)
+        config = run_config(duration, one_way=one_way, packets="full", **network)
         run = play(config, duration)
         ends = [
             " / ".join(f"{value:.4f}" for value in worst_agreement(tick)) for tick in (run.log_ticks[-1], run.ticks[-1])

@@ -162,8 +162,8 @@ def main() -> None:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, default=30.0, help="of the logs in seconds (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=6, help="default: %(default)s")
-    parser.add_argument("--rule", default="gradient", help="default: %(default)s")
-    parser.add_argument("--packets", default="full", help="full or delta (default: %(default)s)")
+    parser.add_argument("--rule", default="bayes", help="default: %(default)s")
+    parser.add_argument("--packets", default="delta", help="full or delta (default: %(default)s)")
 
 
 def _logs(duration: float, num_robots: int) -> Path:

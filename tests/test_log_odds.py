@@ -8,7 +8,6 @@ from octoreplay.log_odds import (
     class_probabilities,
     label_probabilities,
     shifted_exp_sum,
-    team_log_odds,
 )
 from support.long_suite import examples
 
@@ -42,14 +41,7 @@ def test_ties_go_to_free_and_then_to_the_lower_class() -> None:
     assert best_labels(np.array([[0.0, 0.0], [-1.0, 0.0], [0.5, 0.5]])).tolist() == [0, 0, 1]
 
 
-def test_team_log_odds_multiply_the_deviation_by_the_number_of_robots() -> None:
-    prior, evidence = -0.75, np.array([[1.0, -2.0], [0.5, 0.25], [3.0, 3.0]])
-    mean = prior + evidence.mean(axis=0, keepdims=True)
-    np.testing.assert_allclose(team_log_odds(mean, prior, 3), prior + evidence.sum(axis=0, keepdims=True))
-
-
 def test_dtype_is_kept() -> None:
     log_odds = np.zeros((2, 3), dtype=np.float32)
     assert class_probabilities(log_odds).dtype == np.float32
     assert label_probabilities(log_odds).dtype == np.float32
-    assert team_log_odds(log_odds, 0.5, 6).dtype == np.float32

@@ -22,10 +22,10 @@ def part(*rows: int) -> LeafTable:
 
 
 def fill(writer: ResultWriter) -> None:
-    writer.write_state(state("alpha", 0, 1, leaf_list.encode(part(0)), key=True))
-    writer.write_state(state("alpha", 1, 2, leaf_list.encode(part(1))))
-    writer.write_state(state("alpha", 2, 4, leaf_list.encode(part(2, 3))))
-    writer.write_state(state("beta", 0, 4, leaf_list.encode(part(3)), key=True))
+    writer.write_state(state("alpha", 0, 1, leaf_list.encode(part(0)), key=True, num_robots=1))
+    writer.write_state(state("alpha", 1, 2, leaf_list.encode(part(1)), num_robots=2))
+    writer.write_state(state("alpha", 2, 4, leaf_list.encode(part(2, 3)), num_robots=2))
+    writer.write_state(state("beta", 0, 4, leaf_list.encode(part(3)), key=True, num_robots=2))
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_a_map_is_a_key_frame_and_its_deltas(result: Result) -> None:
     stored = result.map("alpha")
     assert (stored.robot_id, stored.tick, stored.stamp_ns) == ("alpha", 4, START + 4 * SECOND)
     assert (stored.resolution, stored.num_robots, stored.prior) == (0.2, 2, 0.0)
-    leaves = stored.leaves()
+    leaves = stored.leaves(map_kind="mean")
     np.testing.assert_array_equal(leaves.centers, LEAVES.centers)
     np.testing.assert_array_equal(leaves.sizes, LEAVES.sizes)
     np.testing.assert_array_equal(leaves.log_odds, LEAVES.log_odds)
@@ -101,7 +101,8 @@ def test_maps_that_are_not_stored_are_input_errors(result: Result) -> None:
 
 
 def test_query_at_points(result: Result) -> None:
-    answer = result.map("alpha").query([[0.15, 0.05, 0.1], [0.79, 0.01, 0.39], [2.1, 0.1, 0.1], [5.0, 5.0, 5.0]])
+    points = [[0.15, 0.05, 0.1], [0.79, 0.01, 0.39], [2.1, 0.1, 0.1], [5.0, 5.0, 5.0]]
+    answer = result.map("alpha").query(points, map_kind="mean")
     np.testing.assert_array_equal(answer.log_odds, [*LEAVES.log_odds[[0, 1, 3]], [0, 0]])
     assert answer.log_odds.dtype == answer.probabilities.dtype == np.float32
     assert answer.labels.tolist() == [1, 2, 0, 0]
@@ -136,7 +137,17 @@ def test_a_box_query_returns_the_overlapping_leaves(result: Result) -> None:
         stored.query_box((1, 0), (2, 1))
 
 
-def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_posterior_of_the_robots_that_a_map_is_the_mean_of(result: Result) -> None:
+    last, first = result.map("alpha"), result.map("alpha", tick=1)
+    assert (last.num_robots, first.num_robots) == (2, 1)
+    np.testing.assert_array_equal(last.leaves().log_odds, 2 * LEAVES.log_odds)
+    np.testing.assert_array_equal(first.leaves().log_odds, LEAVES.log_odds[:1])
+    assert (last.title(), last.title("mean"), first.title()) == ("posterior of 2 robots", "mean of 2 robots", "own map")
+    with pytest.raises(ValueError, match="map_kind: 'sum' is not one of posterior, mean"):
+        last.leaves(map_kind="sum")
+
+
+def test_the_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leaf_list.install(monkeypatch)
     config = team(tmp_path).with_parameters({"prob_free": 0.6})
     prior = np.log(0.4 / 2 / 0.6)
@@ -146,12 +157,12 @@ def test_the_team_posterior_and_the_prior(tmp_path: Path, monkeypatch: pytest.Mo
     with open_result(str(tmp_path / "out.mcap")) as opened:
         stored = opened.map("alpha")
     point = [[0.1, 0.1, 0.1], [9.0, 9.0, 9.0]]
-    own, whole = stored.query(point), stored.query(point, team_posterior=True)
+    own, whole = stored.query(point, map_kind="mean"), stored.query(point)
     np.testing.assert_allclose(own.log_odds, [LEAVES.log_odds[0] + prior, [prior, prior]], rtol=1e-6)
     np.testing.assert_allclose(whole.log_odds, [2 * LEAVES.log_odds[0] + prior, [prior, prior]], rtol=1e-6)
     np.testing.assert_allclose(own.probabilities[1], [0.6, 0.2, 0.2], rtol=1e-6)
-    np.testing.assert_allclose(stored.leaves(team_posterior=True).log_odds, 2 * LEAVES.log_odds + prior, rtol=1e-6)
-    box = stored.query_box((0, 0, 0), (0.2, 0.2, 0.2), team_posterior=True)
+    np.testing.assert_allclose(stored.leaves().log_odds, 2 * LEAVES.log_odds + prior, rtol=1e-6)
+    box = stored.query_box((0, 0, 0), (0.2, 0.2, 0.2))
     np.testing.assert_allclose(box.log_odds, whole.log_odds[:1], rtol=1e-6)
 
 

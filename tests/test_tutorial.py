@@ -45,10 +45,10 @@ def test_the_tutorial_works_as_printed(tmp_path: Path) -> None:
     (script,) = blocks("python")
     (tmp_path / "picture.py").write_text(script, encoding="utf-8")
     commands = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 9
+    assert len(commands) == 10
     output = "".join(run(line, tmp_path) for line in commands)
     for name in ("team.yaml", "result.mcap", "map.ply", "map.png", "metrics.csv", "figures/disagreement.png",
-                 "figures/packet_size.png", "bayes.mcap"):  # fmt: skip
+                 "figures/packet_size.png", "gradient.mcap"):  # fmt: skip
         assert (tmp_path / name).stat().st_size > 0, name
     shown = set().union(*(printed_lines(block) for block in blocks("text")))
     assert shown <= printed_lines(output), sorted(shown - printed_lines(output))

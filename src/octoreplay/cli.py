@@ -57,11 +57,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(_exit_code(arguments))
 
 
+_REMOVED_OPTIONS = {
+    "--team-posterior": "the posterior of the team is the default; '--map mean' shows the mean that a robot holds",
+    "--max-team-calibration-error": "use '--max-calibration-error', which judges the posterior of the team by default",
+}
+"""Options of earlier versions, and what to use in their place."""
+
+
 def _exit_code(arguments: Sequence[str] | None) -> int:
     """Run one command and return its exit code; errors are reported in one sentence on stderr."""
     try:
         code = cli.main(args=arguments, prog_name="octoreplay", standalone_mode=False)
     except click.ClickException as error:
+        if isinstance(error, click.NoSuchOption) and error.option_name in _REMOVED_OPTIONS:
+            remedy = _REMOVED_OPTIONS[error.option_name]
+            error = click.UsageError(f"No such option '{error.option_name}': {remedy}.", ctx=error.ctx)
         error.show()
         return error.exit_code
     except (KeyboardInterrupt, click.Abort) as error:

@@ -1,4 +1,4 @@
-"""Posterior probabilities and labels from log-odds, and the team posterior of a consensus map."""
+"""Posterior probabilities and labels from log-odds."""
 
 from __future__ import annotations
 
@@ -45,8 +45,3 @@ def shifted_exp_sum(log_odds: FloatArray, *, class_axis: int = 1) -> FloatArray:
     largest = log_odds.max(axis=class_axis, initial=0.0)
     total: FloatArray = np.exp(-largest) + np.exp(log_odds - np.expand_dims(largest, class_axis)).sum(axis=class_axis)
     return total
-
-
-def team_log_odds(log_odds: FloatArray, prior: float, num_robots: int) -> FloatArray:
-    """Return h_0 + N (h - h_0), same shape and dtype: the posterior of N robots from their consensus mean h."""
-    return prior + num_robots * (log_odds - prior)

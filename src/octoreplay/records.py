@@ -31,6 +31,10 @@ TEAM_ORIGIN = "frame of the team"
 CENTRAL = "central"
 """Name of the centralised map in a result: the sum of all robots' evidence."""
 
+POSTERIOR, MEAN = "posterior", "mean"
+MAP_KINDS = (POSTERIOR, MEAN)
+"""Forms in which a stored map is shown: the posterior of the robots that it is the mean of, or this mean."""
+
 NO_CLASS = 0
 """The class_id of a measured point without a usable label: it frees its ray and hits nothing."""
 
@@ -216,7 +220,8 @@ class FrameCounts:
 class MapState:
     """Map or evidence of one robot as stored in a result: a packet of the map codec, a key frame or a delta.
 
-    A delta holds the bricks that changed since the state ``base_sequence`` of the same robot.
+    A delta holds the bricks that changed since the state ``base_sequence`` of the same robot. ``num_robots`` is N, the
+    number of robots of whose evidence the map is the mean, 1 where it is no mean; None in results without it.
     """
 
     robot_id: str
@@ -227,6 +232,7 @@ class MapState:
     is_key_frame: bool
     data: bytes
     frame_id: str = TEAM
+    num_robots: int | None = 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,17 +24,20 @@ from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
-from octoreplay.log_odds import best_labels, class_probabilities, team_log_odds
+from octoreplay.log_odds import best_labels, class_probabilities
 from octoreplay.mapping.codec import apply_delta, decode_packet
+from octoreplay.mapping.consensus import scaled_map
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import (
     CENTRAL,
+    MAP_KINDS,
+    MEAN,
+    POSTERIOR,
     TEAM,
     BoolArray,
     ClassTable,
     Float32Array,
     Float64Array,
-    FloatArray,
     LeafTable,
     MapState,
     UInt8Array,
@@ -73,8 +76,11 @@ class StoredMap:
     ``frame_id`` is the name of its frame: 'team', or '<robot>/map' for the map frame of a robot where robots find each
     other's frames during the run.
 
-    With ``team_posterior`` the methods return h_0 + N (h - h_0) instead of the robot's h: after consensus, the
-    posterior of the evidence of all N robots.
+    A map on which robots agree is the mean over ``num_robots`` robots, N: those that reached it over links at the time,
+    or all with rule 'flood'. ``map_kind`` 'posterior' (the default of all methods) gives h_0 + N (h - h_0), the
+    posterior of the evidence of these robots, and 'mean' the map h as the robot holds it. Both are the same where N is
+    1: for a robot without links, for the centralised map, for evidence, for rules whose map is no mean ('local',
+    'merge'), and where ``evidence`` is an average. ``octree`` holds h - h_0.
     """
 
     def __init__(
@@ -100,22 +106,35 @@ class StoredMap:
         """Edge of the finest leaf in metres."""
         return float(self.octree.resolution)
 
-    def leaves(self, *, team_posterior: bool = False) -> LeafTable:
-        """Return all leaves, including free ones, in Morton order."""
-        table = self.octree.leaves(prior=self.prior)
-        return LeafTable(table.centers, table.sizes, self._scaled(table.log_odds, team_posterior))
+    def shown_octree(self, map_kind: str = POSTERIOR) -> SemanticOctree:
+        """Return the octree of a form of the map: N (h - h_0) or h - h_0. Raises ValueError for another form."""
+        if map_kind not in MAP_KINDS:
+            raise ValueError(f"map_kind: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
+        if map_kind == MEAN or self.num_robots == 1:
+            return self.octree
+        return scaled_map(self.octree, float(self.num_robots))
 
-    def query(self, points: npt.ArrayLike, *, team_posterior: bool = False) -> PointQuery:
+    def title(self, map_kind: str = POSTERIOR) -> str:
+        """Return a phrase that says which form of the map is shown."""
+        if self.num_robots == 1:
+            return "centralised map" if self.robot_id == CENTRAL else "own map"
+        return f"{'mean' if map_kind == MEAN else 'posterior'} of {self.num_robots} robots"
+
+    def leaves(self, *, map_kind: str = POSTERIOR) -> LeafTable:
+        """Return all leaves, including free ones, in Morton order."""
+        return self.shown_octree(map_kind).leaves(prior=self.prior)
+
+    def query(self, points: npt.ArrayLike, *, map_kind: str = POSTERIOR) -> PointQuery:
         """Return the state at points (P, 3), in metres in the team's frame. Raises ValueError for another shape."""
         coords = np.asarray(points, dtype=np.float64)
         if coords.ndim != 2 or coords.shape[1] != 3:
             raise ValueError(f"points: expects an array (P, 3), got {coords.shape}")
-        deviation, known, sizes = self.octree.lookup(coords)
-        log_odds = self._scaled((deviation + np.float32(self.prior)).astype(np.float32), team_posterior)
+        deviation, known, sizes = self.shown_octree(map_kind).lookup(coords)
+        log_odds = (deviation + np.float32(self.prior)).astype(np.float32)
         probabilities = class_probabilities(log_odds).astype(np.float32)
         return PointQuery(log_odds, probabilities, best_labels(log_odds), known, np.where(known, sizes, 0.0))
 
-    def query_box(self, lower: npt.ArrayLike, upper: npt.ArrayLike, *, team_posterior: bool = False) -> LeafTable:
+    def query_box(self, lower: npt.ArrayLike, upper: npt.ArrayLike, *, map_kind: str = POSTERIOR) -> LeafTable:
         """Return the leaves that overlap a box with corners ``lower`` and ``upper`` (3,), metres in the team's frame.
 
         Raises ValueError where a corner does not have three numbers, or a lower bound is above its upper bound.
@@ -125,17 +144,10 @@ class StoredMap:
             raise ValueError(f"box: expects two corners of three numbers, got {low.shape} and {high.shape}")
         if not (low <= high).all():
             raise ValueError("box: every lower bound must be at most its upper bound")
-        table = self.leaves(team_posterior=team_posterior)
+        table = self.leaves(map_kind=map_kind)
         half = table.sizes[:, None] / 2
         inside = ((table.centers + half > low) & (table.centers - half < high)).all(axis=1)
         return LeafTable(table.centers[inside], table.sizes[inside], table.log_odds[inside])
-
-    def _scaled(self, log_odds: Float32Array, team_posterior: bool) -> Float32Array:
-        """Log-odds of the robot, or of the team posterior."""
-        if not team_posterior:
-            return log_odds
-        scaled: FloatArray = team_log_odds(log_odds, self.prior, self.num_robots)
-        return scaled.astype(np.float32)
 
 
 class Result:
@@ -256,7 +268,7 @@ class Result:
                 apply_delta(octree, state.data)
         except PacketError as error:
             raise PacketError(f"{self.path}: robot '{robot_id}': {error}; replay the logs again") from error
-        return self._stored_map(octree, states[-1], is_posterior=evidence)
+        return self._stored_map(octree, states[-1], is_evidence=evidence)
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
@@ -283,17 +295,22 @@ class Result:
         if maps:
             yield maps
 
-    def _stored_map(self, octree: SemanticOctree, state: MapState, *, is_posterior: bool = False) -> StoredMap:
-        """Map after a stored state; N is 1 for a posterior: a robot's evidence, and the centralised map."""
-        num_robots = 1 if is_posterior or state.robot_id == CENTRAL else self._num_averaged(state)
+    def _stored_map(self, octree: SemanticOctree, state: MapState, *, is_evidence: bool = False) -> StoredMap:
+        """Map or evidence after a stored state."""
+        num_robots = state.num_robots
+        if num_robots is None:
+            num_robots = 1 if is_evidence else self._num_averaged(state)
         return StoredMap(
             octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots, state.frame_id
         )
 
     def _num_averaged(self, state: MapState) -> int:
-        """Number of robots of which a robot's map is the mean: those in its frame, or all with rule 'flood'."""
+        """N of a state in a result without it: the robots in the map's frame, or all with rule 'flood'."""
+        consensus = self.config.consensus
+        if state.robot_id == CENTRAL or not consensus.map_is_mean:
+            return 1
         places = self._places.get(state.tick, ())
-        if not places or self.config.consensus.traits.exchanges is Exchanged.EVIDENCE:
+        if not places or consensus.traits.exchanges is Exchanged.EVIDENCE:
             return len(self.robots)
         return sum(place.frame_id == state.frame_id for place in places)
 

@@ -12,11 +12,11 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.replay.run import replay_team
 from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
 
-# A run of two robots, its repetition, runs with a smaller step, with another gamma and with finer cells, and a run of
-# three robots.
+# A run of two robots, its repetition, runs with a smaller step, without flows and with finer cells, and a run of three
+# robots.
 RUNS = {
     "pair": (PAIR_TEAM, {}), "again": (PAIR_TEAM, {}), "slower": (PAIR_TEAM, {"epsilon": 0.1, "settle": 0}),
-    "near": (PAIR_TEAM, {"gamma": 0.49}), "finer": (PAIR_TEAM, {"resolution": 0.4}), "trio": (TRIO_TEAM, {}),
+    "near": (PAIR_TEAM, {"flow_bits": 0}), "finer": (PAIR_TEAM, {"resolution": 0.4}), "trio": (TRIO_TEAM, {}),
 }  # fmt: skip
 
 

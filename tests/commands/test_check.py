@@ -52,6 +52,8 @@ def test_an_interrupted_run_fails(tmp_path: Path) -> None:
 def test_wrong_usage(runs: dict[str, Path], tmp_path: Path) -> None:
     sentence = "no limit given; give at least one, such as --max-label-disagreement 0.001"
     assert sentence in output_of(2, "check", runs["pair"])
+    removed = output_of(2, "check", runs["pair"], "--max-team-calibration-error", 0.1)
+    assert "No such option '--max-team-calibration-error': use '--max-calibration-error'" in removed
     assert "No such option '--max-fun'" in output_of(2, "check", runs["pair"], "--max-fun", 1)
     assert "is more than 1; give a share" in output_of(2, "check", runs["pair"], "--min-agreement", 99)
     assert "needs the truth; give it with --truth" in output_of(2, "check", runs["pair"], "--min-coverage", 0.5)

@@ -27,6 +27,7 @@ def test_demo_finds_the_frames_and_writes_every_file(tmp_path: Path) -> None:
     for name in files:
         assert (tmp_path / "show" / name).stat().st_size > 0
     assert "Foxglove" in done.stdout
+    assert f"octoreplay run {Path('show/aligned.yaml')} -o {Path('show/gradient.mcap')} --rule gradient" in done.stdout
     before, after = re.findall(r"^(?:as in the logs|found) .*", done.stdout, re.M)
     assert "%" in before
     assert "%" in after

@@ -21,3 +21,23 @@ def test_points_and_a_box(pair_result: Path) -> None:
     assert re.search(rf"{name} +\d+\.\d\d %", done.stdout)
     assert re.search(r"1e\+06, 0, 0 +unknown", done.stdout)
     assert "m\u00b3" in done.stdout
+
+
+def test_the_posterior_is_shown_and_the_mean_on_request(pair_result: Path) -> None:
+    with open_result(pair_result) as opened:
+        stored = opened.map("husky_1")
+        table = stored.leaves()
+    place = table.centers[int(table.log_odds.max(axis=1).argmax())]
+    for arguments, title, map_kind in (
+        ((), "posterior of 2 robots", "posterior"), (("--map", "posterior"), "posterior of 2 robots", "posterior"),
+        (("--map", "mean"), "mean of 2 robots", "mean"),
+    ):  # fmt: skip
+        text = octoreplay("query", pair_result, "--at", *place, *arguments).stdout
+        assert f"({title}, frame team)" in text
+        assert f"{100 * stored.query([place], map_kind=map_kind).probabilities.max():.2f} %" in text
+    assert "(centralised map, frame team)" in octoreplay(
+        "query", pair_result, "--at", *place, "--robot", "central"
+    ).stdout  # fmt: skip
+    removed = octoreplay("query", pair_result, "--at", *place, "--team-posterior")
+    assert removed.returncode == 2
+    assert "No such option '--team-posterior': the posterior of the team is the default; '--map mean'" in removed.stderr

@@ -141,8 +141,9 @@ def test_the_first_part_of_a_cut_log_is_used(tmp_path: Path) -> None:
 def test_an_interrupted_run_leaves_a_partial_result_and_the_old_result(tmp_path: Path, number: signal.Signals) -> None:
     out, partial = tmp_path / "out.mcap", tmp_path / "out.partial.mcap"
     out.write_text("the result of yesterday")
-    # Settling takes so long that the run cannot end before the signal.
-    arguments = ["run", PAIR_TEAM, "-o", out, "--settle", "100000", "--settle-max", "100000", "--state-every", "0.001"]
+    # The ramp of gamma takes so long that the run cannot end before the signal.
+    settling = ["--rule", "gradient", "--settle", "100000", "--settle-max", "100000"]
+    arguments = ["run", PAIR_TEAM, "-o", out, *settling, "--state-every", "0.001"]
     with started(*arguments) as process:
         wait_for(lambda: partial.exists() and partial.stat().st_size > 20_000)
         process.send_signal(number)

@@ -23,7 +23,10 @@ HUSKIES = "husky_1:husky_2"
         (["--edges", f"{HUSKIES}:1.5"], "edges: the weights of robot 'husky_1' sum to 1.5; lower them to at most 1"),
         (["--epsilon", "1.5"], r"epsilon: 1.5 is not below 1, the bound of this .*; use 0.9 or leave epsilon out"),
         (["--jitter", "0.5", "--latency", "0.2"], "jitter: 0.5 is above latency 0.2; a delay cannot be negative"),
-        (["--budget", "5000"], "budget: goes with packets 'delta'; a whole map cannot be sent in parts"),
+        (
+            ["--budget", "5000", "--packets", "full"],
+            "budget: goes with packets 'delta'; a whole map cannot be sent in parts",
+        ),
         (["--budget", "5000", "--packets", "delta", "--no-acknowledge"], "budget: goes with acknowledge"),
         (["--budget", "300", "--packets", "delta"], r"budget: 300 bytes may not hold one brick .* give at least \d+"),
         (["--rule", "ratio", "--content", "int8"], "rule: 'ratio' sends running sums.* use packets 'full', content"),

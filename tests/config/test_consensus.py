@@ -37,10 +37,26 @@ def test_a_given_quantum_applies_to_the_rules_that_have_one(rule: str) -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_flows_need_a_rule_with_flows_and_a_quantum(rule: str) -> None:
-    assert ConsensusConfig(rule=rule).effective_flow_bits == (4 if rule == "bayes" else 0)
-    assert ConsensusConfig(rule=rule, flow_bits=0).effective_flow_bits == 0
-    assert ConsensusConfig(rule=rule, quantum=0.0).effective_flow_bits == 0
-    assert ConsensusConfig(rule=rule, evidence="time-average").effective_flow_bits == 0
+    def flow_bits(**parameters: object) -> int:
+        return TEAM.with_parameters({"rule": rule, **parameters}).effective_flow_bits
+
+    assert flow_bits() == (4 if rule == "bayes" else 0)
+    assert flow_bits(flow_bits=7) == (7 if rule == "bayes" else 0)
+    assert flow_bits(flow_bits=0) == 0
+    assert flow_bits(quantum=0.0) == 0
+    assert flow_bits(evidence="time-average") == 0
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"content": "int8"}, {"content": "float16"}, {"top_classes": 1}, {"budget": 1000},
+                   {"prune_tolerance": 0.1}],
+)  # fmt: skip
+def test_flows_are_off_by_default_with_packets_that_round(parameters: dict[str, object]) -> None:
+    config = TEAM.with_parameters(parameters)
+    assert not config.has_exact_packets
+    assert config.effective_flow_bits == 0
+    assert config.with_parameters({"flow_bits": 4}).effective_flow_bits == 4
+    assert TEAM.with_parameters({"packet_compression": "none"}).effective_flow_bits == 4
 
 
 @pytest.mark.parametrize(
@@ -55,7 +71,7 @@ def test_flows_need_a_rule_with_flows_and_a_quantum(rule: str) -> None:
         ({"flow_bits": 21}, "flow_bits: 21 is above the largest value 20"),
         ({"anchor_after": -1}, "anchor_after: -1 is below the least value 0"),
         ({"quantum": 2.0}, "quantum: 2 rounds hit 1 to 0; choose a smaller quantum, or 0"),
-        ({"miss": -0.0001}, r"quantum: 0.000976562 rounds miss -0.0001 to 0"),
+        ({"rule": "gradient", "miss": -0.0001}, r"quantum: 0.000976562 rounds miss -0.0001 to 0"),
     ],
 )
 def test_refused_settings(parameters: dict[str, object], sentence: str) -> None:
@@ -84,6 +100,6 @@ def test_effective_sensor_model_of_a_run() -> None:
 
 def test_preset_paper_rounds_nothing() -> None:
     config = with_options(TEAM, "paper", None, {})
-    assert (config.consensus.effective_quantum, config.consensus.effective_flow_bits) == (0.0, 0)
+    assert (config.consensus.effective_quantum, config.effective_flow_bits) == (0.0, 0)
     assert (config.consensus.quantum, config.consensus.anchor_after) == (0.0, 0)
     assert with_options(TEAM, "paper", None, {"evidence": "sum"}).consensus.effective_quantum == 0.0

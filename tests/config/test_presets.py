@@ -25,6 +25,40 @@ def test_options_override_the_preset_and_the_preset_overrides_the_file() -> None
     assert presets.with_options(file, None, None, {}) == file
 
 
+def test_preset_paper_is_the_letter_of_the_paper() -> None:
+    """Settings that the map states depend on, whatever the defaults and the team file are."""
+    config = presets.with_options(base().with_parameters({"rule": "flood", "topology": "ring"}), "paper", None, {})
+    consensus, network = config.consensus, config.network
+    assert (consensus.rule, consensus.evidence, consensus.mode) == ("gradient", "time-average", "on-arrival")
+    assert (consensus.gamma, consensus.gamma_power, consensus.gamma_per_arrival, consensus.epsilon) == (
+        1.0, 0.0, "full", None,
+    )  # fmt: skip
+    assert (network.topology, network.weights, network.publish_period) == ("complete", "degree", 1.0)
+    assert (config.effective_flow_bits, consensus.effective_quantum) == (0, 0.0)
+    assert (consensus.settle, consensus.anchor_after) == (0, 0)
+    assert config.effective_packet.packets == "full"
+    assert config.effective_sensor == config.sensor
+
+
+def test_preset_roam_adds_one_map_every_five_seconds_with_a_constant_weight() -> None:
+    config = presets.with_options(base(), "roam", None, {})
+    assert (config.consensus.rule, config.consensus.merge_weight, config.consensus.merge_maps) == ("merge", 0.2, 1)
+    assert (config.network.publish_period, config.network.topology, config.consensus.settle) == (5.0, "complete", 0)
+    assert config.effective_packet.packets == "full"
+    heavier = presets.with_options(base(), "roam", None, {"merge_weight": 0.8, "publish_period": 10.0})
+    assert (heavier.consensus.merge_weight, heavier.network.publish_period) == (0.8, 10.0)
+
+
+def test_a_rule_takes_the_packets_that_it_can_send() -> None:
+    for rule, kind in (("bayes", "delta"), ("gradient", "delta"), ("ratio", "full"), ("flood", "delta")):
+        config = base().with_parameters({"rule": rule})
+        assert config.effective_packet.packets == kind
+        assert config.packet.packets is None
+    assert base().with_parameters({"packets": "full"}).effective_packet.packets == "full"
+    with pytest.raises(ConfigError, match=r"rule: 'ratio' sends running sums.*use packets 'full'"):
+        base().with_parameters({"rule": "ratio", "packets": "delta"})
+
+
 def test_edges_set_the_topology_and_the_weights() -> None:
     config = presets.with_options(base(), None, "a:b, b:c", {})
     assert (config.network.topology, config.network.weights) == ("edges", "metropolis")

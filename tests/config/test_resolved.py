@@ -60,7 +60,7 @@ def test_plain_configurations_are_the_same_without_the_span():
     run = ResolvedRun.from_config(config, [ResolvedRobot.from_config(plain, (1, 2))], CLASSES)
     effective = {"classes": CLASSES, "merge_classes": (), "sensor": config.effective_sensor}
     assert run.to_config() == dataclasses.replace(config, **effective)
-    assert run.sensor.miss == -19661 * 2.0**-16
+    assert run.effective_sensor.miss == run.to_config().sensor.miss == -19661 * 2.0**-16
 
 
 def test_parameters_keep_the_resolution():
@@ -68,6 +68,15 @@ def test_parameters_keep_the_resolution():
     assert isinstance(run, ResolvedRun)
     assert run.robots == (robot(),)
     assert (run.consensus.rule, run.total_ns) == ("bayes", 18 * SECOND)
+
+
+def test_another_rule_rounds_the_sensor_model_to_its_own_quantum():
+    run = ResolvedRun((robot(),), CLASSES)
+    assert run.effective_sensor.miss == -19661 * 2.0**-16
+    gradient = run.with_parameters({"rule": "gradient"})
+    assert gradient.effective_sensor.miss == -307 * 2.0**-10
+    assert gradient.with_parameters({"rule": "flood"}).effective_sensor.miss == -0.3
+    assert gradient.with_parameters({"rule": "bayes"}).effective_sensor == run.effective_sensor
 
 
 def test_edits_of_classes_are_refused():

@@ -79,8 +79,7 @@ SCORES = MapScores(
     robot_id="alpha", is_active=True, num_cells=5, entropy_bits=0.5, agreement=1.0, agreement_occupied=1.0,
     truth=TruthScores(
         iou=(0.5, 0.75), mean_iou=0.625, mean_iou_known=0.7, occupied_accuracy=0.9, free_accuracy=0.9, coverage=0.75,
-        world_coverage=0.3, calibration_error=0.125, calibration_error_occupied=0.2, team_calibration_error=0.01,
-        team_calibration_error_occupied=0.02,
+        world_coverage=0.3, calibration_error=0.125, calibration_error_occupied=0.2,
     ),
 )  # fmt: skip
 
@@ -93,13 +92,13 @@ def _evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
         assert SCORES.truth is not None
         return dataclasses.replace(SCORES, robot_id=robot_id, truth=dataclasses.replace(SCORES.truth, **changes))
 
-    beta = scores("beta", mean_iou=0.5, coverage=0.25, calibration_error=0.375, team_calibration_error=0.0625)
+    beta = scores("beta", mean_iou=0.5, coverage=0.25, calibration_error=0.375)
     central = scores(CENTRAL, mean_iou=0.0, coverage=0.0, calibration_error=1.0)
     end = EvaluatedTick(tick=5, seconds=5.0, label_disagreement=0.0, maps=(SCORES, beta, central))
 
-    def evaluate_result(path: Path, *, truth: Path, over_time: bool) -> Evaluation:
-        assert not over_time
-        return Evaluation(str(path), str(truth), "central", CLASSES.names, (end,))
+    def evaluate_result(path: Path, *, truth: Path, map_kind: str, over_time: bool) -> Evaluation:
+        assert (map_kind, over_time) == ("posterior", False)
+        return Evaluation(str(path), str(truth), "central", map_kind, CLASSES.names, (end,))
 
     stand_in = SimpleNamespace(evaluate_result=evaluate_result)
     monkeypatch.setitem(sys.modules, "octoreplay.evaluate.evaluation", stand_in)
@@ -127,7 +126,6 @@ WORST = {
     "min_mean_iou": (0.5, "beta", None, 5.0),
     "min_coverage": (0.25, "beta", None, 5.0),
     "max_calibration_error": (0.375, "beta", None, 5.0),
-    "max_team_calibration_error": (0.0625, "beta", None, 5.0),
 }
 """Worst value of every limit in ``ticks``, with its robot, its link or pair, and its time."""
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from octoreplay import Evaluation, evaluate_result, load_team_file, open_result, replay_team, resolve
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate.evaluation import truth_beside_logs
 from octoreplay.evaluate.records import MAP_SCORES, SCORES, MapScores
 from octoreplay.io.results.result_writer import ResultWriter
@@ -19,7 +19,7 @@ from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
 from support import dense_scores
 from support.octree_factory import cells_of, cube, octree_of
-from support.result_factory import state, write_result, write_until
+from support.result_factory import state, summary, team, tick_metrics, write_result, write_until
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 FREE, GROUND, TREE = (-2.0, -2.0), (3.0, -1.5), (-1.2, 2.3)
@@ -41,7 +41,8 @@ def save_result(folder: Path, ticks: Mapping[int, Mapping[str, Cells]]) -> Path:
     def fill(writer: ResultWriter) -> None:
         for sequence, (tick, maps) in enumerate(sorted(ticks.items())):
             for name, cells in maps.items():
-                writer.write_state(state(name, sequence, tick, packet(cells), key=True))
+                num_robots = 1 if name == CENTRAL else 2
+                writer.write_state(state(name, sequence, tick, packet(cells), key=True, num_robots=num_robots))
 
     return write_result(folder, fill)
 
@@ -98,25 +99,45 @@ def test_scores_at_every_stored_tick(result: Path, tmp_path: Path) -> None:
     assert final.truth.mean_iou == final.agreement == final.truth.coverage == 1.0
 
 
-def test_entropy_and_calibration_of_the_distributions(result: Path, tmp_path: Path) -> None:
-    evaluation = evaluate_result(result, truth=save_truth(tmp_path))
+@pytest.mark.parametrize("map_kind", ["posterior", "mean"])
+def test_entropy_and_calibration_of_the_distributions(result: Path, tmp_path: Path, map_kind: str) -> None:
+    evaluation = evaluate_result(result, truth=save_truth(tmp_path), map_kind=map_kind)
+    assert evaluation.map_kind == map_kind
     classes = {key: 1 for key in TRUTH if TRUTH[key] == 1}
-    entropies = []
-    for values in WHOLE.values():
-        distribution = dense_scores.probabilities(values, 0.0, 1)
-        entropies.append(-np.sum(distribution * np.log2(distribution)))
-    for name, num_robots in (("alpha", 2), (CENTRAL, 1)):
+    for name in ("alpha", CENTRAL):
+        num_robots = 2 if (name, map_kind) == ("alpha", "posterior") else 1
+        entropies = []
+        for values in WHOLE.values():
+            distribution = dense_scores.probabilities(values, 0.0, num_robots)
+            entropies.append(-np.sum(distribution * np.log2(distribution)))
         found = scores(evaluation, name)
         assert found.entropy_bits == pytest.approx(np.mean(entropies), abs=1e-6)
         expected = [
-            dense_scores.calibration_error(WHOLE, classes, 0.0, robots, occupied=occupied)
-            for robots in (1, num_robots)
+            dense_scores.calibration_error(WHOLE, classes, 0.0, num_robots, occupied=occupied)
             for occupied in (False, True)
         ]
-        assert [
-            found.truth.calibration_error, found.truth.calibration_error_occupied, found.truth.team_calibration_error,
-            found.truth.team_calibration_error_occupied,
-        ] == pytest.approx(expected, abs=1e-6)  # fmt: skip
+        assert [found.truth.calibration_error, found.truth.calibration_error_occupied] == pytest.approx(
+            expected, abs=1e-6
+        )
+
+
+def test_an_unknown_form_of_the_maps_is_refused(result: Path) -> None:
+    with pytest.raises(ConfigError, match="map: 'sum' is not one of posterior, mean"):
+        evaluate_result(result, map_kind="sum")
+
+
+def test_the_posterior_has_its_own_labels(tmp_path: Path) -> None:
+    # With this prior, the mean 0.7 of two robots leaves the cell free, and the posterior makes it occupied.
+    config = team(tmp_path).with_parameters({"prob_free": 0.5})
+    cells, path = {(0, 0, 0): (-2.0, 0.6), (1, 0, 0): (-2.0, -2.0)}, tmp_path / "prior.mcap"
+    with ResultWriter(path, config) as writer:
+        writer.write_metrics(tick_metrics(1))
+        for robot_id in ("alpha", "beta"):
+            writer.write_state(state(robot_id, 0, 1, packet(cells), key=True, num_robots=2))
+        writer.complete(summary([tick_metrics(1)]))
+    truth = save_truth(tmp_path, {(0, 0, 0): 2})
+    for map_kind, found in (("posterior", 1.0), ("mean", 0.0)):
+        assert scores(evaluate_result(path, truth=truth, map_kind=map_kind), "alpha").truth.occupied_accuracy == found
 
 
 def test_the_last_tick_only_equals_the_end_of_the_history(result: Path, tmp_path: Path) -> None:
@@ -240,7 +261,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_scores_equal_the_metrics_of_the_run(pair: Path) -> None:
-    evaluation = evaluate_result(pair)
+    evaluation = evaluate_result(pair, map_kind="mean")
     assert len(evaluation.ticks) > 3
     with open_result(pair) as opened:
         by_tick = {metrics.tick: metrics for metrics in opened.metrics}
@@ -256,7 +277,7 @@ def test_scores_equal_the_metrics_of_the_run(pair: Path) -> None:
             assert (found.robot_id, found.is_active, found.num_cells) == (robot.robot_id, robot.active, robot.num_cells)
             assert (found.agreement, found.agreement_occupied) == (robot.agreement, robot.agreement_occupied)
             assert found.entropy_bits == pytest.approx(robot.entropy_bits)
-    again = evaluate_result(pair, against=pair)
+    again = evaluate_result(pair, against=pair, map_kind="mean")
     for own, other in zip(evaluation.ticks[1:], again.ticks[1:], strict=True):
         assert [entry.agreement for entry in own.maps] == pytest.approx([entry.agreement for entry in other.maps])
         assert [entry.agreement_occupied for entry in own.maps] == pytest.approx(
@@ -273,7 +294,12 @@ def test_a_recorded_team_against_its_truth_cell_by_cell(pair: Path) -> None:
     team = cells_of(maps[CENTRAL].octree)
     for name, stored in maps.items():
         found = scores(evaluation, name)
-        cells = {key: tuple(np.frombuffer(data, np.float32).tolist()) for key, data in cells_of(stored.octree).items()}
+        # The posterior of two robots; the centralised map is one already.
+        factor = np.float32(1 if name == CENTRAL else 2)
+        cells = {
+            key: tuple((factor * np.frombuffer(data, np.float32)).tolist())
+            for key, data in cells_of(stored.octree).items()
+        }
         assert found.truth.iou == pytest.approx(dense_scores.iou(cells, team, classes, prior), nan_ok=True)
         assert len(found.truth.iou) == num_classes
         assert (found.truth.occupied_accuracy, found.truth.free_accuracy) == pytest.approx(
@@ -281,9 +307,8 @@ def test_a_recorded_team_against_its_truth_cell_by_cell(pair: Path) -> None:
         )
         assert found.truth.coverage == pytest.approx(dense_scores.coverage(cells, team, classes, prior))
         assert found.truth.world_coverage == pytest.approx(dense_scores.coverage(cells, classes, classes, prior))
-        robots = 1 if name == CENTRAL else 2
-        assert found.truth.team_calibration_error == pytest.approx(
-            dense_scores.calibration_error(cells, classes, prior, robots), abs=1e-4
+        assert found.truth.calibration_error == pytest.approx(
+            dense_scores.calibration_error(cells, classes, prior, 1), abs=1e-4
         )
     assert 0.2 < found.truth.mean_iou < 1.0
     assert found.truth.coverage > 0.4

@@ -31,12 +31,12 @@ def truth_of(classes):
     return Truth(Path("truth.ply"), codes[order], numbers[order])
 
 
-def scores_of(cells, classes, *, prior=0.0, num_robots=1, team=None, observed=None):
+def scores_of(cells, classes, *, prior=0.0, team=None, observed=None):
     """Scores of a map of some cells; the team knows the cells ``team``, and ``observed`` at the end."""
     octree, truth = octree_of(cells), truth_of(classes)
     region = Region([octree_of(cells if team is None else team).spans()])
     at_end = region if observed is None else Region([octree_of(observed).spans()])
-    return truth_scores(octree.spans(), prior, num_robots, truth, region, at_end.holds(truth.codes))
+    return truth_scores(octree.spans(), prior, truth, region, at_end.holds(truth.codes))
 
 
 @st.composite
@@ -64,10 +64,10 @@ def mean_of_true_classes(iou, region, classes):
 
 
 @examples(80)
-@given(scenes(), st.sampled_from((0.0, -0.8, 0.15)), st.sampled_from((1, 3)))
-def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior, num_robots):
+@given(scenes(), st.sampled_from((0.0, -0.8, 0.15)))
+def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior):
     cells, team, observed, classes = scene
-    found = scores_of(cells, classes, prior=prior, num_robots=num_robots, team=team, observed=observed)
+    found = scores_of(cells, classes, prior=prior, team=team, observed=observed)
     iou = dense_scores.iou(cells, team, classes, prior)
     iou_known = dense_scores.iou(cells, cells, classes, prior)
     accuracies = dense_scores.accuracies(cells, classes, prior)
@@ -78,11 +78,7 @@ def test_scores_equal_those_of_scikit_learn_over_cells(scene, prior, num_robots)
         *accuracies,
         dense_scores.coverage(cells, observed, classes, prior),
         dense_scores.coverage(cells, classes, classes, prior),
-        *(
-            dense_scores.calibration_error(cells, classes, prior, robots, occupied=occupied)
-            for robots in (1, num_robots)
-            for occupied in (False, True)
-        ),
+        *(dense_scores.calibration_error(cells, classes, prior, 1, occupied=occupied) for occupied in (False, True)),
     )
     found_iou, *found_numbers = dataclasses.astuple(found)
     np.testing.assert_allclose((*found_iou, *found_numbers), expected, atol=1e-6)
@@ -166,25 +162,15 @@ def test_calibration_by_hand():
     cells = {(0, 0, 0): sure, (2, 0, 0): sure, (4, 0, 0): unsure, (6, 0, 0): unsure}
     found = scores_of(cells, {(0, 0, 0): 1, (2, 0, 0): 2, (4, 0, 0): 1, (6, 0, 0): 1})
     assert found.calibration_error == pytest.approx(0.4, abs=1e-6)
-    assert found.calibration_error == found.calibration_error_occupied == found.team_calibration_error
+    assert found.calibration_error == found.calibration_error_occupied
 
 
-def test_the_team_posterior_is_calibrated_where_the_mean_is_not():
+def test_a_posterior_is_calibrated_where_the_mean_is_not():
     # Odds of a million to one; the mean over ten robots has a tenth of these log-odds.
-    cells = cube((0, 0, 0), 4, (np.log(1e6) / 10, -3.0))
-    found = scores_of(cells, dict.fromkeys(cells, 1), num_robots=10)
-    assert found.calibration_error > 0.15
-    assert found.team_calibration_error < 1e-5
-
-
-def test_the_team_posterior_has_its_own_labels():
-    # With this prior, evidence of 0.7 leaves the cell free, and three times as much makes it occupied.
-    cells = {(0, 0, 0): (0.25, 0.7), (3, 0, 0): FREE}
-    found = scores_of(cells, {(0, 0, 0): 2}, prior=-0.8, num_robots=3)
-    assert found.occupied_accuracy == 0.0
-    for error, num_robots in ((found.calibration_error, 1), (found.team_calibration_error, 3)):
-        expected = dense_scores.calibration_error(cells, {(0, 0, 0): 2}, -0.8, num_robots)
-        assert error == pytest.approx(expected, abs=1e-6)
+    values = np.log(1e6), -30.0
+    posterior, mean = (cube((0, 0, 0), 4, tuple(value / n for value in values)) for n in (1, 10))
+    assert scores_of(mean, dict.fromkeys(mean, 1)).calibration_error > 0.15
+    assert scores_of(posterior, dict.fromkeys(posterior, 1)).calibration_error < 1e-5
 
 
 def test_calibration_has_fifteen_bins():
@@ -214,7 +200,7 @@ def test_scores_of_an_empty_map():
     empty = SemanticOctree(0.25, 2).spans()
     truth = truth_of({(0, 0, 0): 1})
     region = Region([octree_of({(0, 0, 0): GROUND}).spans()])
-    found = truth_scores(empty, 0.0, 3, truth, region, np.array([True]))
+    found = truth_scores(empty, 0.0, truth, region, np.array([True]))
     assert (found.iou[0], found.mean_iou, found.coverage, found.world_coverage) == (0.0, 0.0, 0.0, 0.0)
     assert np.isnan([found.mean_iou_known, found.occupied_accuracy, found.calibration_error]).all()
     assert agreement(empty, 0.0, empty, 0.0, 0) == (1.0, 1.0)

@@ -56,6 +56,12 @@ def merge_step(
     return np.clip(with_evidence(mixed, now, at_last_iteration), clamp_min, clamp_max)
 
 
+def in_turn(senders: Sequence[int], num_maps: int, tick: int) -> list[int]:
+    """Return the next ``num_maps`` of the senders: each tick goes on in the circle of senders where the last ended."""
+    circle = [senders[(tick * num_maps + step) % len(senders)] for step in range(num_maps) if senders]
+    return sorted(set(circle))
+
+
 def rounded(log_odds: Float64Array, quantum: float) -> Float64Array:
     """Return the nearest multiples of ``quantum``, ties to even; unchanged for 0."""
     return np.rint(log_odds / quantum) * quantum if quantum else log_odds

@@ -171,7 +171,7 @@ def check_rest(config, recording):
     assert (before.maps == last.maps).all()
     team = graph.team_graph(config.network, config.consensus, [r.robot_id for r in config.robots], last.active)
     settled = 100 if last.settling else 0
-    num_bits, quantum = config.consensus.effective_flow_bits + settled, config.consensus.effective_quantum
+    num_bits, quantum = config.effective_flow_bits + settled, config.consensus.effective_quantum
     for i, j in last.links:
         steps = flows.flow_steps(last.maps[i], last.maps[j], num_bits, quantum)
         bound = steps / (2.0 * team.epsilon * team.weights[i, j])

@@ -18,7 +18,7 @@ ALL_RULES = ("gradient", "bayes", "natural", "local")
 
 def _run(frames, robot_ids="ab", **parameters):
     """All ticks of a hand-made team."""
-    config = team_config(robot_ids, **parameters)
+    config = team_config(robot_ids, **{"rule": "gradient", **parameters})
     twin = Twin(config, record(config, frames))
     return list(twin.ticks()), twin
 

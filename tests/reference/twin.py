@@ -82,6 +82,7 @@ class Exchange:
     published: Float64Array
     known: BoolArray
     arrivals: frozenset[Link]
+    tick: int
 
     def senders(self, receiver: int) -> list[int]:
         """Return the robots whose maps arrived, in the team's order."""
@@ -166,7 +167,7 @@ class Twin:
         self.prior = config.map.prior(recording.num_classes)
         self.sensor = config.effective_sensor
         self.quantum = config.consensus.effective_quantum
-        self.flow_bits = config.consensus.effective_flow_bits
+        self.flow_bits = config.effective_flow_bits
         self._graph_of(tuple([True] * self.num_robots), self.start_ns)
         self.scans = [scan for scan in recording.scans if not self._is_off(scan.robot, scan.stamp_ns)]
         self.stamps = [[scan.stamp_ns for scan in self.scans if scan.robot == i] for i in range(self.num_robots)]
@@ -283,7 +284,7 @@ class Twin:
         due = self._due(tick)
         exchanges = self.config.consensus.rule != "local"
         arrivals = frozenset((j, i) for j, i in team.directed if exchanges and j in due and active[j] and active[i])
-        return Exchange(team, self.maps.copy(), self.known.copy(), arrivals)
+        return Exchange(team, self.maps.copy(), self.known.copy(), arrivals, tick)
 
     def _due(self, tick: int) -> frozenset[int]:
         """Return the robots that publish in a tick by their own periods and phases."""
@@ -348,6 +349,8 @@ class Twin:
         """Run all iterations of one robot in a tick: one with all maps that arrived, or one for each."""
         consensus = self.config.consensus
         senders = exchange.senders(robot)
+        if consensus.rule == "merge" and consensus.merge_maps is not None:
+            senders = rules.in_turn(senders, consensus.merge_maps, exchange.tick)
         gamma_factor = stage.gamma_factor
         if consensus.mode == "sync" or not senders:
             self._iterate(robot, senders, exchange, stage, gamma_factor)
@@ -366,6 +369,8 @@ class Twin:
         differences, amounts = [], np.zeros_like(current)
         for j in senders:
             other, weight = exchange.published[j], team.weights[robot, j]
+            if self.config.consensus.rule == "merge" and self.config.consensus.merge_weight is not None:
+                weight = self.config.consensus.merge_weight / (2.0 * team.epsilon)
             is_mutual = self.config.consensus.rule == "bayes" and exchange.is_mutual(robot, j)
             # 'bayes' conserves the sum over robots only if both ends of a link use the same difference.
             own = exchange.published[robot] if is_mutual else self._base(current)

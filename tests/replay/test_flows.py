@@ -29,7 +29,7 @@ TEAMS = (
     {"topology": "range", "radio_range": 4.0, "packets": "delta"},
     {"topology": "complete", "schedule": (GROUPS,), "packets": "delta"},
     {"topology": "ring", "schedule": (ScheduleEntry(4.0, 8.0, robots_off=("robot_1",)),)},
-    {"topology": "ring", "packets": "delta", "content": "int8"},
+    {"topology": "ring", "packets": "delta", "content": "int8", "flow_bits": 4},
     {"topology": "line", "period": 3.0},
 )
 

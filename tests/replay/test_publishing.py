@@ -54,10 +54,15 @@ def test_stored_maps_after_a_restart_equal_the_metrics(rule, tmp_path):
                 assert robot.active == (metrics.tick > 0 and (robot.robot_id, metrics.tick) != ("husky_1", 2))
 
 
-@pytest.mark.parametrize("topology", ["complete", "line"])
-@pytest.mark.parametrize("mode", ["sync", "on-arrival"])
-def test_merge_equals_its_twin(mode, topology):
-    config = configured(rule="merge", mode=mode, topology=topology, settle=0)
+@pytest.mark.parametrize(
+    ("mode", "parameters"),
+    [("sync", {"topology": "complete"}), ("on-arrival", {"topology": "line"}), ("sync", {"merge_weight": 0.7}),
+     ("on-arrival", {"topology": "line", "merge_weight": 0.45}), ("sync", {"merge_maps": 1, "merge_weight": 0.9}),
+     ("on-arrival", {"merge_maps": 2})],
+    ids=str,
+)  # fmt: skip
+def test_merge_equals_its_twin(mode, parameters):
+    config = configured(rule="merge", mode=mode, settle=0, **parameters)
     twin = Twin(config, recording(), with_metrics=False)
     saturated = 0
     for expected, tick in itertools.zip_longest(twin.ticks(), session_of(config).ticks()):

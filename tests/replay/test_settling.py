@@ -30,9 +30,9 @@ RAMP = 20
 
 
 def _team(*, periods=None, link_overrides=(), **parameters):
-    """A graph of four robots and the configuration that it is from."""
+    """A graph of four robots and the configuration that it is from; rule gradient unless another one is given."""
     robots = tuple(RobotConfig(name, (Path(f"{name}.mcap"),), publish_period=(periods or {}).get(name)) for name in IDS)
-    config = RunConfig(robots=robots).with_parameters(parameters)
+    config = RunConfig(robots=robots).with_parameters({"rule": "gradient", **parameters})
     config = dataclasses.replace(config, link_overrides=link_overrides)
     network = TeamNetwork(config.network, config.consensus, IDS)
     return network.at(0.0, [True] * len(IDS), np.full((len(IDS), 3), np.nan)), config
@@ -77,7 +77,7 @@ def test_flows_add_the_ticks_in_which_they_get_finer():
 )  # fmt: skip
 def test_flows_get_finer_until_their_step_is_the_quantum(largest, parameters, expected):
     _, config = _team(**{"rule": "bayes", **parameters})
-    assert num_finer_ticks(config.consensus, largest) == expected
+    assert num_finer_ticks(config, largest) == expected
 
 
 def test_settling_does_not_end_before_flows_are_finest():

@@ -130,8 +130,8 @@ def _clamping_is_forgotten(monkeypatch):
 
 
 def _half_a_step(monkeypatch):
-    right = session_module.step_size
-    monkeypatch.setattr(session_module, "step_size", lambda *args: 0.5 * right(*args))
+    right = session_module.step_weights_of
+    monkeypatch.setattr(session_module, "step_weights_of", lambda *args: 0.5 * right(*args))
 
 
 def _neighbours_cells_are_not_taken(monkeypatch):

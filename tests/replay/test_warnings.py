@@ -36,6 +36,18 @@ def test_a_run_warns_of_faults_that_its_rule_does_not_tolerate(parameters, sente
     assert sum(sentence in warning for warning in summary.warnings) == 1
 
 
+@pytest.mark.parametrize(
+    "parameters", [{"content": "int8"}, {"top_classes": 2}, {"prune_tolerance": 0.1}], ids=str
+)  # fmt: skip
+def test_flows_with_packets_that_round_give_a_warning_where_they_are_asked_for(parameters):
+    assert rule_warnings(configured(rule="bayes", **parameters), is_symmetric=True) == ()
+    (warning,) = rule_warnings(configured(rule="bayes", flow_bits=3, **parameters), is_symmetric=True)
+    assert warning.startswith(
+        "flow_bits 3 with packets that do not hold the maps exactly: the maps do not come to rest;"
+    )
+    assert rule_warnings(configured(rule="gradient", flow_bits=3, **parameters), is_symmetric=True) == ()
+
+
 @pytest.mark.parametrize("rule", ["bayes", "ratio", "flood", "gradient"])
 def test_a_run_without_faults_has_no_warning(rule):
     assert rule_warnings(configured(rule=rule), is_symmetric=True) == ()

@@ -31,6 +31,10 @@ def test_csv_has_one_row_per_map_and_three_for_the_team() -> None:
     judged = evaluation()
     table = rows(evaluation_csv(judged))
     assert len(table) == len(judged.ticks) * (len(judged.ticks[0].maps) + 3)
+    assert {row["map_kind"] for row in table} == {"posterior"}
+    of_means = dataclasses.replace(judged, map_kind="mean")
+    assert {row["map_kind"] for row in rows(evaluation_csv(of_means))} == {"mean"}
+    assert json.loads(evaluation_json(of_means))["map_kind"] == "mean"
     places = iter(table)
     for tick in judged.ticks:
         for scores in tick.maps:

@@ -16,7 +16,7 @@ NUMBERS = {
     "mean_iou_known": 0.71, "central_mean_iou": 0.72, "sent_bytes_per_second": 12_345.0, "ticks_to_consensus": 3.0,
     "realtime_factor": 6.54, "peak_rss_bytes": 5e8, "memory_bytes": 2e7, "num_leaves": 43_210.0,
     "contraction": 0.444, "contraction_theory": 0.4444, "epsilon_share": 0.5, "wrong": 0.25, "repaired": 0.125,
-    "spread": 0.01, "calibration_error_occupied": 0.5, "team_calibration_error_occupied": 0.1,
+    "spread": 0.01, "calibration_error_occupied": 0.5,
     "central_calibration_error_occupied": 0.09,
 }  # fmt: skip
 

@@ -27,9 +27,9 @@ def fill(writer: ResultWriter) -> None:
     )
     first = LeafTable(LEAVES.centers[:1], LEAVES.sizes[:1], LEAVES.log_odds[:1])
     rest = LeafTable(LEAVES.centers[1:], LEAVES.sizes[1:], LEAVES.log_odds[1:])
-    writer.write_state(state("alpha", 0, 1, leaf_list.encode(first), key=True))
-    writer.write_state(state("beta", 0, 1, leaf_list.encode(other), key=True))
-    writer.write_state(state("alpha", 1, 3, leaf_list.encode(rest)))
+    writer.write_state(state("alpha", 0, 1, leaf_list.encode(first), key=True, num_robots=2))
+    writer.write_state(state("beta", 0, 1, leaf_list.encode(other), key=True, num_robots=2))
+    writer.write_state(state("alpha", 1, 3, leaf_list.encode(rest), num_robots=2))
 
 
 @pytest.fixture
@@ -64,16 +64,18 @@ def test_free_leaves_are_optional(result: Path) -> None:
 
 
 def test_the_comments_name_the_options(result: Path) -> None:
-    comments = exported(result, robot="beta", team_posterior=True)[2].comments
+    comments = exported(result, robot="beta")[2].comments
     assert "octoreplay map of beta at tick 1, 1 s after the start" in comments
-    assert "resolution 0.2 m, N = 2 robots, log-odds: team posterior h_0 + N (h - h_0)" in comments
+    assert "resolution 0.2 m, log-odds: posterior of 2 robots" in comments
     assert "classes: 0 free, 1 ground, 2 tree" in comments
-    assert "log-odds: the robot's own h" in exported(result)[2].comments[1]
+    assert "log-odds: mean of 2 robots" in exported(result, map_kind="mean")[2].comments[1]
+    with pytest.raises(ConfigError, match="map: 'sum' is not one of posterior, mean"):
+        exported(result, map_kind="sum")
 
 
-def test_the_team_posterior_has_higher_probabilities(result: Path) -> None:
-    own = exported(result)[2]["vertex"]["probability"]
-    whole = exported(result, team_posterior=True)[2]["vertex"]["probability"]
+def test_the_posterior_has_higher_probabilities(result: Path) -> None:
+    own = exported(result, map_kind="mean")[2]["vertex"]["probability"]
+    whole = exported(result)[2]["vertex"]["probability"]
     odds = np.exp(2 * LEAVES.log_odds[0])
     assert whole[0] == pytest.approx(odds[0] / (1 + odds.sum()), rel=1e-5)
     assert (whole > own).all()

@@ -97,12 +97,14 @@ def scores(robot_id: str, number: float) -> MapScores:
 def test_the_truth_numbers_are_means_over_robots() -> None:
     maps = (scores("a", 0.25), scores("b", 0.5), scores("central", 0.75))
     tick = EvaluatedTick(3, 1.0, 0.0, maps)
-    row = truth_numbers(Evaluation("r", "t", "central", ("x",), (tick,)))
+    row = truth_numbers(Evaluation("r", "t", "central", "posterior", ("x",), (tick,)))
     assert tuple(row) == TRUTH_COLUMNS
-    for name in ("mean_iou", "coverage", "free_accuracy", "calibration_error", "team_calibration_error_occupied"):
+    for name in ("mean_iou", "coverage", "free_accuracy", "calibration_error", "calibration_error_occupied"):
         assert row[name] == pytest.approx((maps[0].score(name) + maps[1].score(name)) / 2)
     assert row["mean_iou_least"] == maps[0].score("mean_iou")
     assert row["central_mean_iou"] == maps[2].score("mean_iou")
     assert row["central_calibration_error"] == maps[2].score("calibration_error")
-    alone = truth_numbers(Evaluation("r", "t", "central", ("x",), (dataclasses.replace(tick, maps=maps[:2]),)))
+    alone = truth_numbers(
+        Evaluation("r", "t", "central", "posterior", ("x",), (dataclasses.replace(tick, maps=maps[:2]),))
+    )
     assert math.isnan(alone["central_mean_iou"])

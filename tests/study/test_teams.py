@@ -152,7 +152,7 @@ def test_a_team_is_replayed_once(stored: Path) -> None:
 
 
 def test_a_result_of_other_settings_is_refused(stored: Path) -> None:
-    config = load_team_file(stored / "team" / "team.yaml").with_parameters({"rule": "bayes"})
+    config = load_team_file(stored / "team" / "team.yaml").with_parameters({"rule": "gradient"})
     assert not is_replayed(config, stored / "other.mcap")
     with pytest.raises(OutputError, match=r"result\.mcap: exists and was made from other logs, with other settings"):
         replayed_team(config, stored / "result.mcap")

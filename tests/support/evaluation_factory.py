@@ -11,8 +11,8 @@ from octoreplay.run_metrics import PairMetrics
 
 def map_scores(robot_id: str, start: float, *, is_active: bool = True, has_truth: bool = True) -> MapScores:
     """Scores that grow by a thousandth from field to field."""
-    values = [start + index / 1000 for index in range(13)]
-    tree = math.nan if robot_id == "beta" else values[12] / 2
+    values = [start + index / 1000 for index in range(11)]
+    tree = math.nan if robot_id == "beta" else values[10] / 2
     truth = TruthScores((values[3] / 3, tree), *values[3:]) if has_truth else None
     return MapScores(robot_id, is_active, int(1e5 * start), values[0] + 1, values[1], values[2], truth)
 
@@ -37,4 +37,6 @@ def evaluation(
         EvaluatedTick(5 * t, 2.5 * t, 0.25 / (1 + t), maps(t), pairs if t == num_ticks - 1 else ())
         for t in range(num_ticks)
     )
-    return Evaluation("result.mcap", "world.npz" if has_truth else None, CENTRAL, ("ground", "tree"), ticks)
+    return Evaluation(
+        "result.mcap", "world.npz" if has_truth else None, CENTRAL, "posterior", ("ground", "tree"), ticks
+    )

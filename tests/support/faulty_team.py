@@ -19,8 +19,8 @@ PERIOD_NS = 10**9
 FLOOD_TOLERANCE = 1e-4
 RATIO_TOLERANCE = 1e-3
 PACKETS = {
-    "full": {},
-    "full, broadcast": {"cast": "broadcast"},
+    "full": {"packets": "full"},
+    "full, broadcast": {"packets": "full", "cast": "broadcast"},
     "delta": {"packets": "delta"},
     "delta, broadcast": {"packets": "delta", "cast": "broadcast"},
     "key frames": {"packets": "delta", "acknowledge": False, "key_frame_every": 4},

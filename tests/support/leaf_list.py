@@ -57,7 +57,14 @@ def apply(octree: LeafList, data: bytes) -> None:
     )
 
 
+def scaled(octree: LeafList, factor: float) -> LeafList:
+    """The leaves with their log-odds multiplied."""
+    table = octree.table
+    return LeafList(octree.resolution, LeafTable(table.centers, table.sizes, table.log_odds * np.float32(factor)))
+
+
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stored maps be leaf lists."""
     monkeypatch.setattr("octoreplay.result.decode_packet", decode)
     monkeypatch.setattr("octoreplay.result.apply_delta", apply)
+    monkeypatch.setattr("octoreplay.result.scaled_map", scaled)

@@ -92,10 +92,10 @@ def pose(robot_id: str, x: float) -> RobotPose:
     return RobotPose(robot_id, transform)
 
 
-def state(robot_id: str, sequence: int, tick: int, data: bytes, *, key: bool = False) -> MapState:
-    """A state that builds on the one before, or a key frame."""
+def state(robot_id: str, sequence: int, tick: int, data: bytes, *, key: bool = False, num_robots: int = 1) -> MapState:
+    """A state that builds on the one before, or a key frame; its map is the mean over ``num_robots``."""
     base = sequence if key else sequence - 1
-    return MapState(robot_id, START + tick * SECOND, tick, sequence, base, key, data)
+    return MapState(robot_id, START + tick * SECOND, tick, sequence, base, key, data, num_robots=num_robots)
 
 
 def write_result(folder: Path, fill: Callable[[ResultWriter], None] | None = None, *, num_ticks: int = 4) -> Path:

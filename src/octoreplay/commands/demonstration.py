@@ -71,6 +71,8 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
         ),
     )
     out.print(f"more: octoreplay metrics {result_path}", soft_wrap=True)
+    out.print(f"the paper's rule gradient in place of {config.consensus.rule}: octoreplay run {folder / 'aligned.yaml'}"
+              f" -o {folder / 'gradient.mcap'} --rule gradient", soft_wrap=True)  # fmt: skip
     return EXIT_DATA_LOST if summary.lost_data or not alignment.is_whole else 0
 
 

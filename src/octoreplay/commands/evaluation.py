@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from octoreplay.commands.options import check_folder, check_output, existing_path
+from octoreplay.commands.options import check_folder, check_output, existing_path, map_option
 from octoreplay.commands.progress import progress_bar, warn
 from octoreplay.records import CENTRAL
 
@@ -17,6 +17,7 @@ from octoreplay.records import CENTRAL
               help="ground truth: world.npz, the folder of a simulated team, or a labelled PLY file")  # fmt: skip
 @click.option("--against", default=CENTRAL, show_default=True, metavar="central|OTHER.mcap",
               help="centralised map to compare with: that of this result, or of another one")  # fmt: skip
+@map_option
 @click.option("--csv", type=existing_path, metavar="FILE.csv",
               help="write the scores of every map at every stored tick as CSV")  # fmt: skip
 @click.option("--json", type=existing_path, metavar="FILE.json", help="write the same scores as JSON")
@@ -24,8 +25,9 @@ from octoreplay.records import CENTRAL
               help="write figures of IoU, coverage, calibration and agreement into this folder")  # fmt: skip
 @click.option("--last", is_flag=True, help="evaluate only the last stored maps, which is faster")
 def evaluate(
-    result: Path, truth: Path | None, against: str, csv: Path | None, json: Path | None, plot: Path | None, last: bool
-) -> int:
+    result: Path, truth: Path | None, against: str, map_kind: str, csv: Path | None, json: Path | None,
+    plot: Path | None, last: bool,
+) -> int:  # fmt: skip
     """Evaluate the maps of a result, over time and at the end.
 
     With --truth: IoU per class, occupied and free cells found, coverage of the surface, calibration of the
@@ -51,8 +53,9 @@ def evaluate(
             warn(err, f"{result}: the run was interrupted; only the maps stored before are evaluated")
     with progress_bar("evaluate") as update:
         evaluation = evaluate_result(
-            result, truth=truth, against=against, over_time=not last, progress=lambda share: update(share, None, "")
-        )
+            result, truth=truth, against=against, map_kind=map_kind, over_time=not last,
+            progress=lambda share: update(share, None, ""),
+        )  # fmt: skip
     tables.show(out, evaluation_tables(evaluation))
     for sentence in evaluation.warnings:
         warn(err, sentence)

@@ -9,12 +9,22 @@ from typing import Any
 import click
 
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, Parameter
+from octoreplay.config.presets import PRESETS
 from octoreplay.errors import ConfigError, OutputError
+from octoreplay.records import MAP_KINDS, POSTERIOR
 
 _METAVARS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
 """Placeholders of values in ``--help``, by the kind of the parameter."""
 
 existing_path = click.Path(path_type=Path, readable=False)
+
+
+preset_option = click.option("--preset", type=click.Choice(tuple(PRESETS)),
+                             help="named set of settings, overridden by options; paper: the paper's experiment, roam:"
+                                  " the exchange of the authors' code")  # fmt: skip
+map_option = click.option("--map", "map_kind", type=click.Choice(MAP_KINDS), default=POSTERIOR, show_default=True,
+                          help="form of the maps: posterior, h_0 + N (h - h_0), the evidence of the N robots that they"
+                               " are the mean of, or this mean h")  # fmt: skip
 
 
 class _ParameterOption(click.Option):

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from octoreplay.commands.options import check_folder, check_output, existing_path
+from octoreplay.commands.options import check_folder, check_output, existing_path, map_option
 from octoreplay.errors import ConfigError
 
 
@@ -51,8 +51,7 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
 @click.option("--color", type=click.Choice(("label", "robot", "disagreement", "probability")), default="label",
               show_default=True, help="quantity shown by the colours")  # fmt: skip
 @click.option("--free", is_flag=True, help="write free leaves too")
-@click.option("--team-posterior", is_flag=True,
-              help="use the posterior of the whole team, h_0 + N (h - h_0), instead of the robot's own h")  # fmt: skip
+@map_option
 def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
     """Write a map of a result as a PLY file, which CloudCompare, MeshLab and Open3D open."""
     from octoreplay.report.export import export_ply
@@ -74,11 +73,10 @@ def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
 @click.option("--robot", default=None, metavar="ID", help="robot id, or 'central'  [default: the first robot]")
 @click.option("--time", "seconds", type=float, default=None, metavar="SECONDS",
               help="time of the map since the run's start [s]  [default: the end]")  # fmt: skip
-@click.option("--team-posterior", is_flag=True,
-              help="use the posterior of the whole team, h_0 + N (h - h_0), instead of the robot's own h")  # fmt: skip
+@map_option
 def query(
     result: Path, points: tuple[tuple[float, float, float], ...], box: tuple[float, ...] | None, robot: str | None,
-    seconds: float | None, team_posterior: bool,
+    seconds: float | None, map_kind: str,
 ) -> int:  # fmt: skip
     """Show the class probabilities of a robot's map at points, or the classes in a box."""
     import numpy as np
@@ -99,13 +97,13 @@ def query(
         names = ("free", *opened.class_table.names)
         out.print(
             f"map of {robot_id} {opened.seconds(stored.stamp_ns):.1f} s after the start"
-            f" ({'team posterior' if team_posterior else 'own map'}, frame {stored.frame_id})",
+            f" ({stored.title(map_kind)}, frame {stored.frame_id})",
             soft_wrap=True,
         )
         if points:
-            answer = stored.query(np.array(points), team_posterior=team_posterior)
+            answer = stored.query(np.array(points), map_kind=map_kind)
             tables.show(out, tables.point_answers(names, points, answer))
         if box is not None:
-            found = stored.query_box(box[:3], box[3:], team_posterior=team_posterior)
+            found = stored.query_box(box[:3], box[3:], map_kind=map_kind)
             tables.show(out, tables.box_answer(names, found))
     return 0

@@ -10,14 +10,14 @@ import click
 
 from octoreplay.commands.aligning import aligned_run, dof_option
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import SectionedCommand, check_output, existing_path, with_parameters
+from octoreplay.commands.options import SectionedCommand, check_output, existing_path, preset_option, with_parameters
 from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
 from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
 from octoreplay.config.alignment import ON_AIR
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.config.parameters import PARAMETERS
-from octoreplay.config.presets import PRESETS, with_options
+from octoreplay.config.presets import with_options
 from octoreplay.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ def _check_input(word: str) -> None:
               help="use the logs and settings stored in this result, instead of TEAM.yaml or LOG")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
               help="write robots, topics and settings to this team file")  # fmt: skip
-@click.option("--preset", type=click.Choice(tuple(PRESETS)),
-              help="named set of settings, overridden by options; paper: the paper's experiment")  # fmt: skip
+@preset_option
 @click.option("--edges", metavar="A:B[:W],...",
               help="edge list of the communication graph; give a weight W for all edges or for none")  # fmt: skip
 @click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
-from octoreplay.commands.options import SectionedCommand, existing_path, with_parameters
+from octoreplay.commands.options import SectionedCommand, existing_path, preset_option, with_parameters
 from octoreplay.commands.progress import progress_bar, warn
-from octoreplay.config.presets import PRESETS
 
 if TYPE_CHECKING:
     from octoreplay.study.sweep import Sweep, SweepProgress
@@ -35,8 +34,7 @@ if TYPE_CHECKING:
 @click.option("--threads", type=int, default=1, show_default=True, metavar="N", help="number of threads of each run")
 @click.option("--scheduler", metavar="tcp://HOST:PORT",
               help="address of a dask scheduler; runs are executed on its workers instead of this machine")  # fmt: skip
-@click.option("--preset", type=click.Choice(tuple(PRESETS)),
-              help="named set of settings, overridden by options; paper: the paper's experiment")  # fmt: skip
+@preset_option
 def sweep(
     teams: tuple[Path, ...], output: Path, vary: tuple[str, ...], seeds: int | None, truth: Path | None, keep: bool,
     jobs: int | None, threads: int, scheduler: str | None, preset: str | None, **parameters: Any,

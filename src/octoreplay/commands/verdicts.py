@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from octoreplay.commands.exit_codes import EXIT_ERROR
-from octoreplay.commands.options import check_output, existing_path
+from octoreplay.commands.options import check_output, existing_path, map_option
 from octoreplay.evaluate.checks import LIMITS, check_result
 
 _json_option = click.option("--json", "json_file", type=existing_path, metavar="FILE.json",
@@ -30,8 +30,11 @@ def _with_limits(command: Callable[..., int]) -> Callable[..., int]:
 @click.option("--settled", is_flag=True, help="the maps must have settled at the end")
 @click.option("--truth", type=existing_path, metavar="WORLD",
               help="ground truth for limits that need it: world.npz, its folder, or a labelled PLY file")  # fmt: skip
+@map_option
 @_json_option
-def check(result: Path, settled: bool, truth: Path | None, json_file: Path | None, **options: float | None) -> int:
+def check(
+    result: Path, settled: bool, truth: Path | None, map_kind: str, json_file: Path | None, **options: float | None
+) -> int:
     """Check a result against limits, for continuous integration.
 
     Exit code 0 if all limits hold, 1 if one is violated. The result of an interrupted run fails.
@@ -42,7 +45,7 @@ def check(result: Path, settled: bool, truth: Path | None, json_file: Path | Non
     limits = {name: limit for name, limit in options.items() if limit is not None}
     if json_file is not None:
         check_output(json_file, ".json", [result])
-    rows = check_result(result, limits, settled=settled, truth=truth)
+    rows = check_result(result, limits, settled=settled, truth=truth, map_kind=map_kind)
     passed = all(row.passed for row in rows)
     if json_file is not None:
         write_whole(json_file, json_text({"result": result, "passed": passed, "rows": rows}))

@@ -11,6 +11,8 @@ from octoreplay.errors import ConfigError
 
 EVIDENCES = ("sum", "time-average", "cell-average")
 MODES = ("sync", "on-arrival")
+FLOW_BITS = 4
+"""Default of ``flow_bits`` for packets that hold the maps exactly."""
 
 
 @dataclass(frozen=True)
@@ -18,10 +20,10 @@ class ConsensusConfig:
     """The consensus rule and its steps (docs/algorithm.md)."""
 
     rule: str = parameter(
-        "gradient",
-        "consensus rule: gradient (the paper's), bayes (Bayes' rule with averaging), natural (natural gradient), ratio"
-        " and flood (exact in spite of lost packets), merge (baseline that counts evidence repeatedly), local (no"
-        " exchange)",
+        "bayes",
+        "consensus rule: bayes (Bayes' rule with averaging), gradient (Alg. 1 of the paper), natural (natural"
+        " gradient), ratio and flood (exact in spite of lost packets), merge (baseline that counts evidence"
+        " repeatedly), local (no exchange)",
         choices=tuple(RULES),
     )
     evidence: str = parameter(
@@ -46,10 +48,10 @@ class ConsensusConfig:
         "mode on-arrival: gamma divided by the number of received maps (divided), or the whole gamma for each (full)",
         choices=("divided", "full"),
     )
-    flow_bits: int = parameter(
-        4,
+    flow_bits: int | None = parameter(
+        None,
         "rule bayes: leading bits of the amounts that two robots exchange in a tick; fewer bits let maps come to rest"
-        " earlier (0: exact amounts)",
+        f" earlier; 0: exact amounts (default: {FLOW_BITS}, or 0 where packets do not hold the maps exactly)",
         minimum=0,
         maximum=20,
     )
@@ -58,6 +60,14 @@ class ConsensusConfig:
         "smallest step of log-odds, a power of two, for evidence sum and the rules bayes, gradient and natural; 0: none"
         " (default: 2^-16 for bayes, 2^-10 for gradient and natural)",
         minimum=0.0,
+    )
+    merge_weight: float | None = parameter(
+        None, "rule merge: weight of every received map (default: 2 epsilon A_ij, from the graph)", above=0.0
+    )
+    merge_maps: int | None = parameter(
+        None,
+        "rule merge: largest number of received maps that a robot merges in a tick, its senders in turn (default: all)",
+        minimum=1,
     )
     anchor_after: int = parameter(
         5,
@@ -86,16 +96,16 @@ class ConsensusConfig:
         return RULES[self.rule]
 
     @property
+    def map_is_mean(self) -> bool:
+        """True where robots agree on the mean of their evidence: N times it is the posterior of N robots."""
+        return self.traits.map_is_mean and self.evidence == "sum"
+
+    @property
     def effective_quantum(self) -> float:
         """Step of log-odds of the run, a power of two; 0 for rules and readings of evidence without a quantum."""
         if self.evidence != "sum" or self.traits.default_quantum == 0.0:
             return 0.0
         return self.traits.default_quantum if self.quantum is None else self.quantum
-
-    @property
-    def effective_flow_bits(self) -> int:
-        """``flow_bits`` where the rule has flows and the run has a quantum, else 0."""
-        return self.flow_bits if self.traits.has_flows and self.effective_quantum > 0.0 else 0
 
 
 def _check_power_of_two(quantum: float) -> None:

@@ -12,8 +12,11 @@ from octoreplay.errors import ConfigError
 class PacketConfig:
     """Configuration of packets: full maps or deltas, number format and budget."""
 
-    packets: str = parameter(
-        "full", "packets hold the full map, or the delta to what the receiver has", choices=("full", "delta")
+    packets: str | None = parameter(
+        None,
+        "packets hold the full map, or the delta to what the receiver has (default: delta; full for rule ratio, which"
+        " sends nothing else)",
+        choices=("full", "delta"),
     )
     acknowledge: bool = parameter(True, "packets delta: receivers acknowledge packets")
     key_frame_every: int = parameter(
@@ -49,7 +52,7 @@ class PacketConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.budget is not None and self.packets != "delta":
+        if self.budget is not None and self.packets == "full":
             raise ConfigError("budget: goes with packets 'delta'; a whole map cannot be sent in parts")
         if self.budget is not None and not self.acknowledge:
             raise ConfigError("budget: goes with acknowledge; what waits is sent from what the receiver has")

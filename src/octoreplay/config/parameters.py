@@ -86,7 +86,7 @@ SECTIONS: Mapping[str, Section] = MappingProxyType(
 def _parameters() -> Iterator[Parameter]:
     """Flat parameters in the order of the sections and their fields."""
     kinds = {"float": "float", "float | None": "float", "int": "int", "int | None": "int", "bool": "bool",
-             "str": "str", "tuple[float, ...]": "floats"}  # fmt: skip
+             "str": "str", "str | None": "str", "tuple[float, ...]": "floats"}  # fmt: skip
     for name, section in SECTIONS.items():
         for item in dataclasses.fields(section.config_type):
             if item.metadata:

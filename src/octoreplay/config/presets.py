@@ -16,12 +16,24 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             {
                 "rule": "gradient", "evidence": "time-average", "mode": "on-arrival", "gamma_per_arrival": "full",
                 "topology": "complete", "publish_period": 1.0, "weights": "degree", "settle": 0, "gamma": 1.0,
-                "flow_bits": 0, "quantum": 0.0, "anchor_after": 0,
+                "flow_bits": 0, "quantum": 0.0, "anchor_after": 0, "packets": "full",
             }
-        )
+        ),
+        "roam": MappingProxyType(
+            {
+                "rule": "merge", "merge_weight": 0.2, "merge_maps": 1, "publish_period": 5.0, "packets": "full",
+                "topology": "complete", "evidence": "sum", "mode": "sync", "settle": 0,
+            }
+        ),
     }
 )  # fmt: skip
-"""Sets of parameters by name. 'paper' follows the paper's text literally."""
+"""Sets of parameters by name.
+
+'paper' follows the paper's text literally. 'roam' has the weight and the periods of the paper's authors' public code,
+https://github.com/ExistentialRobotics/ROAM, branch demo, ROAM-Mapping/params/multi_robot_semantic_mapping_params.yaml:
+consensus_weight 0.2, pub_timer 5 and sub_timer 5. The code adds the weighted log-odds of a received map to its own and
+merges one map per sub_timer, of whichever robot (octomapCallback of octomap_generator_semantic_ros.cpp).
+"""
 
 
 def with_options(base: RunConfig, preset: str | None, edges: str | None, given: Mapping[str, Any]) -> RunConfig:

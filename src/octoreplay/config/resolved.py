@@ -115,7 +115,6 @@ class ResolvedRun(RunConfig):
         super().__post_init__()
         if self.merge_classes or self.ignore_hits:
             raise ConfigError("merge_classes, ignore_hits: must be empty in a resolved run; edit its classes instead")
-        object.__setattr__(self, "sensor", self.effective_sensor)
 
     @classmethod
     def from_config(
@@ -126,9 +125,12 @@ class ResolvedRun(RunConfig):
         return cls(**{**_values(config, RunConfig), **resolved}, warnings=tuple(warnings))
 
     def to_config(self) -> RunConfig:
-        """Return the plain configuration, which compares equal to the one that a result stores."""
+        """Return the plain configuration, which compares equal to the one that a result stores.
+
+        Its sensor model has the rounded increments and clamps of the run.
+        """
         robots = tuple(robot.to_config() for robot in self.robots)
-        return RunConfig(**{**_values(self, RunConfig), "robots": robots})
+        return RunConfig(**{**_values(self, RunConfig), "robots": robots, "sensor": self.effective_sensor})
 
     @property
     def total_ns(self) -> int | None:

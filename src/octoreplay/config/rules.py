@@ -44,6 +44,8 @@ class Rule:
         True where new evidence enters the map before it is published, in every tick.
     mixes_differences : bool
         True where neighbours' maps enter as differences h_j - h_i, False where they are added whole.
+    map_is_mean : bool
+        True where a robot's map is the mean over the robots, with evidence 'sum': N times it is the team's posterior.
     needs_symmetric_links : bool
         True where the team's sum is kept only if both ends of a link receive a map in the same tick.
     keeps_last_evidence : bool
@@ -70,12 +72,13 @@ class Rule:
     default_quantum: float = 0.0
     adds_evidence_first: bool = False
     mixes_differences: bool = True
+    map_is_mean: bool = True
     needs_symmetric_links: bool = False
     keeps_last_evidence: bool = False
     survives_losses: bool = False
     survives_restarts: bool = False
     modes: tuple[str, ...] = ("sync", "on-arrival")
-    packets: tuple[str, ...] = ("full", "delta")
+    packets: tuple[str, ...] = ("delta", "full")
     needs_exact_packets: bool = False
     warning: str = ""
 
@@ -107,10 +110,11 @@ _RULES = (
         name="merge",
         exchanges=Exchanged.MAP,
         mixes_differences=False,
+        map_is_mean=False,
         keeps_last_evidence=True,
         warning="rule 'merge' counts received evidence again in every tick; it is a baseline, not a map to trust",
     ),
-    Rule(name="local", exchanges=Exchanged.NOTHING),
+    Rule(name="local", exchanges=Exchanged.NOTHING, map_is_mean=False),
 )
 
 RULES: Mapping[str, Rule] = MappingProxyType({rule.name: rule for rule in _RULES})

@@ -9,11 +9,12 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Self
 
 from octoreplay.config.alignment import ON_AIR, AlignmentConfig
 from octoreplay.config.class_tables.edits import Merges
-from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.consensus import FLOW_BITS, ConsensusConfig
 from octoreplay.config.network import POSITION_TOPOLOGIES, LinkConfig, NetworkConfig
 from octoreplay.config.output import OutputConfig
 from octoreplay.config.packets import PacketConfig
@@ -74,7 +75,7 @@ class RunConfig:
         if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
             raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
         _check_rule(self)
-        rounded_sensor(self.sensor, self.consensus.effective_quantum)  # raises ConfigError
+        _ = self.effective_sensor  # raises ConfigError
         if self.alignment.is_on_air:
             _check_on_air(self)
 
@@ -115,10 +116,33 @@ class RunConfig:
         values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
         return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
 
-    @property
+    @cached_property
     def effective_sensor(self) -> SensorConfig:
         """Sensor model of the run: increments and clamps are multiples of the run's quantum."""
         return rounded_sensor(self.sensor, self.consensus.effective_quantum)
+
+    @cached_property
+    def effective_packet(self) -> PacketConfig:
+        """Packets of the run: ``packets`` is the kind that the rule sends by default where none is given."""
+        return dataclasses.replace(self.packet, packets=self.packet.packets or self.consensus.traits.packets[0])
+
+    @property
+    def has_exact_packets(self) -> bool:
+        """True where packets hold the published maps unchanged."""
+        return self.packet.is_exact and self.map.prune_tolerance == 0.0
+
+    @property
+    def effective_flow_bits(self) -> int:
+        """Bits of the flows; 0 for rules without flows and runs without a quantum.
+
+        The default is FLOW_BITS with exact packets and 0 with others: maps that differ by the packets' rounding would
+        exchange flows for ever.
+        """
+        if not self.consensus.traits.has_flows or self.consensus.effective_quantum == 0.0:
+            return 0
+        if self.consensus.flow_bits is not None:
+            return self.consensus.flow_bits
+        return FLOW_BITS if self.has_exact_packets else 0
 
     def with_parameters(self, values: Mapping[str, Any]) -> Self:
         """Return the configuration with flat parameters replaced.
@@ -149,8 +173,8 @@ def _check_rule(config: RunConfig) -> None:
             f"mode: rule '{rule.name}' does not support '{config.consensus.mode}';"
             f" use {' or '.join(map(repr, rule.modes))}"
         )
-    is_exact = packet.is_exact and config.map.prune_tolerance == 0
-    if packet.packets not in rule.packets or (rule.needs_exact_packets and not is_exact):
+    is_unsupported = packet.packets is not None and packet.packets not in rule.packets
+    if is_unsupported or (rule.needs_exact_packets and not config.has_exact_packets):
         raise ConfigError(
             f"rule: '{rule.name}' sends {rule.exchanges.value}, which receivers need whole and exact; use packets"
             f" '{rule.packets[0]}', content 'float32' and prune_tolerance 0, without budget and top_classes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from octoreplay.config.class_file import CLASSES_KEYS, class_settings, class_to_mapping
@@ -32,14 +33,14 @@ def load_team_file(path: str | Path) -> RunConfig:
     return parse_team(read_text(path, "team"), name=str(path), folder=path.parent)
 
 
-def parse_team(text: str, *, name: str, folder: Path) -> RunConfig:
+def parse_team(text: str, *, name: str, folder: Path, defaults: Mapping[str, Any] = MappingProxyType({})) -> RunConfig:
     """Return the configuration of a team file's text. Relative paths in it are relative to ``folder``.
 
-    Raises ConfigError that starts with ``name``.
+    ``defaults`` are values of parameters that the text does not name. Raises ConfigError that starts with ``name``.
     """
     content = load_yaml(text, name)
     try:
-        return _team_from_mapping(content, folder)
+        return _team_from_mapping({**defaults, **content} if isinstance(content, Mapping) else content, folder)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from error
 
@@ -195,15 +196,15 @@ def _link_overrides(entries: Any) -> tuple[tuple[str, str, tuple[tuple[str, Any]
     return tuple(found)
 
 
-def dump_team(config: RunConfig, folder: Path | None = None) -> str:
-    """Return the text of a team file: the robots, and every parameter that differs from its default.
+def dump_team(config: RunConfig, folder: Path | None = None, *, with_defaults: bool = False) -> str:
+    """Return the text of a team file: the robots, and every parameter that differs from its default, or all of them.
 
     Log paths below ``folder`` are written relative to it. ``parse_team`` returns the same configuration.
     """
-    return dump_yaml(team_to_mapping(config, folder))
+    return dump_yaml(team_to_mapping(config, folder, with_defaults=with_defaults))
 
 
-def team_to_mapping(config: RunConfig, folder: Path | None) -> dict[str, Any]:
+def team_to_mapping(config: RunConfig, folder: Path | None, *, with_defaults: bool = False) -> dict[str, Any]:
     """Return the content of a configuration's team file, by key."""
     content: dict[str, Any] = {"robots": [robot_to_mapping(robot, folder) for robot in config.robots]}
     if config.classes is not None:
@@ -226,7 +227,7 @@ def team_to_mapping(config: RunConfig, folder: Path | None) -> dict[str, Any]:
         content["links"] = [{"from": a, "to": b, **dict(values)} for a, b, values in config.link_overrides]
     for name, parameter in PARAMETERS.items():
         value = getattr(getattr(config, parameter.section), name)
-        if value != parameter.default:
+        if with_defaults or value != parameter.default:
             content[name] = list(value) if isinstance(value, tuple) else value
     return content
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.records import CONVERGED
+from octoreplay.records import CONVERGED, POSTERIOR
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, RobotMetrics, RunSummary, TickMetrics, ranked_pairs
 
 if TYPE_CHECKING:
@@ -132,7 +132,12 @@ class Quantity:
 
 
 def check_result(
-    path: str | Path, limits: Mapping[str, float], *, settled: bool = False, truth: str | Path | None = None
+    path: str | Path,
+    limits: Mapping[str, float],
+    *,
+    settled: bool = False,
+    truth: str | Path | None = None,
+    map_kind: str = POSTERIOR,
 ) -> tuple[CheckRow, ...]:
     """Check a result against limits and return one row per check, failed ones first, in the order of ``LIMITS``.
 
@@ -148,11 +153,14 @@ def check_result(
         True to check that the maps were at rest at the end.
     truth : path, optional
         True world (docs/simulation.md), which some limits need.
+    map_kind : 'posterior' or 'mean'
+        Form of the maps that limits with a truth judge (``StoredMap``).
 
     Raises
     ------
     ConfigError
-        A limit is unknown or out of range, no check is asked for, or the truth is missing or not needed.
+        A limit or ``map_kind`` is unknown, a limit is out of range, no check is asked for, or the truth is missing or
+        not needed.
     InputError
         The file is not a result or holds no tick.
     """
@@ -160,7 +168,7 @@ def check_result(
 
     _check_limits(limits, settled, truth is not None)
     with open_result(path) as result:
-        checked = _CheckedResult(result, None if truth is None else _evaluation(result.path, Path(truth)))
+        checked = _CheckedResult(result, None if truth is None else _evaluation(result.path, Path(truth), map_kind))
         rows = [*_flags(checked, settled), *(_row(name, limits[name], checked) for name in LIMITS if name in limits)]
     return tuple(sorted(rows, key=lambda row: row.passed))
 
@@ -194,11 +202,11 @@ def _check_limits(limits: Mapping[str, float], settled: bool, has_truth: bool) -
         raise ConfigError("truth: no limit needs the truth; add one, such as --min-mean-iou 0.5, or leave --truth out")
 
 
-def _evaluation(path: Path, truth: Path) -> Evaluation:
+def _evaluation(path: Path, truth: Path, map_kind: str) -> Evaluation:
     """Evaluation of a result's last maps against the truth."""
     from octoreplay.evaluate.evaluation import evaluate_result
 
-    return evaluate_result(path, truth=truth, over_time=False)
+    return evaluate_result(path, truth=truth, map_kind=map_kind, over_time=False)
 
 
 _COMPLETE, _SETTLED = "complete", "settled"
@@ -365,10 +373,8 @@ QUANTITIES = (
              _truth_scores("mean_iou"), is_share=True, needs_truth=True),
     Quantity("coverage", ("min",), "share of the observed surface in the map, worst robot; needs --truth",
              _truth_scores("coverage"), is_share=True, needs_truth=True),
-    Quantity("calibration_error", ("max",), "expected calibration error, worst robot; needs --truth",
+    Quantity("calibration_error", ("max",), "expected calibration error of the map shown, worst robot; needs --truth",
              _truth_scores("calibration_error"), is_share=True, needs_truth=True),
-    Quantity("team_calibration_error", ("max",), "the same of the team posterior h_0 + N (h - h_0); needs --truth",
-             _truth_scores("team_calibration_error"), is_share=True, needs_truth=True),
 )  # fmt: skip
 """All quantities that limits can be set on."""
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate.morton_intervals import Region
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.evaluate.scores import agreement, truth_scores
@@ -20,7 +20,7 @@ from octoreplay.evaluate.truth_frame import truth_frame_warning
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
-from octoreplay.records import CENTRAL, BoolArray
+from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, BoolArray
 from octoreplay.replay.warnings import team_frame_warnings
 from octoreplay.result import Result, StoredMap, open_result
 from octoreplay.run_metrics import PairMetrics, TickMetrics
@@ -31,6 +31,7 @@ def evaluate_result(
     *,
     truth: str | Path | None = None,
     against: str | Path = CENTRAL,
+    map_kind: str = POSTERIOR,
     over_time: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
@@ -45,6 +46,8 @@ def evaluate_result(
     against : path or 'central'
         Reference of the agreement: the result's own centralised map, or the centralised map of another result at the
         same time since the start.
+    map_kind : 'posterior' or 'mean'
+        Form of the robots' maps that is scored (``StoredMap``).
     over_time : bool
         True for every stored tick, False for the last one only.
     progress : callable, optional
@@ -52,18 +55,22 @@ def evaluate_result(
 
     Raises
     ------
+    ConfigError
+        ``map_kind`` is unknown.
     InputError
         A file cannot be used, or the files have different classes or resolutions.
     PacketError
         A stored map is damaged.
     """
+    if map_kind not in MAP_KINDS:
+        raise ConfigError(f"map: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
     with contextlib.ExitStack() as files:
         result = files.enter_context(open_result(path))
         other = None if against == CENTRAL else files.enter_context(open_result(against))
         if other is not None:
             _check_fit(result, other)
         surface = None if truth is None else load_truth(Path(truth), result.class_table, result.config.map.resolution)
-        evaluator = _Evaluator(result, surface, other)
+        evaluator = _Evaluator(result, surface, other, map_kind)
         stored: Iterable[Mapping[str, StoredMap]] = result.history() if over_time else [evaluator.last_maps]
         ticks = []
         for maps in stored:
@@ -72,8 +79,8 @@ def evaluate_result(
                 progress(min(1.0, (ticks[-1].tick + 1) / (result.metrics[-1].tick + 1)))
         misplaced = None if truth is None else truth_frame_warning(result, Path(truth))
         return Evaluation(
-            str(path), None if truth is None else str(truth), str(against), result.class_table.names, tuple(ticks),
-            (*evaluator.warnings, *([misplaced] if misplaced is not None else [])),
+            str(path), None if truth is None else str(truth), str(against), map_kind, result.class_table.names,
+            tuple(ticks), (*evaluator.warnings, *([misplaced] if misplaced is not None else [])),
         )  # fmt: skip
 
 
@@ -122,8 +129,9 @@ class _Counts(NamedTuple):
 class _Evaluator:
     """Evaluates the maps of one result, tick by tick."""
 
-    def __init__(self, result: Result, truth: Truth | None, other: Result | None) -> None:
+    def __init__(self, result: Result, truth: Truth | None, other: Result | None, map_kind: str) -> None:
         self._result = result
+        self._map_kind = map_kind
         self._truth = truth
         self._other = other
         self._other_start_ns = 0 if other is None else _first_central_ns(other)
@@ -168,7 +176,7 @@ class _Evaluator:
                     robot_id=name,
                     is_active=is_active.get(name, True),
                     **count._asdict(),
-                    truth=self._truth_scores(name, leaves, region),
+                    truth=self._truth_scores(leaves, region),
                 )
                 for name, count, leaves in zip(names, counts, spans, strict=True)
             ),
@@ -194,9 +202,9 @@ class _Evaluator:
         return pairs
 
     def _octree(self, maps: Mapping[str, StoredMap], name: str) -> SemanticOctree:
-        """Octree of a map, an empty one before its first stored state."""
+        """Octree of a map in the form that is scored, an empty one before its first stored state."""
         if name in maps:
-            return maps[name].octree
+            return maps[name].shown_octree(self._map_kind)
         return SemanticOctree(self._result.config.map.resolution, self._result.class_table.num_classes)
 
     def _observed(self, truth: Truth) -> BoolArray:
@@ -249,10 +257,8 @@ class _Evaluator:
         num_cells = Region([*spans, leaves]).num_cells
         return [agreement(own, self._prior, leaves, reference.prior, num_cells) for own in spans]
 
-    def _truth_scores(self, name: str, spans: LeafSpans, region: Region) -> TruthScores | None:
+    def _truth_scores(self, spans: LeafSpans, region: Region) -> TruthScores | None:
         """Scores of one map against the truth, None without a truth."""
         if self._truth is None:
             return None
-        # The centralised map already is the posterior of all evidence.
-        num_robots = 1 if name == CENTRAL else len(self._result.robots)
-        return truth_scores(spans, self._prior, num_robots, self._truth, region, self._is_observed)
+        return truth_scores(spans, self._prior, self._truth, region, self._is_observed)

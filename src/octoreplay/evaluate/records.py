@@ -29,9 +29,7 @@ class TruthScores:
     world_coverage : float
         Share of all surface that the map calls occupied.
     calibration_error, calibration_error_occupied : float
-        Expected calibration error of h, over known cells and over those that are occupied in the map or in truth.
-    team_calibration_error, team_calibration_error_occupied : float
-        The same of the team posterior h_0 + N (h - h_0).
+        Expected calibration error, over known cells and over those that are occupied in the map or in truth.
     """
 
     iou: tuple[float, ...]
@@ -43,8 +41,6 @@ class TruthScores:
     world_coverage: float
     calibration_error: float
     calibration_error_occupied: float
-    team_calibration_error: float
-    team_calibration_error_occupied: float
 
 
 @dataclass(frozen=True)
@@ -117,12 +113,14 @@ class EvaluatedTick(PairTotals):
 class Evaluation:
     """Scores of a result's maps over time; the last of ``ticks`` is the end. ``class_names`` (C,) without free.
 
-    ``warnings`` are sentences on the robots' frames (docs/metrics.md).
+    ``map_kind`` is the form of the maps that was scored: 'posterior' or 'mean'. ``warnings`` are sentences on the
+    robots' frames (docs/metrics.md).
     """
 
     result: str
     truth: str | None
     against: str
+    map_kind: str
     class_names: tuple[str, ...]
     ticks: tuple[EvaluatedTick, ...]
     warnings: tuple[str, ...] = ()

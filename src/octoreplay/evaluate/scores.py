@@ -11,7 +11,7 @@ import numpy.typing as npt
 from octoreplay.evaluate.morton_intervals import Region, common_intervals
 from octoreplay.evaluate.records import TruthScores
 from octoreplay.evaluate.truth import Truth
-from octoreplay.log_odds import TIE_TOLERANCE, best_labels, shifted_exp_sum, team_log_odds
+from octoreplay.log_odds import TIE_TOLERANCE, best_labels, shifted_exp_sum
 from octoreplay.mapping.octree import LeafSpans
 from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 
@@ -19,9 +19,7 @@ NUM_BINS = 15
 """Number of bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
 
 
-def truth_scores(
-    spans: LeafSpans, prior: float, num_robots: int, truth: Truth, region: Region, is_observed: BoolArray
-) -> TruthScores:
+def truth_scores(spans: LeafSpans, prior: float, truth: Truth, region: Region, is_observed: BoolArray) -> TruthScores:
     """Return the scores of a map with prior h_0 against the truth.
 
     ``region`` holds the cells that the team's evidence covers at this tick. ``is_observed`` (M,) bool is True for the
@@ -40,11 +38,6 @@ def truth_scores(
     is_seen[surface.is_known] = labels[surface.leaves] > 0
     # Classes come first: sums along the short axis would take several times as long.
     by_class = np.ascontiguousarray(log_odds.T)
-    errors = team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
-    if num_robots > 1:
-        by_class = team_log_odds(by_class, prior, num_robots).astype(np.float32, copy=False)
-        labels = labels if prior == 0 else best_labels(by_class.T)
-        team_errors = _calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells)
     return TruthScores(
         tuple(iou.tolist()),
         _mean(iou, of_team),
@@ -53,8 +46,7 @@ def truth_scores(
         _ratio(confusion[0, 0], confusion[0].sum()),
         _ratio((is_seen & is_observed & truth.is_class).sum(), (is_observed & truth.is_class).sum()),
         _ratio((is_seen & truth.is_class).sum(), truth.is_class.sum()),
-        *errors,
-        *team_errors,
+        *_calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells),
     )
 
 

@@ -230,6 +230,13 @@ def _scratch(num_classes: int, num_columns: int) -> tuple[Float32Array, Int64Arr
     )
 
 
+def scaled_map(octree: SemanticOctree, factor: float) -> SemanticOctree:
+    """Return an octree with the deviations of another one, multiplied by ``factor``."""
+    scaled = SemanticOctree(octree.resolution, octree.num_classes)
+    sum_of_evidence(scaled, [Evidence(octree, scale=factor)], octree.codes, 0)
+    return scaled
+
+
 def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes: Int64Array, revision: int) -> None:
     """Write sum_i log q_i of the bricks ``codes`` (n,) into ``target``: the oracle, or one robot's log q_i.
 

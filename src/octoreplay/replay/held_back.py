@@ -193,7 +193,7 @@ def compare_held_back(
     octrees = [octree for variant in (0, 1) for evidence in found for octree in evidence.parts[variant]]
     names = [str(number) for number in range(len(octrees))]
     cells, contradicting = np.zeros((2, len(octrees), len(octrees)))
-    comparer = EvidenceComparer(names, num_classes, state_limits(config.sensor))
+    comparer = EvidenceComparer(names, num_classes, state_limits(config.effective_sensor))
     for pair in comparer.compare(octrees, 0, threads):
         if pair.occupied_cells:
             places = [int(pair.first), int(pair.second)], [int(pair.second), int(pair.first)]
@@ -221,8 +221,8 @@ def _evidence(
 ) -> _Evidence:
     """Read one log and integrate the scans that are held back, with the recorded and with the corrected poses."""
     num_classes, resolution = config.classes.num_classes, config.map.resolution
-    caster = ScanCaster(config.sensor, config.map, num_classes)
-    increments = clamped_increments(config.sensor)
+    caster = ScanCaster(config.effective_sensor, config.map, num_classes)
+    increments = clamped_increments(config.effective_sensor)
     parts: tuple[dict[int, SemanticOctree], dict[int, SemanticOctree]] = ({}, {})
     wholes = (SemanticOctree(resolution, num_classes), SemanticOctree(resolution, num_classes))
     if track.stamps_ns.size == 0:

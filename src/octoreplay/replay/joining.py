@@ -62,7 +62,7 @@ class Joining:
         self._packet_codec = packet_codec
         self._threads = threads
         self._limits = AcceptLimits()
-        self._exchanges = [Exchange(config.packet, packet_codec) for _ in range(num_robots)]
+        self._exchanges = [Exchange(config.effective_packet, packet_codec) for _ in range(num_robots)]
         self._public: dict[int, PublicMap] = {}
         self._found: list[PairAlignment] = []
         # Version of the received evidence and cells of both maps at the last attempt of a pair.

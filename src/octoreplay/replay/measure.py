@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.resolved import ResolvedRun
+from octoreplay.config.run import RunConfig
 from octoreplay.mapping.consensus import sum_of_evidence
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
@@ -44,9 +44,9 @@ class _Component:
         self._threads = threads
         self._is_new = True
         self._since = 0
-        self._consensus = config.consensus
+        self._config = config
         self._comparer = MapComparer(len(ids), config.map.prior(num_classes))
-        self._evidence_comparer = EvidenceComparer(ids, num_classes, state_limits(config.sensor))
+        self._evidence_comparer = EvidenceComparer(ids, num_classes, state_limits(config.effective_sensor))
 
     def forget(self) -> None:
         """Compare all bricks anew in the next tick: a robot's map and evidence were replaced."""
@@ -75,7 +75,7 @@ class _Component:
         position = {index: place for place, index in enumerate(self.members)}
         links = [(position[i], position[j]) for i, j in graph.pairs if i in position and j in position]
         maps = [team.robots[index].map for index in self.members]
-        least_tie = len(team.robots) * rest_difference(self._consensus, graph)
+        least_tie = len(team.robots) * rest_difference(self._config, graph)
         return self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
 
     def spread(self, values: npt.NDArray[Any], num_robots: int) -> npt.NDArray[Any]:
@@ -85,12 +85,12 @@ class _Component:
         return spread
 
 
-def rest_difference(consensus: ConsensusConfig, graph: CommunicationGraph) -> float:
+def rest_difference(config: RunConfig, graph: CommunicationGraph) -> float:
     """Largest difference of two neighbours' log-odds at rest: quantum / (2 epsilon A_min) with flows, else 0."""
     weights = graph.weights[graph.weights > 0.0]
-    if not consensus.effective_flow_bits or not weights.size:
+    if not config.effective_flow_bits or not weights.size:
         return 0.0
-    return consensus.effective_quantum / (2.0 * step_size(graph, consensus) * float(weights.min()))
+    return config.consensus.effective_quantum / (2.0 * step_size(graph, config.consensus) * float(weights.min()))
 
 
 class TickMeasurer:
@@ -205,7 +205,7 @@ class TickMeasurer:
         num_cells = int(comparison.num_cells[robot.index])
         sizes = published.sizes if published else MapSizes()
         sent_bytes = sum(link.sent_bytes for link in links if link.sender == robot.robot_id)
-        if published and self._config.packet.cast == "broadcast":
+        if published and self._config.effective_packet.cast == "broadcast":
             # One packet reaches all its receivers.
             sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.messages)
         return RobotMetrics(

@@ -65,24 +65,25 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     octree, measured = SemanticOctree(config.map.resolution, num_classes), MeasuredPoints(config.map.resolution)
     # The bounds are in the team's frame, which is not known yet.
     region = dataclasses.replace(config.map, bounds=())
-    caster = ScanCaster(config.sensor, region, num_classes)
-    increments = clamped_increments(config.sensor)
+    sensor = config.effective_sensor
+    caster, increments = ScanCaster(sensor, region, num_classes), clamped_increments(sensor)
     alone = dataclasses.replace(robot, T_team_map=_OWN_FRAME, T_team_map_sigma=None, T_team_map_from=None)
-    reach = sensor_reach(config.sensor, region)
+    reach = sensor_reach(sensor, region)
     with RobotLog(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
-            measured.add_scan(frame, config.sensor)
+            measured.add_scan(frame, sensor)
         return OwnEvidence(octree, measured, read_sightings(log, config.time), log.counts)
 
 
 def overlaid_contradiction(config: ResolvedRun, evidence: Sequence[OwnEvidence]) -> tuple[PairMetrics, ...]:
     """Return the contradiction of the robots' evidence, each in its own map frame, as if these were one frame."""
     robot_ids = [robot.robot_id for robot in config.robots]
-    comparer = EvidenceComparer(robot_ids, config.classes.num_classes, state_limits(config.sensor))
+    comparer = EvidenceComparer(robot_ids, config.classes.num_classes, state_limits(config.effective_sensor))
     return comparer.compare([own.octree for own in evidence], 0)
 
 
 def own_map_of(config: RunConfig, evidence: SemanticOctree, measured: MeasuredPoints | None = None) -> OwnMap:
     """Return the map for registration of a robot's evidence. ``measured`` points make its surfaces more accurate."""
-    return OwnMap.of_evidence(evidence, hit=config.sensor.hit, miss=config.sensor.miss, measured=measured)
+    sensor = config.effective_sensor
+    return OwnMap.of_evidence(evidence, hit=sensor.hit, miss=sensor.miss, measured=measured)

@@ -8,11 +8,13 @@ from concurrent.futures import Executor
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
+from octoreplay.config.rules import Exchanged
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL, FrameCounts, LeafTable, MapState
 from octoreplay.replay.joining import Joining
+from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.warnings import team_frame_warnings
 from octoreplay.run_metrics import LinkTotals, RunSummary, TickMetrics
@@ -31,8 +33,10 @@ class _StateSeries:
         self._num_stored = 0
         self._octrees: Sequence[SemanticOctree] = ()
 
-    def store(self, tick: Tick, names: Sequence[str], octrees: Sequence[SemanticOctree]) -> None:
-        """Store the octrees of one tick; ``names`` are the same in all ticks."""
+    def store(
+        self, tick: Tick, names: Sequence[str], octrees: Sequence[SemanticOctree], num_robots: Sequence[int]
+    ) -> None:
+        """Store the octrees of one tick, the means of ``num_robots``; ``names`` are the same in all ticks."""
         sequence = self._num_stored
 
         def encode(index: int) -> MapState:
@@ -45,7 +49,10 @@ class _StateSeries:
                 data = codec.encode_delta(octree, np.flatnonzero(octree.revisions > self.last_tick))
             base = sequence if is_key_frame else sequence - 1
             frame_id = tick.metrics.frame_of(names[index])
-            return MapState(names[index], tick.stamp_ns, tick.number, sequence, base, is_key_frame, data, frame_id)
+            return MapState(
+                names[index], tick.stamp_ns, tick.number, sequence, base, is_key_frame, data, frame_id,
+                num_robots[index],
+            )  # fmt: skip
 
         for state in self._threads.map(encode, range(len(names))):
             self._write(state)
@@ -68,6 +75,7 @@ class Recorder:
             self._maps = _StateSeries(writer.write_state, threads)
             self._evidence = _StateSeries(writer.write_evidence, threads)
         self._view_tick = -1
+        self._num_averaged = np.ones(len(config.robots), np.int64)
         self._num_settling = 0
         self._peak = 0.0
         self._peak_all = 0.0
@@ -90,6 +98,7 @@ class Recorder:
             self.start_ns = tick.stamp_ns
         self.last = tick
         self._add_up(tick.metrics)
+        self._count_averaged(tick.graph)
         if self._writer is None:
             return
         self._writer.write_metrics(tick.metrics)
@@ -166,6 +175,20 @@ class Recorder:
         self._links.add(metrics.links)
         self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
 
+    def _count_averaged(self, graph: CommunicationGraph) -> None:
+        """Update N of each active robot: the robots that reach it, or the team where evidence goes by origin.
+
+        The map of a dormant robot stays as it is, and so does its N.
+        """
+        consensus = self._config.consensus
+        if not consensus.map_is_mean:
+            return
+        if consensus.traits.exchanges is Exchanged.EVIDENCE:
+            self._num_averaged[:] = len(graph.robot_ids)
+            return
+        active = list(graph.active)
+        self._num_averaged[active] = graph.num_reaching[active]
+
     def _is_due(self, tick: Tick, every: float) -> bool:
         """True when a multiple of ``every`` seconds of log time lies in the period that ends with this tick."""
         period_ns = round(self._config.network.publish_period * 1e9)
@@ -173,11 +196,12 @@ class Recorder:
 
     def _store_maps(self, tick: Tick) -> None:
         """Store all maps, the centralised map included."""
-        self._maps.store(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle))
+        num_robots = (*self._num_averaged.tolist(), 1)
+        self._maps.store(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle), num_robots)
 
     def _store_evidence(self, tick: Tick) -> None:
         """Store every robot's evidence."""
-        self._evidence.store(tick, tick.graph.robot_ids, tick.evidence)
+        self._evidence.store(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence))
 
     def _write_views(self, tick: Tick) -> None:
         """Store every robot's map for viewing."""

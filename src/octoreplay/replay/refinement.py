@@ -213,7 +213,7 @@ class _SubmapBuilder:
             self._close()
         points, class_ids = scan_points(
             frame,
-            self._config.sensor,
+            self._config.effective_sensor,
             max_range=_RANGE_SHARE * self._config.sensor.max_range,
             max_points=_POINTS_PER_SCAN,
         )

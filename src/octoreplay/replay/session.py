@@ -17,7 +17,7 @@ from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import check_budget
 from octoreplay.replay.joining import Joining
 from octoreplay.replay.measure import TickMeasurer, Traffic
-from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_size
+from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_weights_of
 from octoreplay.replay.network.links import Links
 from octoreplay.replay.robots.robot import REPLAY, MapSizes, Phase, Publication, Robot, Turn
 from octoreplay.replay.robots.team import make_team
@@ -81,13 +81,13 @@ class Session:
         self.stop_reason = ""
         self.is_symmetric = True
         robot_ids = [robot.robot_id for robot in config.robots]
-        check_budget(config.packet, config.classes.num_classes)
+        check_budget(config.effective_packet, config.classes.num_classes)
         check_team_graph(config.network, config.consensus, robot_ids)
         self._threads = threads
         self._timeline = Timeline(sources)
         self._bodies = bodies
         self._network = TeamNetwork(config.network, config.consensus, robot_ids)
-        self._packet_codec = PacketCodec(config.packet)
+        self._packet_codec = PacketCodec(config.effective_packet)
         self.team = make_team(config, self._packet_codec)
         self.joining = Joining(config, self._packet_codec, threads) if config.alignment.is_on_air else None
         self._reopen = reopen
@@ -258,7 +258,7 @@ class Session:
 
     def _iterate(self, graph: CommunicationGraph, phase: Phase, number: int) -> float:
         """Iterate at every active robot with the maps that arrived; the largest change of a log-odds."""
-        step_weights = 2.0 * step_size(graph, self.config.consensus) * graph.weights
+        step_weights = step_weights_of(graph, self.config.consensus)
         robots = self.team.robots
         turns = [Turn(robots[index], robots[index].take_arrivals(), step_weights[index]) for index in graph.active]
         return max(self.team.iterate(turns, phase, number, self._threads), default=0.0)

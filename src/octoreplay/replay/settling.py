@@ -15,6 +15,7 @@ from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import LinkConfig
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
+from octoreplay.config.run import RunConfig
 from octoreplay.records import CONVERGED
 from octoreplay.replay.network.graph import CommunicationGraph, step_size
 from octoreplay.replay.robots.robot import Phase
@@ -52,11 +53,11 @@ class Settling:
     ) -> None:
         self.stop_reason = SETTLE_MAX
         self._consensus = config.consensus
-        self._num_finer = num_finer_ticks(config.consensus, largest)
+        self._num_finer = num_finer_ticks(config, largest)
         self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
         self._most = num_settle_ticks(graph, config, longest_transmission, self._num_finer)
         self._tolerance = config.consensus.settle_tolerance
-        if config.consensus.effective_flow_bits:
+        if config.effective_flow_bits:
             # No flow is below the quantum.
             self._tolerance = min(self._tolerance, config.consensus.effective_quantum)
         self._num_quiet = 0
@@ -82,17 +83,17 @@ class Settling:
         self._num_quiet = self._num_quiet + 1 if max_change < self._tolerance else 0
 
 
-def num_finer_ticks(consensus: ConsensusConfig, largest: float) -> int:
+def num_finer_ticks(config: RunConfig, largest: float) -> int:
     """Number of settling ticks in which flows get finer, until every step is the quantum; 0 without flows.
 
     It is the least n with floor(log2 ``largest``) - (flow_bits + 2 n) <= log2 quantum. ``largest`` is the largest
     |log-odds| of the maps; flows do not raise it.
     """
-    if not consensus.effective_flow_bits or largest == 0.0:
+    if not config.effective_flow_bits or largest == 0.0:
         return 0
     # frexp gives floor(log2 x) + 1 exactly.
-    num_bits = math.frexp(largest)[1] - math.frexp(consensus.effective_quantum)[1]
-    return max(0, math.ceil((num_bits - consensus.effective_flow_bits) / BITS_PER_TICK))
+    num_bits = math.frexp(largest)[1] - math.frexp(config.consensus.effective_quantum)[1]
+    return max(0, math.ceil((num_bits - config.effective_flow_bits) / BITS_PER_TICK))
 
 
 def num_quiet_ticks(graph: CommunicationGraph, config: ResolvedRun, transmission: float = 0.0) -> int:
@@ -126,7 +127,7 @@ def num_settle_ticks(
     most = settle_ticks_max(dataclasses.replace(graph, weights=weights), consensus, epsilon)
     if consensus.settle == 0 or consensus.settle_max is not None:
         return most
-    ramp, has_budget = consensus.settle, config.packet.budget is not None
+    ramp, has_budget = consensus.settle, config.effective_packet.budget is not None
     all_links = list(links.values())
     slower = _repeats(config, all_links) * _slowest_period(config)
     slower *= 1 + _delay(all_links, config, 2.0 * transmission)
@@ -134,7 +135,7 @@ def num_settle_ticks(
         # The time until all waiting evidence is sent is unknown, but finite, since no new evidence comes.
         return max(most, FLOOD_TICKS)
     slower *= BUDGET_TICKS if has_budget else 1
-    finer = max(FINER_TICKS, num_finer) if consensus.effective_flow_bits else 0
+    finer = max(FINER_TICKS, num_finer) if config.effective_flow_bits else 0
     return ramp + (most - ramp) * slower + num_quiet_ticks(graph, config, transmission) - 1 + finer
 
 
@@ -171,14 +172,14 @@ def _slowest_period(config: ResolvedRun) -> int:
 
 def _repeats(config: ResolvedRun, links: Sequence[LinkConfig]) -> int:
     """Number of packets until one makes up for a lost packet: the next one, or the next key frame."""
-    packet = config.packet
+    packet = config.effective_packet
     waits = packet.packets == "delta" and not packet.acknowledge and any(link.mean_loss > 0.0 for link in links)
     return packet.key_frame_every if waits else 1
 
 
 def _sources_in_turn(config: ResolvedRun) -> int:
     """Number of ticks in which each robot's evidence is first in a budget once; 1 where evidence does not share one."""
-    takes_turns = config.consensus.traits.exchanges is Exchanged.EVIDENCE and config.packet.budget is not None
+    takes_turns = config.consensus.traits.exchanges is Exchanged.EVIDENCE and config.effective_packet.budget is not None
     return len(config.robots) if takes_turns else 1
 
 

@@ -20,8 +20,25 @@ def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
         return (rule.warning,)
     if not rule.needs_symmetric_links:
         return ()
+    return (*_flow_warnings(config), *_sum_warnings(config, ids, is_symmetric))
+
+
+def _flow_warnings(config: ResolvedRun) -> tuple[str, ...]:
+    """Sentence on flows between maps that packets do not hold exactly."""
+    if not config.effective_flow_bits or config.has_exact_packets:
+        return ()
+    sentence = (
+        f"flow_bits {config.effective_flow_bits} with packets that do not hold the maps exactly: the maps do not come"
+        " to rest; leave flow_bits out, or use content 'float32' without top_classes, budget and prune_tolerance"
+    )
+    return (sentence,)
+
+
+def _sum_warnings(config: ResolvedRun, ids: Sequence[str], is_symmetric: bool) -> tuple[str, ...]:
+    """Sentence on the faults of this network by which the team's sum drifts."""
+    rule = config.consensus.traits
     links = [config.link_config(a, b) for a in ids for b in ids if a != b]
-    has_budget = config.packet.budget is not None
+    has_budget = config.effective_packet.budget is not None
     has_restarts = any(entry.robots_off for entry in config.network.schedule)
     causes = {
         "links that do not carry the same both ways": not is_symmetric,
@@ -39,7 +56,7 @@ def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
         for other in RULES.values()
         if other.survives_losses
         and (other.survives_restarts or not has_restarts)
-        and (config.packet.packets in other.packets or not has_budget)
+        and (config.effective_packet.packets in other.packets or not has_budget)
     ]
     sentence = (
         f"rule '{rule.name}' keeps the team's sum only when both ends of a link receive a map in the same tick; with"

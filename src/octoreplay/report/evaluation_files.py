@@ -28,14 +28,14 @@ OVER_ROBOTS: dict[str, Callable[[Sequence[float]], float]] = {
 def evaluation_csv(evaluation: Evaluation) -> str:
     """Return an evaluation as CSV text: at each stored tick one row per map and three for the team.
 
-    ``kind`` is ``robot`` or ``central``, or ``mean``, ``least`` or ``largest`` over the robots for the team. The other
-    columns have the names of the records' fields, with ``iou.<class>`` for each class. Numbers have full precision;
-    missing values are empty.
+    ``kind`` is ``robot`` or ``central``, or ``mean``, ``least`` or ``largest`` over the robots for the team.
+    ``map_kind`` is the form of the maps that was scored. The other columns have the names of the records' fields, with
+    ``iou.<class>`` for each class. Numbers have full precision; missing values are empty.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     classes = (f"iou.{name}" for name in evaluation.class_names)
-    writer.writerow(["tick", "seconds", *_TICK_COLUMNS, "kind", "robot_id", "is_active", *SCORES, *classes])
+    writer.writerow(["tick", "seconds", *_TICK_COLUMNS, "kind", "robot_id", "is_active", "map_kind", *SCORES, *classes])
     for tick in evaluation.ticks:
         for kind, robot_id, is_active, numbers, iou in _rows(evaluation, tick):
             cells = (
@@ -44,6 +44,7 @@ def evaluation_csv(evaluation: Evaluation) -> str:
                 kind,
                 robot_id,
                 is_active,
+                evaluation.map_kind,
                 *numbers,
                 *iou,
             )

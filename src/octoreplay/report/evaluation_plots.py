@@ -30,7 +30,7 @@ def write_evaluation_figures(evaluation: Evaluation, folder: Path) -> list[Path]
         figures["coverage.png"] = _curves(
             "Coverage of the surface observed by the team", "coverage", evaluation.ticks, "coverage"
         )
-        figures["calibration.png"] = _calibration_figure(evaluation.ticks)
+        figures["calibration.png"] = _calibration_figure(evaluation)
     return save_figures(figures, folder)
 
 
@@ -54,11 +54,11 @@ def _curves(title: str, y_label: str, ticks: Sequence[EvaluatedTick], name: str)
     return _finished(figure, axes)
 
 
-def _calibration_figure(ticks: Sequence[EvaluatedTick]) -> Figure:
-    """Figure of the expected calibration error of h, of N h and of the centralised map."""
+def _calibration_figure(evaluation: Evaluation) -> Figure:
+    """Figure of the expected calibration error of the robots' maps and of the centralised map."""
+    ticks = evaluation.ticks
     figure, [axes] = over_log_time("Expected calibration error", ["error"])
-    _draw_robots(axes, ticks, "calibration_error", BLUE, "robots' maps, h")
-    _draw_robots(axes, ticks, "team_calibration_error", GREEN, "team posterior, N h")
+    _draw_robots(axes, ticks, "calibration_error", BLUE, f"robots' maps, {evaluation.map_kind}")
     _draw_central(axes, ticks, "calibration_error", ORANGE, "centralised map")
     return _finished(figure, axes)
 

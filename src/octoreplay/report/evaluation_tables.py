@@ -11,7 +11,7 @@ from rich.text import Text
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation
 from octoreplay.mapping.contradiction import contradicting_pairs
-from octoreplay.records import CENTRAL
+from octoreplay.records import CENTRAL, MEAN, POSTERIOR
 from octoreplay.report.evaluation_files import OVER_ROBOTS
 from octoreplay.report.tables import (
     number,
@@ -20,6 +20,9 @@ from octoreplay.report.tables import (
     styled_table,
     worst_pair,
 )
+
+_KINDS = {POSTERIOR: "posterior of the team", MEAN: "mean of the team"}
+"""Phrase for each form of the maps."""
 
 MAX_ROBOT_COLUMNS = 6
 """Largest team with one column per robot in the table of classes."""
@@ -32,8 +35,7 @@ _TRUTH_COLUMNS = {
     "free\nfound": "free_accuracy", "coverage": "coverage", "of the\nworld": "world_coverage",
 }  # fmt: skip
 _CALIBRATION_COLUMNS = {
-    "ECE of h\nall": "calibration_error", "\noccupied": "calibration_error_occupied",
-    "of N h\nall": "team_calibration_error", " \noccupied": "team_calibration_error_occupied",
+    "ECE\nall": "calibration_error", "\noccupied": "calibration_error_occupied",
 }  # fmt: skip
 
 
@@ -42,7 +44,10 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
     final = evaluation.final
     # Titles are lines of their own, since a table folds its title to its width.
     parts: list[RenderableType] = [
-        _title(f"Maps {final.seconds:.1f} s after the start, agreement with {_reference(evaluation)}"),
+        _title(
+            f"Maps {final.seconds:.1f} s after the start ({_KINDS[evaluation.map_kind]}), agreement with"
+            f" {_reference(evaluation)}"
+        ),
         _maps_table(final),
         f"cells with different labels: {share(final.label_disagreement)}",
         f"contradiction of evidence, worst pair: {worst_pair(final.pairs, 'contradiction')}",
@@ -53,7 +58,6 @@ def evaluation_tables(evaluation: Evaluation) -> RenderableType:
         parts += ["", pairs_table(final.pairs)]
     if evaluation.truth is not None:
         parts += ["", _title(f"Against {evaluation.truth}"), _truth_table(final)]
-        parts += ["h: the map; N h: the team posterior h_0 + N (h - h_0) (docs/evaluation.md)"]
         parts += ["", _title("IoU of the classes"), _classes_table(evaluation)]
     if len(evaluation.ticks) > 1:
         parts += ["", _title("Over time, mean over the robots"), _times_table(evaluation)]
@@ -120,8 +124,7 @@ def _times_table(evaluation: Evaluation) -> Table:
     table = styled_table("")
     columns = {"agreement\nall cells": "agreement", "\noccupied": "agreement_occupied"}
     if evaluation.truth is not None:
-        columns |= {"mean IoU": "mean_iou", "coverage": "coverage", "ECE of h": "calibration_error",
-                    "of N h": "team_calibration_error"}  # fmt: skip
+        columns |= {"mean IoU": "mean_iou", "coverage": "coverage", "ECE": "calibration_error"}
     for heading in ("time", "different\nlabels", *columns):
         table.add_column(heading, justify="right", no_wrap=True)
     if evaluation.truth is not None:

@@ -194,11 +194,10 @@ def _noise(found: Tables) -> dict[str, Figure]:
             calibration, rows, kind, "central_calibration_error_occupied", 1.0, _RULE_COLORS["central"], "centralised"
         )
         for (rule,), part in groups(rows, "rule").items():
-            color, exchanges = _RULE_COLORS[rule], RULES[rule].exchanges is not Exchanged.NOTHING
+            color = _RULE_COLORS[rule]
             _line(iou, part, kind, "mean_iou", 1.0, color, rule)
-            quantity = "team_calibration_error_occupied" if exchanges else "calibration_error_occupied"
-            _line(calibration, part, kind, quantity, 1.0, color, f"{rule}, N h" if exchanges else rule)
-            if exchanges:
+            _line(calibration, part, kind, "calibration_error_occupied", 1.0, color, rule)
+            if RULES[rule].exchanges is not Exchanged.NOTHING:
                 _line(change, part, kind, "repaired", 1.0, color, f"{rule}: corrected")
                 _line(change, part, kind, "spread", 1.0, color, f"{rule}: made wrong")
                 change.lines[-1].set_linestyle("--")

@@ -172,7 +172,7 @@ def _noise(found: Tables) -> Iterator[str]:
         Column("wrong before", _percent("wrong")),
         Column("corrected", _percent("repaired")),
         Column("made wrong", _percent("spread")),
-        Column("calibration error, h / N h", _pair("calibration_error_occupied", "team_calibration_error_occupied")),
+        Column("calibration error", _share("calibration_error_occupied", 3)),
         Column("centralised mean IoU", _share("central_mean_iou", 3)),
     )
     for kind in NOISES:

@@ -10,7 +10,17 @@ from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results import ply
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import BoolArray, ClassTable, Float64Array, FloatArray, LeafTable, UInt8Array
+from octoreplay.records import (
+    MAP_KINDS,
+    MEAN,
+    POSTERIOR,
+    BoolArray,
+    ClassTable,
+    Float64Array,
+    FloatArray,
+    LeafTable,
+    UInt8Array,
+)
 from octoreplay.result import Result, StoredMap, open_result
 
 COLORS = ("label", "robot", "disagreement", "probability")
@@ -27,7 +37,7 @@ _RAMP = np.array(
 
 def export_ply(
     result_path: Path, output: Path, robot: str | None = None, at: float | None = None, what: str = "points",
-    color: str = "label", *, free: bool = False, team_posterior: bool = False,
+    color: str = "label", *, free: bool = False, map_kind: str = POSTERIOR,
 ) -> int:  # fmt: skip
     """Write a map of a result as a PLY file and return the number of leaves in it.
 
@@ -51,13 +61,14 @@ def export_ply(
           in the file, yellow (an unknown cell counts as the prior)
     free : bool
         True to write free leaves too.
-    team_posterior : bool
-        True for labels and probabilities of h_0 + N (h - h_0).
+    map_kind : str
+        'posterior' for labels and probabilities of the team's posterior h_0 + N (h - h_0), 'mean' for those of h
+        (``StoredMap``); the disagreement is that of h.
 
     Raises
     ------
     ConfigError
-        ``what`` or ``color`` is unknown.
+        ``what``, ``color`` or ``map_kind`` is unknown.
     InputError
         The result cannot be read, has no such map, or has maps in several frames that the options put together.
     OutputError
@@ -67,6 +78,8 @@ def export_ply(
         raise ConfigError(f"what: '{what}' is not one of points, voxels")
     if color not in COLORS:
         raise ConfigError(f"color: '{color}' is not one of {', '.join(COLORS)}")
+    if map_kind not in MAP_KINDS:
+        raise ConfigError(f"map: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
     with open_result(result_path) as result:
         at_ns = None if at is None else result.time_ns(at)
         together = robot is None and color == "robot"
@@ -74,9 +87,9 @@ def export_ply(
         shown = [result.map(robot_id, at_ns=at_ns) for robot_id in chosen]
         if together or color in _OF_ALL_ROBOTS:
             _check_one_frame(result, at_ns)
-        leaves = _leaves(shown, team_posterior, free)
+        leaves = _leaves(shown, map_kind, free)
         colors, scale = _colors(result, shown, leaves, color, at_ns)
-        comments = _comments(result, shown, color, scale, team_posterior)
+        comments = _comments(result, shown, color, scale, map_kind)
     write = ply.write_voxels if what == "voxels" else ply.write_points
     write(output, leaves, colors, comments)
     return len(leaves)
@@ -93,9 +106,9 @@ def _check_one_frame(result: Result, at_ns: int | None) -> None:
         )
 
 
-def _leaves(maps: list[StoredMap], team_posterior: bool, free: bool) -> LeafTable:
+def _leaves(maps: list[StoredMap], map_kind: str, free: bool) -> LeafTable:
     """Leaves of some maps; a leaf of several maps is taken from the first one."""
-    tables = [stored.leaves(team_posterior=team_posterior) for stored in maps]
+    tables = [stored.leaves(map_kind=map_kind) for stored in maps]
     centers = np.concatenate([table.centers for table in tables])
     sizes = np.concatenate([table.sizes for table in tables])
     log_odds = np.concatenate([table.log_odds for table in tables])
@@ -124,7 +137,7 @@ def _colors(
     ids = {stored.robot_id: stored for stored in shown}
     maps = [ids.get(robot_id) or result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
     if color == "robot":
-        known = np.column_stack([stored.query(leaves.centers).known for stored in maps])
+        known = np.column_stack([stored.query(leaves.centers, map_kind=MEAN).known for stored in maps])
         return _robot_colors(known), ", ".join(f"{m.robot_id} {_robot_color(i)}" for i, m in enumerate(maps))
     values = _disagreement(shown[0], maps, leaves.centers)
     largest = float(values.max(initial=0.0))
@@ -152,11 +165,12 @@ def _robot_colors(known: BoolArray) -> UInt8Array:
 
 def _disagreement(own: StoredMap, maps: list[StoredMap], points: Float64Array) -> FloatArray:
     """Largest distance (P,) float64 between one robot's log-odds and another's at points."""
-    h = own.query(points).log_odds.astype(np.float64)
+    h = own.query(points, map_kind=MEAN).log_odds.astype(np.float64)
     largest = np.zeros(len(points))
     for other in maps:
         if other is not own:
-            np.maximum(largest, np.linalg.norm(other.query(points).log_odds - h, axis=1), out=largest)
+            difference = other.query(points, map_kind=MEAN).log_odds - h
+            np.maximum(largest, np.linalg.norm(difference, axis=1), out=largest)
     return largest
 
 
@@ -167,15 +181,15 @@ def _ramp(values: FloatArray) -> UInt8Array:
     return np.rint(np.column_stack([np.interp(place, steps, _RAMP[:, k]) for k in range(3)])).astype(np.uint8)
 
 
-def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, team_posterior: bool) -> list[str]:
+def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, map_kind: str) -> list[str]:
     """Comments of the file: map, time, classes and colours."""
     last = shown[0]
     names = ", ".join(f"{c.class_id} {c.name}" for c in result.class_table.classes)
-    evidence = "team posterior h_0 + N (h - h_0)" if team_posterior else "the robot's own h"
+    kinds = ", ".join(dict.fromkeys(stored.title(map_kind) for stored in shown))
     when = f"tick {last.tick}, {result.seconds(last.stamp_ns):g} s after the start"
     lines = [
         f"octoreplay map of {', '.join(stored.robot_id for stored in shown)} at {when}",
-        f"resolution {last.resolution:g} m, N = {last.num_robots} robots, log-odds: {evidence}",
+        f"resolution {last.resolution:g} m, log-odds: {kinds}",
         f"frame: {last.frame_id}",
         f"classes: 0 free, {names}",
         f"color: {color} ({scale})",

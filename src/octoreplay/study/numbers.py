@@ -30,9 +30,8 @@ _SCORES = (
     "mean_iou", "mean_iou_known", "coverage", "world_coverage", "occupied_accuracy", "free_accuracy",
     "calibration_error", "calibration_error_occupied",
 )  # fmt: skip
-_TEAM_SCORES = ("team_calibration_error", "team_calibration_error_occupied")
 
-TRUTH_COLUMNS = (*_SCORES, *_TEAM_SCORES, "mean_iou_least", *(f"central_{name}" for name in _SCORES))
+TRUTH_COLUMNS = (*_SCORES, "mean_iou_least", *(f"central_{name}" for name in _SCORES))
 """Additional columns if the ground truth is known."""
 
 TIMING_COLUMNS = ("wall_seconds", "realtime_factor", "peak_rss_bytes")
@@ -90,7 +89,7 @@ def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
     final = evaluation.final
     central = final.central
     return {
-        **{name: final.mean(name) for name in (*_SCORES, *_TEAM_SCORES)},
+        **{name: final.mean(name) for name in _SCORES},
         "mean_iou_least": final.least("mean_iou"),
         **{f"central_{name}": math.nan if central is None else central.score(name) for name in _SCORES},
     }

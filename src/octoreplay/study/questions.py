@@ -46,7 +46,7 @@ def rules(duration: float, num_villages: int) -> Experiment:
         f"rule+evidence+gamma+gamma_power={','.join(variants)}",
         "topology=complete,ring,line,range",
     )
-    settings = {"radio_range": RADIO_RANGE, **_FINAL_STATES}
+    settings = {"radio_range": RADIO_RANGE, "packets": "full", **_FINAL_STATES}
     return Experiment(teams, (Plan("rules", tuple(teams), vary, settings),))
 
 
@@ -65,7 +65,7 @@ def steps(duration: float, num_villages: int) -> Experiment:
                 "steps",
                 tuple(teams),
                 ("rule=gradient,natural", "epsilon=0.1,0.2,0.35,0.5,0.7", "gamma=0.05,0.1,0.25,0.5,1,1.5"),
-                {"topology": "ring", **_SHORT_SETTLING, **_FINAL_STATES},
+                {"topology": "ring", "packets": "full", **_SHORT_SETTLING, **_FINAL_STATES},
             ),
             Plan(
                 "bound",
@@ -105,7 +105,7 @@ def scale(duration: float, num_villages: int) -> Experiment:
                 "robots",
                 robots,
                 ("topology+resolution=complete+0.3,nearest+0.3,nearest+0.2,nearest+0.1",),
-                {"num_nearest": 3},
+                {"num_nearest": 3, "rule": "gradient"},
             ),
             _timed("resolution", six, (f"resolution={resolutions}", "rule=gradient,bayes"), {}),
             _timed("classes", classes, ("rule=gradient,bayes",), {}),
@@ -129,7 +129,7 @@ def noise(duration: float, num_villages: int) -> Experiment:
         "noise",
         tuple(teams),
         ("rule=local,gradient,bayes",),
-        _FINAL_STATES,
+        {"packets": "full", **_FINAL_STATES},
         keep=True,
         extra_columns=_noise_and_repairs,
     )
@@ -183,7 +183,7 @@ def _timed(
         name,
         tuple(teams),
         vary,
-        {**settings, "settle": 0, **_FINAL_STATES},
+        {**settings, "packets": "full", "settle": 0, **_FINAL_STATES},
         has_truth=False,
         num_threads=2,
         extra_columns=_sizes,

@@ -4,7 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.packets import PacketConfig
+from octoreplay.config.parameters import PARAMETERS
+from octoreplay.config.team_file import dump_team
 from octoreplay.errors import InputError
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages import ros_types
@@ -12,6 +17,9 @@ from octoreplay.io.messages.ros_types import message, time_message
 from octoreplay.io.results import result_writer
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
+from octoreplay.mapping.codec import encode_packet
+from octoreplay.result import open_result
+from support.octree_factory import octree_of
 from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
 
 
@@ -71,9 +79,14 @@ def test_a_result_of_an_older_version_has_no_pairs_and_no_evidence(
             reader.states("central", evidence=True)
 
 
-def _write_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, change: Callable[[str], str]) -> Path:
-    """Write a result whose definition of the metrics is changed."""
-    name = "octoreplay_msgs/msg/TickMetrics"
+def _write_with(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    change: Callable[[str], str],
+    name: str = "octoreplay_msgs/msg/TickMetrics",
+    fill: Callable[[ResultWriter], None] | None = None,
+) -> Path:
+    """Write a result with a changed definition of a message."""
     changed = {**ros_types.OCTOREPLAY_MSGS, name: change(ros_types.OCTOREPLAY_MSGS[name])}
     make_message = result_writer.message
 
@@ -86,7 +99,7 @@ def _write_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, change: Callabl
         patch.setattr(ros_types, "OCTOREPLAY_MSGS", changed)
         patch.setattr(result_writer, "message", message)
         ros_types.typestore.cache_clear()
-        path = write_result(tmp_path)
+        path = write_result(tmp_path, fill)
     ros_types.typestore.cache_clear()
     return path
 
@@ -101,6 +114,43 @@ def test_a_result_of_an_older_version_has_no_published_distance(
     assert [dataclasses.replace(tick, total_distance_published=0.0) for tick in metrics] == [
         dataclasses.replace(tick, total_distance_published=0.0) for tick in METRICS
     ]
+
+
+def test_states_of_an_older_version_do_not_name_the_number_of_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(writer: ResultWriter) -> None:
+        for write in (writer.write_state, writer.write_evidence):
+            write(state("alpha", 0, 1, encode_packet(octree_of({(0, 0, 0): (1.0, 2.0)})), key=True))
+        writer.write_state(state("central", 0, 1, encode_packet(octree_of({})), key=True))
+
+    name = "octoreplay_msgs/msg/MapState"
+    path = _write_with(monkeypatch, tmp_path, lambda text: text.replace("uint32 num_robots\n", ""), name, fill)
+    with ResultReader(path) as reader:
+        assert [one.num_robots for one in reader.states("alpha")] == [None]
+    with open_result(path) as result:
+        assert [result.map("alpha").num_robots, result.map("central").num_robots] == [2, 1]
+        assert result.evidence("alpha").num_robots == 1
+
+
+def test_a_result_names_every_parameter_and_older_ones_had_other_defaults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = team(tmp_path).with_parameters({"rule": "gradient", "packets": "full", "flow_bits": 4})
+    path = tmp_path / "out.mcap"
+    for with_defaults in (True, False):
+        with monkeypatch.context() as patch:
+            if not with_defaults:
+                older = dataclasses.replace(config, consensus=ConsensusConfig(), packet=PacketConfig())
+                text = dump_team(older, tmp_path)
+                patch.setattr(result_writer, "dump_team", lambda *_, text=text, **__: text)
+            with ResultWriter(path, config) as writer:
+                writer.complete(summary(METRICS))
+        with ResultReader(path) as reader:
+            assert (reader.config.consensus, reader.config.packet) == (config.consensus, config.packet)
+        if with_defaults:
+            stored = yaml.safe_load(reader._metadata["config"]["team_file"])
+            assert set(PARAMETERS) <= set(stored)
 
 
 def test_a_definition_that_no_version_wrote_is_damage() -> None:
@@ -118,7 +168,10 @@ def test_a_definition_that_no_version_wrote_is_damage() -> None:
 
 
 def test_numbers_of_the_configuration_are_read_exactly(tmp_path: Path) -> None:
-    values = {"resolution": 0.1 + 0.2, "miss": -1 / 3, "prob_free": 0.7, "bounds": (-1.5, 1e-3), "settle_max": 7}
+    values = {
+        "resolution": 0.1 + 0.2, "miss": -1 / 3, "quantum": 0.0, "prob_free": 0.7, "bounds": (-1.5, 1e-3),
+        "settle_max": 7,
+    }  # fmt: skip
     config = team(tmp_path).with_parameters(values)
     with ResultWriter(tmp_path / "out.mcap", config) as writer:
         writer.complete(summary(METRICS))

@@ -23,7 +23,7 @@ NUM_BRICKS = 6
 
 DELTA = PacketConfig(packets="delta")
 CONFIGS = {
-    "full": PacketConfig(),
+    "full": PacketConfig(packets="full"),
     "delta": DELTA,
     "key frames": PacketConfig(packets="delta", acknowledge=False, key_frame_every=4),
     "broadcast": PacketConfig(packets="delta", cast="broadcast"),
@@ -187,7 +187,7 @@ def test_a_delta_holds_the_changes_since_the_acknowledged_version():
 
 
 def test_a_map_is_not_sent_back_to_its_sender():
-    exchanges = [Exchange(PacketConfig(), PacketCodec(PacketConfig())) for _ in range(2)]
+    exchanges = [Exchange(PacketConfig(packets="full"), PacketCodec(PacketConfig(packets="full"))) for _ in range(2)]
     source = Source(7, 0)
     exchanges[0].hold(source, HeldMap(octree_of({(0, 0, 0): [1.0, 2.0]}), 3))
     ((_, message),) = exchanges[0].outbox([1], [source], keep_alive=False)
@@ -286,6 +286,6 @@ def test_a_map_forwarded_in_parts_is_complete_after_a_late_acknowledgement():
 
 def test_a_budget_needs_acknowledged_deltas():
     with pytest.raises(ConfigError, match="budget: goes with packets 'delta'"):
-        PacketConfig(budget=1000)
+        PacketConfig(packets="full", budget=1000)
     with pytest.raises(ConfigError, match="budget: goes with acknowledge"):
         PacketConfig(packets="delta", acknowledge=False, budget=1000)

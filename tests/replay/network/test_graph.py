@@ -11,7 +11,7 @@ import pytest
 
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import NetworkConfig, ScheduleEntry
-from octoreplay.replay.network.graph import build_graph, step_size
+from octoreplay.replay.network.graph import TeamNetwork, build_graph, step_size, step_weights_of
 from octoreplay.replay.settling import settle_ticks_max
 from support.team_graphs import NAMES, built, directed, edges_of, nowhere, pairs_of, team_of
 
@@ -261,3 +261,26 @@ def test_importing_the_module_does_not_import_networkx():
     code = "import sys, octoreplay.replay.network.graph; print('networkx' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_robots_reach_others_over_robots_in_between_and_in_the_direction_of_the_links():
+    a, b, c, d, e, _ = NAMES[:6]
+    edges = ((a, b, None), (b, c, None), (d, e, None))
+    network = NetworkConfig(topology="edges", edges=edges, one_way=((a, b), (c, b)))
+    graph = TeamNetwork(network, ConsensusConfig(), NAMES[:6]).at(0.0, [True] * 6, nowhere(6))
+    # Robot b receives from a and c, which receive nothing.
+    assert graph.num_reaching.tolist() == [1, 3, 1, 2, 2, 1]
+    both_ways = TeamNetwork(NetworkConfig(topology="edges", edges=edges), ConsensusConfig(), NAMES[:6])
+    assert both_ways.at(0.0, [True] * 6, nowhere(6)).num_reaching.tolist() == [3, 3, 3, 2, 2, 1]
+    part = TeamNetwork(network, ConsensusConfig(), NAMES[:6]).at(
+        0.0, [True, False, True, True, True, False], nowhere(6)
+    )
+    assert part.num_reaching.tolist() == [1, 1, 1, 2, 2, 1]
+
+
+def test_a_constant_weight_of_received_maps_replaces_those_of_the_graph():
+    graph = built(3, "line")
+    np.testing.assert_allclose(step_weights_of(graph, ConsensusConfig(rule="merge")), graph.weights)
+    constant = step_weights_of(graph, ConsensusConfig(rule="merge", merge_weight=0.25))
+    assert constant.tolist() == [[0.0, 0.25, 0.0], [0.25, 0.0, 0.25], [0.0, 0.25, 0.0]]
+    np.testing.assert_allclose(step_weights_of(graph, ConsensusConfig(merge_weight=0.25)), graph.weights)

@@ -24,6 +24,8 @@ uint32 tick
 uint32 sequence
 uint32 base_sequence
 bool is_key_frame
+# N, the number of robots of whose evidence the map is the mean; 1 where it is no mean.
+uint32 num_robots
 uint8[] data
 """,
     "octoreplay_msgs/msg/Packet": """\

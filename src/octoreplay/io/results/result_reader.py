@@ -236,7 +236,10 @@ class ResultReader:
     def _read_config(self) -> RunConfig:
         """Parse the stored configuration."""
         try:
-            return parse_team(self._metadata["config"]["team_file"], name=str(self.path), folder=self.path.parent)
+            return parse_team(
+                self._metadata["config"]["team_file"], name=str(self.path), folder=self.path.parent,
+                defaults={**_FORMER_DEFAULTS, "rule": self.description["rule"]},
+            )  # fmt: skip
         except (ConfigError, KeyError) as error:
             raise InputError(f"{self.path}: damaged: its configuration cannot be read: {error}") from error
 
@@ -276,6 +279,9 @@ class ResultReader:
         except _DAMAGE as error:
             raise InputError(f"{self.path}: damaged at topic '{topics[0]}': {error}") from error
 
+
+_FORMER_DEFAULTS = {"packets": "full", "flow_bits": 4}
+"""Parameters of results that do not name all of them, and were written before these defaults changed."""
 
 _DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
 """Exceptions raised by reading a damaged file."""
@@ -334,6 +340,7 @@ def _map_state(value: Any) -> MapState:
         is_key_frame=bool(value.is_key_frame),
         data=value.data.tobytes(),
         frame_id=value.header.frame_id,
+        num_robots=getattr(value, "num_robots", None),
     )
 
 

@@ -153,7 +153,7 @@ class ResultWriter:
         value = message(
             type_name, header=header(state.stamp_ns, state.frame_id), robot_id=state.robot_id, tick=state.tick,
             sequence=state.sequence, base_sequence=state.base_sequence, is_key_frame=state.is_key_frame,
-            data=np.frombuffer(state.data, dtype=np.uint8),
+            num_robots=state.num_robots, data=np.frombuffer(state.data, dtype=np.uint8),
         )  # fmt: skip
         self._writer.write(topic, type_name, value, state.stamp_ns)
 
@@ -333,9 +333,8 @@ class ResultWriter:
                 "rule": config.consensus.rule,
             },
         )
-        self._writer.write_metadata(
-            "config", {"team_file": dump_team(dataclasses.replace(config, robots=robots), folder)}
-        )
+        used = dataclasses.replace(config, robots=robots, sensor=config.effective_sensor)
+        self._writer.write_metadata("config", {"team_file": dump_team(used, folder, with_defaults=True)})
         classes = [{"id": 0, "name": "free", "color": None}]
         classes += [{"id": c.class_id, "name": c.name, "color": list(c.color)} for c in self._class_table.classes]
         self._writer.write_metadata("classes", {"classes": json.dumps(classes)})

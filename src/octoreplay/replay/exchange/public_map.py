@@ -48,8 +48,8 @@ class PublicMap:
     """
 
     def __init__(self, config: ResolvedRun, packet_codec: PacketCodec, source: Source) -> None:
-        self.is_exact = config.packet.is_exact and config.map.prune_tolerance == 0
-        self._packet = config.packet
+        self.is_exact = config.has_exact_packets
+        self._packet = config.effective_packet
         self._tolerance = config.map.prune_tolerance
         self._packet_codec = packet_codec
         self._source = source

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.network import POSITION_TOPOLOGIES, NetworkConfig
 from octoreplay.errors import ConfigError
-from octoreplay.records import BoolArray, Float64Array, read_only
+from octoreplay.records import BoolArray, Float64Array, Int64Array, read_only
 from octoreplay.replay.network.schedule import Availability, Schedule
 from octoreplay.replay.network.topology import Topology
 
@@ -61,6 +61,17 @@ class CommunicationGraph:
     def degree(self, robot_index: int) -> int:
         """Number of robots that send to a robot."""
         return len(self._senders[robot_index])
+
+    @cached_property
+    def num_reaching(self) -> Int64Array:
+        """Number (N,) of robots whose maps reach each robot, directly or over others; itself counts."""
+        reaches = np.eye(len(self.robot_ids), dtype=bool)
+        for link in self.links:
+            reaches[link] = True
+        for middle in range(len(self.robot_ids)):
+            reaches |= reaches[:, middle, None] & reaches[middle]
+        counts: Int64Array = reaches.sum(axis=0)
+        return counts
 
     @cached_property
     def is_symmetric(self) -> bool:
@@ -223,6 +234,17 @@ def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
             f" '{graph.network.weights}'); use {0.9 * graph.epsilon_bound:.3g} or leave epsilon out"
         )
     return consensus.epsilon
+
+
+def step_weights_of(graph: CommunicationGraph, consensus: ConsensusConfig) -> Float64Array:
+    """Weights (N, N) float64 of the maps in an iteration: 2 epsilon A_ij, or ``merge_weight`` on every link.
+
+    Row i holds the weights at robot i. Raises ConfigError as ``step_size``.
+    """
+    if consensus.merge_weight is not None and not consensus.traits.mixes_differences:
+        constant: Float64Array = np.where(graph.weights > 0.0, consensus.merge_weight, 0.0)
+        return constant
+    return 2.0 * step_size(graph, consensus) * graph.weights
 
 
 def check_team_graph(network: NetworkConfig, consensus: ConsensusConfig, robot_ids: Sequence[str]) -> None:

@@ -28,7 +28,7 @@ class ConsensusRobot(Robot):
         self._update = update
         self._public = PublicMap(config, packet_codec, self.source)
         self._published: HeldMap | None = None
-        self._has_budget = config.packet.budget is not None
+        self._has_budget = config.effective_packet.budget is not None
         self._used: dict[Source, int] = {}
         self._last_step_tick = -1
         self._last_conditions: tuple[object, ...] = ()
@@ -107,7 +107,7 @@ class ConsensusRobot(Robot):
             base = self._published_octree(tick) if keeps_sum or not self._public.is_exact else None
             step = self._step([arrival], step_weights, phase, gamma, base, tick)
             team_step(
-                [step], update=self._update, revision=tick, clamp=self._config.sensor.clamp,
+                [step], update=self._update, revision=tick, clamp=self._config.effective_sensor.clamp,
                 quantum=quantum_in(self._config, phase),
             )  # fmt: skip
             self._finish_step(tick)
@@ -150,7 +150,7 @@ class ConsensusRobot(Robot):
 
     def _flows(self, arrived: Sequence[Arrival], phase: Phase, tick: int) -> Flows | None:
         """Flows of the mutual links; None for a rule or a run without flows."""
-        bits = self._config.consensus.effective_flow_bits
+        bits = self._config.effective_flow_bits
         if not bits:
             return None
         return Flows(bits + phase.extra_flow_bits, [self._is_mutual(arrival, tick) for arrival in arrived])
@@ -203,8 +203,8 @@ class ConsensusTeam(Team[ConsensusRobot]):
 
     def iterate(self, turns: Sequence[Turn[ConsensusRobot]], phase: Phase, tick: int, threads: Executor) -> list[float]:
         """One iteration per robot, all robots brick by brick; in mode 'on-arrival' one iteration per arrived map."""
-        consensus, clamp = self._config.consensus, self._config.sensor.clamp
-        turns = [dataclasses.replace(turn, arrived=_from_neighbours(turn)) for turn in turns]
+        consensus, clamp = self._config.consensus, self._config.effective_sensor.clamp
+        turns = [dataclasses.replace(turn, arrived=self._chosen(turn, tick)) for turn in turns]
         is_sync = consensus.mode == "sync"
         together = [turn for turn in turns if is_sync or not turn.arrived]
         alone = [turn for turn in turns if not is_sync and turn.arrived]
@@ -221,6 +221,17 @@ class ConsensusTeam(Team[ConsensusRobot]):
         return changes + list(
             threads.map(lambda t: t.robot.iterate_on_arrival(t.arrived, t.step_weights, phase, tick), alone)
         )
+
+    def _chosen(self, turn: Turn[ConsensusRobot], tick: int) -> list[Arrival]:
+        """Arrivals that an iteration uses: those from neighbours, or ``merge_maps`` of their newest ones in turn."""
+        arrived, most = _from_neighbours(turn), self._config.consensus.merge_maps
+        if most is None or self._config.consensus.traits.mixes_differences:
+            return arrived
+        newest = {arrival.source: arrival for arrival in arrived}
+        sources = sorted(newest)
+        first = tick * most
+        chosen = {sources[(first + place) % len(sources)] for place in range(min(most, len(sources)))}
+        return [newest[source] for source in sources if source in chosen]
 
 
 def quantum_in(config: ResolvedRun, phase: Phase) -> float:

@@ -135,7 +135,7 @@ class RatioTeam(Team[RatioRobot]):
 
 def _check_range(config: ResolvedRun) -> None:
     """Raise ConfigError where masses could exceed the range of the sums."""
-    sensor = config.sensor
+    sensor = config.effective_sensor
     numbers = [sensor.clamp_min, sensor.clamp_max]
     if config.consensus.evidence != "sum":
         numbers = [sensor.hit, sensor.miss, sensor.hit_other or 0.0]

@@ -135,13 +135,13 @@ class Robot(ABC):
         self.num_scans = 0
         self.num_iterations = 0
         self.T_team_sensor: Float64Array | None = None
-        self.exchange = Exchange(config.packet, packet_codec)
+        self.exchange = Exchange(config.effective_packet, packet_codec)
         self._config = config
-        self._caster = ScanCaster(config.sensor, config.map, num_classes)
-        self._increments = clamped_increments(config.sensor, config.consensus.effective_quantum)
+        self._caster = ScanCaster(config.effective_sensor, config.map, num_classes)
+        self._increments = clamped_increments(config.effective_sensor, config.consensus.effective_quantum)
         self._is_average = config.consensus.evidence != "sum"
         if self._is_average:
-            self._increments = unclamped_increments(config.sensor)
+            self._increments = unclamped_increments(config.effective_sensor)
 
         def octree(classes: int = num_classes) -> SemanticOctree:
             return SemanticOctree(config.map.resolution, classes)
