@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
+from functools import partial
+from typing import Any, Self
 
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
+from octoreplay.errors import OutputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
@@ -26,17 +30,16 @@ STATES_PER_KEY_FRAME = 12
 class _StateSeries:
     """Stored states of some octrees over time: key frames, and deltas with the bricks that changed between them."""
 
-    def __init__(self, write: Callable[[MapState], None], threads: Executor) -> None:
+    def __init__(self, threads: Executor) -> None:
         self.last_tick = -1
-        self._write = write
         self._threads = threads
         self._num_stored = 0
         self._octrees: Sequence[SemanticOctree] = ()
 
-    def store(
+    def encode(
         self, tick: Tick, names: Sequence[str], octrees: Sequence[SemanticOctree], num_robots: Sequence[int]
-    ) -> None:
-        """Store the octrees of one tick, the means of ``num_robots``; ``names`` are the same in all ticks."""
+    ) -> list[MapState]:
+        """Next states: octrees of one tick, the means of ``num_robots``; ``names`` are the same in all ticks."""
         sequence = self._num_stored
 
         def encode(index: int) -> MapState:
@@ -54,15 +57,52 @@ class _StateSeries:
                 num_robots[index],
             )  # fmt: skip
 
-        for state in self._threads.map(encode, range(len(names))):
-            self._write(state)
+        states = list(self._threads.map(encode, range(len(names))))
         self._num_stored += 1
         self._octrees = tuple(octrees)
         self.last_tick = tick.number
+        return states
+
+
+class _WriteQueue:
+    """Calls that one thread makes in their order while the replay goes on.
+
+    An error of a call is raised by the next ``start`` or ``wait``.
+    """
+
+    def __init__(self, threads: Executor) -> None:
+        self._threads = threads
+        self._calls: list[Callable[[], None]] = []
+        self._started: Future[None] | None = None
+
+    def add(self, write: Callable[..., None], *arguments: Any) -> None:
+        """Add a call, whose arguments do not change any more."""
+        self._calls.append(partial(write, *arguments))
+
+    def start(self) -> None:
+        """Wait for the calls before, and start those that were added since."""
+        self.wait()
+        calls, self._calls = self._calls, []
+        self._started = self._threads.submit(_call_all, calls)
+
+    def wait(self) -> None:
+        """Wait for the calls that were started."""
+        started, self._started = self._started, None
+        if started is not None:
+            started.result()
+
+
+def _call_all(calls: Sequence[Callable[[], None]]) -> None:
+    """Make some calls in their order."""
+    for call in calls:
+        call()
 
 
 class Recorder:
-    """Writer of ticks to a result (None: no result) and of their summary; maps are encoded in parallel ``threads``."""
+    """Writer of ticks to a result (None: no result) and of their summary; a context manager.
+
+    Maps are encoded in parallel ``threads``. What a tick writes is compressed and written beside the next tick.
+    """
 
     def __init__(self, config: ResolvedRun, writer: ResultWriter | None, threads: Executor) -> None:
         self.start_ns = 0
@@ -71,9 +111,9 @@ class Recorder:
         self._config = config
         self._writer = writer
         self._threads = threads
-        if writer is not None:
-            self._maps = _StateSeries(writer.write_state, threads)
-            self._evidence = _StateSeries(writer.write_evidence, threads)
+        self._queue = _WriteQueue(threads)
+        self._maps = _StateSeries(threads)
+        self._evidence = _StateSeries(threads)
         self._view_tick = -1
         self._num_averaged = np.ones(len(config.robots), np.int64)
         self._num_settling = 0
@@ -83,6 +123,14 @@ class Recorder:
         self._num_published = 0
         self._sent_bytes = 0
         self._links = LinkTotals()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        # An error on the way out would hide the first one.
+        with contextlib.suppress(OutputError):
+            self._queue.wait()
 
     def frame_warnings(self) -> tuple[str, ...]:
         """Sentences on the frames of the robots with evidence after the last tick; empty before the first tick."""
@@ -101,21 +149,23 @@ class Recorder:
         self._count_averaged(tick.graph)
         if self._writer is None:
             return
-        self._writer.write_metrics(tick.metrics)
-        self._writer.write_poses(tick.stamp_ns, tick.poses)
+        self._queue.add(self._writer.write_metrics, tick.metrics)
+        self._queue.add(self._writer.write_poses, tick.stamp_ns, tick.poses)
         ids = tick.graph.robot_ids
-        self._writer.write_graph(tick.stamp_ns, [(ids[a], ids[b]) for a, b in tick.graph.pairs], tick.poses)
+        links = [(ids[a], ids[b]) for a, b in tick.graph.pairs]
+        self._queue.add(self._writer.write_graph, tick.stamp_ns, links, tick.poses)
         if self._config.output.keep_packets:
             for robot_id, published in zip(ids, tick.published, strict=True):
                 for _, message in published.messages if published else ():
                     data = b"".join(part.data for part in message.parts)
-                    self._writer.write_packet(robot_id, tick.stamp_ns, tick.number, data)
+                    self._queue.add(self._writer.write_packet, robot_id, tick.stamp_ns, tick.number, data)
         if self._is_due(tick, self._config.output.state_every):
-            self._store_maps(tick)
+            self._store_maps(tick, self._writer)
         if self._config.output.evidence_every and self._is_due(tick, self._config.output.evidence_every):
-            self._store_evidence(tick)
+            self._store_evidence(tick, self._writer)
         if self._is_due(tick, self._config.output.view_every):
-            self._write_views(tick)
+            self._write_views(tick, self._writer)
+        self._queue.start()
 
     def finish(
         self,
@@ -133,11 +183,13 @@ class Recorder:
         assert tick is not None
         if self._writer is not None:
             if self._maps.last_tick < tick.number:
-                self._store_maps(tick)
+                self._store_maps(tick, self._writer)
             if self._evidence.last_tick < tick.number:
-                self._store_evidence(tick)
+                self._store_evidence(tick, self._writer)
             if self._view_tick < tick.number:
-                self._write_views(tick)
+                self._write_views(tick, self._writer)
+            self._queue.start()
+            self._queue.wait()
         means = self._bytes / max(self._num_published, 1)
         return RunSummary(
             num_ticks=tick.number + 1,
@@ -194,23 +246,23 @@ class Recorder:
         period_ns = round(self._config.network.publish_period * 1e9)
         return falls_due(tick.stamp_ns - self.start_ns, period_ns, every)
 
-    def _store_maps(self, tick: Tick) -> None:
+    def _store_maps(self, tick: Tick, writer: ResultWriter) -> None:
         """Store all maps, the centralised map included."""
         num_robots = (*self._num_averaged.tolist(), 1)
-        self._maps.store(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle), num_robots)
+        for state in self._maps.encode(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle), num_robots):
+            self._queue.add(writer.write_state, state)
 
-    def _store_evidence(self, tick: Tick) -> None:
+    def _store_evidence(self, tick: Tick, writer: ResultWriter) -> None:
         """Store every robot's evidence."""
-        self._evidence.store(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence))
+        for state in self._evidence.encode(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence)):
+            self._queue.add(writer.write_evidence, state)
 
-    def _write_views(self, tick: Tick) -> None:
+    def _write_views(self, tick: Tick, writer: ResultWriter) -> None:
         """Store every robot's map for viewing."""
-        if self._writer is None:
-            return
 
         def occupied(octree: SemanticOctree) -> LeafTable:
             return octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True)
 
         for robot_id, leaves in zip(tick.graph.robot_ids, self._threads.map(occupied, tick.maps), strict=True):
-            self._writer.write_view(robot_id, tick.stamp_ns, leaves, tick.metrics.frame_of(robot_id))
+            self._queue.add(writer.write_view, robot_id, tick.stamp_ns, leaves, tick.metrics.frame_of(robot_id))
         self._view_tick = tick.number

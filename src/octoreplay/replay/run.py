@@ -69,7 +69,7 @@ def replay_team(
         threads = stack.enter_context(ThreadPoolExecutor(num_threads))
         session = Session(config, team.sources, threads, bodies=bodies, reopen=team.reopen)
         writer = stack.enter_context(ResultWriter(output, config)) if output else None
-        recorder = Recorder(config, writer, threads)
+        recorder = stack.enter_context(Recorder(config, writer, threads))
         total_ns = config.total_ns
         _check_num_ticks(config, total_ns)
         with deferred_interrupts() as deliver_interrupts:
