@@ -16,7 +16,7 @@ import scenes
 from rounds import Report, Row, arguments, measured, pinned
 from scenes import NUM_CLASSES
 
-from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.consensus import FLOW_BITS
 from octoreplay.config.rules import RULES
 from octoreplay.config.sensor import MapConfig, SensorConfig, rounded_sensor
 from octoreplay.mapping.codec import decode_packet, encode_packet
@@ -28,7 +28,6 @@ from octoreplay.records import Frame, Int64Array
 NUM_ROBOTS = 6
 SENSOR = rounded_sensor(SensorConfig(max_range=7.8), RULES["bayes"].default_quantum)
 GAMMA = 0.5
-FLOW_BITS = ConsensusConfig().flow_bits
 BLOCK_EDGE = 8
 """Edge in cells of the blocks in which the share of never-hit space is counted."""
 WARM_TICKS = 3

@@ -15,7 +15,7 @@ from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.kernels.consensus import FIRST_NEIGHBOUR, OWN
 from octoreplay.mapping.kernels.storage import BrickTable
-from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
+from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned, parts_of
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
 
@@ -82,10 +82,6 @@ class Step:
     last_log_likelihood: SemanticOctree | None = None
     since: int | None = None
     flows: Flows | None = None
-
-
-NUM_PARTS = 16
-"""Number of parts of a step in threads."""
 
 
 def team_step(
@@ -178,12 +174,6 @@ def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, Br
     codes = union_codes(octrees, None if any(step.since is None for step in steps) else since)
     columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
     return since, codes, brick_table(octrees, codes, since, run), columns
-
-
-def parts_of(num_bricks: int, threads: Executor | None) -> list[Int64Array]:
-    """Return the positions 0 to ``num_bricks`` - 1 in non-empty parts of consecutive ones: one part without threads."""
-    parts = np.array_split(np.arange(num_bricks), 1 if threads is None else NUM_PARTS)
-    return [part for part in parts if part.size]
 
 
 def _octrees(step: Step) -> list[SemanticOctree]:

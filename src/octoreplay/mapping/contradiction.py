@@ -91,6 +91,8 @@ class EvidenceComparer:
         """
         since = since if self._num_slots else 0
         changed = [np.flatnonzero(octree.revisions >= since) for octree in evidence]
+        if not any(new.size for new in changed):
+            return self._pairs()
         rows = [self._bricks.find_or_add(octree.codes[new]) for octree, new in zip(evidence, changed, strict=True)]
         self._add_slots(rows)
 

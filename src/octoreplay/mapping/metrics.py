@@ -12,7 +12,7 @@ import numpy as np
 from octoreplay.log_odds import TIE_TOLERANCE
 from octoreplay.mapping.kernels import metrics as metrics_kernels
 from octoreplay.mapping.kernels.storage import BRICK_CELLS
-from octoreplay.mapping.octree import SemanticOctree, brick_table, cache_aligned
+from octoreplay.mapping.octree import SemanticOctree, brick_table, cache_aligned, parts_of
 from octoreplay.records import Float64Array, Int32Array, Int64Array
 
 
@@ -31,10 +31,6 @@ class MapComparison:
     entropy_bits: Float64Array
 
 
-NUM_PARTS = 16
-"""Number of parts of a comparison in threads."""
-
-
 class MapComparer:
     """Incremental comparison of N maps and the oracle: only changed bricks are compared again.
 
@@ -47,6 +43,7 @@ class MapComparer:
         self._bricks = SemanticOctree(1.0, 1)
         self._links: Int64Array | None = None
         self._least_tie = 0.0
+        self._result: MapComparison | None = None
         self._distances: Float64Array = np.empty((0, 2))
         self._counts: Int32Array = np.empty((0, 4 + 3 * num_robots), np.int32)
         self._entropies: Float64Array = np.empty((0, num_robots))
@@ -78,13 +75,16 @@ class MapComparer:
             old = getattr(self, name)
             if len(old) < len(stale):
                 setattr(self, name, np.concatenate([old, np.zeros((len(stale) - len(old), old.shape[1]), old.dtype)]))
-        parts = np.array_split(np.flatnonzero(stale), 1 if threads is None else NUM_PARTS)
+        stale_rows = np.flatnonzero(stale)
 
-        def refresh(rows: Int64Array) -> None:
-            self._refresh(maps, oracle, rows, link_ends)
+        def refresh(part: Int64Array) -> None:
+            self._refresh(maps, oracle, stale_rows[part], link_ends)
 
+        parts = parts_of(stale_rows.size, threads)
         list(map(refresh, parts) if threads is None else threads.map(refresh, parts))
-        return self._result()
+        if self._result is None or parts:
+            self._result = self._sum()
+        return self._result
 
     def forget(self) -> None:
         """Compare all bricks at the next call. Needed after a map is replaced by another one."""
@@ -116,7 +116,7 @@ class MapComparer:
             self._entropies,
         )
 
-    def _result(self) -> MapComparison:
+    def _sum(self) -> MapComparison:
         """Sum over all bricks."""
         distances = self._distances.sum(axis=0)
         counts = self._counts.sum(axis=0, dtype=np.int64)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -44,6 +45,9 @@ BRICK_CELLS = storage.BRICK_CELLS
 
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Function that calls another one with each of some items: ``map``, or the ``map`` of an executor."""
+
+NUM_PARTS = 16
+"""Number of parts of work in threads."""
 
 BRICK_ARRAYS = ("codes", "blocks", "values", "masks", "known", "revisions")
 """Names of the arrays with one entry for each brick."""
@@ -311,6 +315,12 @@ def brick_table(octrees: Sequence[SemanticOctree], codes: Int64Array, since: int
 
     list(run(fill, range(len(octrees))))
     return table
+
+
+def parts_of(num_bricks: int, threads: Executor | None) -> list[Int64Array]:
+    """Return the positions 0 to ``num_bricks`` - 1 in non-empty parts of consecutive ones: one part without threads."""
+    parts = np.array_split(np.arange(num_bricks), 1 if threads is None else NUM_PARTS)
+    return [part for part in parts if part.size]
 
 
 def code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int64Array:

@@ -29,13 +29,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.mapping.consensus import expand_to_columns, parts_of, union_codes
+from octoreplay.mapping.consensus import expand_to_columns, union_codes
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import running_sums as kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.kernels.running_sums import MODULUS, SOURCE, TARGET
 from octoreplay.mapping.kernels.storage import BrickTable
-from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned
+from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned, parts_of
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
 Arrival = tuple[SemanticOctree, SemanticOctree | None]

@@ -53,7 +53,7 @@ class PublicMap:
         self._tolerance = config.map.prune_tolerance
         self._packet_codec = packet_codec
         self._source = source
-        self._octree: SemanticOctree | None = None
+        self._last: HeldMap | None = None
         self._comparer = MapComparer(2, 0.0)
         self._filled = 0
         self._bytes_per_brick = 100.0
@@ -64,22 +64,30 @@ class PublicMap:
         ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``. ``num_shares``
         maps share the budget.
         """
-        octree = octree.copy()
-        octree.revisions[:] = revisions
-        if self.is_exact:
-            return HeldMap(octree, version)
+        last = self._last
+        if last is not None and self._packet.budget is None and not (revisions >= last.version).any():
+            self._last = HeldMap(last.octree, version)
+            return self._last
+        public = octree.copy()
+        public.revisions[:] = revisions
+        if not self.is_exact:
+            public = self._within_packets(public, last, version, num_shares)
+        self._last = HeldMap(public, version)
+        return self._last
+
+    def _within_packets(
+        self, octree: SemanticOctree, last: HeldMap | None, version: int, num_shares: int
+    ) -> SemanticOctree:
+        """Next published octree: the last one, with the changes of ``octree`` that packets can hold."""
         target = self._rounded(octree)
-        if self._octree is None:
-            self._octree = SemanticOctree(octree.resolution, octree.num_classes)
-        public = self._octree.copy()
+        public = SemanticOctree(octree.resolution, octree.num_classes) if last is None else last.octree.copy()
         if self._packet.budget is None:
             # Unchanged bricks keep their revisions and stay out of deltas.
             team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
         else:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(public, target, version, max(self._packet.budget // num_shares, least))
-        self._octree = public
-        return HeldMap(public, version)
+        return public
 
     def _rounded(self, octree: SemanticOctree) -> SemanticOctree:
         """Map with the values that packets can hold."""

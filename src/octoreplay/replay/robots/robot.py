@@ -156,6 +156,9 @@ class Robot(ABC):
         self.map = octree()
         self.size = StreamSize()
         self._meter = StreamMeter(self.map)
+        # Sizes of the map without pruning as of a tick: plain and compressed.
+        self._unpruned_tick: int | None = None
+        self._unpruned_bytes = (0, 0)
 
     @property
     def evidence(self) -> Evidence:
@@ -216,17 +219,22 @@ class Robot(ABC):
 
     def publication(self, receivers: Sequence[int], tick: int, *, with_unpruned: bool) -> Publication:
         """The robot's messages to its receivers in one tick, and the sizes of its map."""
-        return Publication(self.publish(receivers, tick), self.map_sizes(with_unpruned=with_unpruned))
+        return Publication(self.publish(receivers, tick), self.map_sizes(tick, with_unpruned=with_unpruned))
 
-    def map_sizes(self, *, with_unpruned: bool) -> MapSizes:
+    def map_sizes(self, tick: int, *, with_unpruned: bool) -> MapSizes:
         """Sizes of the robot's map. The sizes without pruning are costly, and 0 unless ``with_unpruned``."""
         num_classes = self.map.num_classes
-        unpruned = self.map.streams(prune=False) if with_unpruned else None
+        measured = self._unpruned_tick
+        if with_unpruned and (measured is None or (self.map.revisions >= measured).any()):
+            unpruned = self.map.streams(prune=False)
+            packed = codec.pack(self.map, unpruned, codec.FULL)
+            self._unpruned_bytes, self._unpruned_tick = (unpruned.size.num_bytes(num_classes), len(packed)), tick
+        plain, compressed = self._unpruned_bytes
         return MapSizes(
             octree_bytes=codec.HEADER_BYTES + self.size.num_bytes(num_classes),
             grid_bytes=codec.grid_bytes(self.map.num_cells, num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + unpruned.size.num_bytes(num_classes) if unpruned else 0,
-            unpruned_compressed_bytes=len(codec.pack(self.map, unpruned, codec.FULL)) if unpruned else 0,
+            unpruned_bytes=codec.HEADER_BYTES + plain if with_unpruned else 0,
+            unpruned_compressed_bytes=compressed if with_unpruned else 0,
         )
 
     @abstractmethod
