@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from octoreplay.mapping.octree import Run
 from octoreplay.records import Float64Array
 from octoreplay.registration.icp import (
     MIN_CORRESPONDENCES,
@@ -91,22 +92,25 @@ def _motions(
     return _solved(hessian, gradient)
 
 
-def register_planes(planes: Sequence[PlanePoints], poses: Sequence[Float64Array]) -> list[Float64Array]:
+def register_planes(
+    planes: Sequence[PlanePoints], poses: Sequence[Float64Array], *, run: Run = map
+) -> list[Float64Array]:
     """Return the poses (4, 4) of a team's planes in the frame of the first one, refined from close guesses ``poses``.
 
     The distances of points to planes count for every pair of robots, weighted by Geman and McClure's function. A
-    direction that the planes leave free stays near the guess.
+    direction that the planes leave free stays near the guess. ``run`` compares the pairs, one call for each; the result
+    does not depend on it.
     """
     guesses = [np.array(T, np.float64) for T in poses]
     spacing = planes[0].spacing
     middles = [own.points.mean(axis=0) if len(own.points) else np.zeros(3) for own in planes]
-    pairs = _close_samples(planes, guesses, _SEARCH_GATE * spacing)
+    pairs = _close_samples(planes, guesses, _SEARCH_GATE * spacing, run)
     prior = np.diag([_GUESS_ANGLE**-2.0] * 3 + [(_GUESS_SHIFT * spacing) ** -2.0] * 3)
     poses = guesses
     for gate in _PLANE_GATES:
         for _ in range(_NUM_ITERATIONS):
             centres = [T[:3, :3] @ middle + T[:3, 3] for T, middle in zip(poses, middles, strict=True)]
-            hessian, gradient = _plane_equations(planes, pairs, poses, centres, gate * spacing)
+            hessian, gradient = _plane_equations(planes, pairs, poses, centres, gate * spacing, run)
             for n, (T, guess) in enumerate(zip(poses, guesses, strict=True)):
                 own = slice(6 * n, 6 * n + 6)
                 turn = rotation_logs((T[:3, :3] @ guess[:3, :3].T)[None])[0]
@@ -121,18 +125,20 @@ def register_planes(planes: Sequence[PlanePoints], poses: Sequence[Float64Array]
 
 
 def _close_samples(
-    planes: Sequence[PlanePoints], poses: Sequence[Float64Array], gate: float
+    planes: Sequence[PlanePoints], poses: Sequence[Float64Array], gate: float, run: Run
 ) -> dict[tuple[int, int], PlanePoints]:
     """Planes of the second robot of each pair with the samples that are close to the first robot's points."""
-    close = {}
-    for a, b in itertools.permutations(range(len(planes)), 2):
+
+    def close(pair: tuple[int, int]) -> PlanePoints:
+        a, b = pair
         T = inverse(poses[a]) @ poses[b]
         points = planes[b].sample_points @ T[:3, :3].T + T[:3, 3]
         distances, _ = planes[a].nearest(points, planes[b].class_ids[planes[b].samples], gate)
-        samples = planes[b].samples[np.isfinite(distances)]
-        if samples.size >= MIN_CORRESPONDENCES:
-            close[a, b] = planes[b].with_samples(samples)
-    return close
+        return planes[b].with_samples(planes[b].samples[np.isfinite(distances)])
+
+    pairs = list(itertools.permutations(range(len(planes)), 2))
+    found = zip(pairs, run(close, pairs), strict=True)
+    return {pair: moving for pair, moving in found if moving.samples.size >= MIN_CORRESPONDENCES}
 
 
 def _plane_equations(
@@ -141,21 +147,28 @@ def _plane_equations(
     poses: Sequence[Float64Array],
     centres: Sequence[Float64Array],
     gate: float,
+    run: Run,
 ) -> tuple[Float64Array, Float64Array]:
     """Gauss-Newton's matrix (6n, 6n) and gradient (6n,) of the distances for motions about the ``centres``."""
-    hessian, gradient = np.zeros((6 * len(planes), 6 * len(planes))), np.zeros(6 * len(planes))
-    for (a, b), moving in pairs.items():
-        found = plane_distances(moving, planes[a], inverse(poses[a]) @ poses[b], gate, least_cosine=_LEAST_COSINE)
+
+    def of_pair(pair: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
+        a, b = pair
+        T = inverse(poses[a]) @ poses[b]
+        found = plane_distances(pairs[pair], planes[a], T, gate, least_cosine=_LEAST_COSINE)
         points = found.points @ poses[a][:3, :3].T + poses[a][:3, 3]
         normals = found.normals @ poses[a][:3, :3].T
-        sigma = _PLANE_SIGMA * moving.spacing
+        sigma = _PLANE_SIGMA * planes[a].spacing
         weights = (sigma * (1.0 + np.square(found.distances / (_ROBUST_SHARE * gate)))) ** -2.0
         jacobian = np.concatenate(
             [-np.cross(points - centres[a], normals), -normals, np.cross(points - centres[b], normals), normals], axis=1
         )
+        return (jacobian * weights[:, None]).T @ jacobian, jacobian.T @ (weights * found.distances)
+
+    hessian, gradient = np.zeros((6 * len(planes), 6 * len(planes))), np.zeros(6 * len(planes))
+    for (a, b), (of_both, pull) in zip(pairs, run(of_pair, pairs), strict=True):
         rows = np.r_[6 * a : 6 * a + 6, 6 * b : 6 * b + 6]
-        hessian[np.ix_(rows, rows)] += (jacobian * weights[:, None]).T @ jacobian
-        gradient[rows] += jacobian.T @ (weights * found.distances)
+        hessian[np.ix_(rows, rows)] += of_both
+        gradient[rows] += pull
     return hessian, gradient
 
 

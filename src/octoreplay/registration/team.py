@@ -67,14 +67,17 @@ def align_team(
 
     pairs = tuple(run(align, combinations(range(len(maps)), 2)))
     joined = join_pairs(maps, pairs, limits, names=names, is_upright=dof == 4)
-    return refine_components(maps, joined, is_upright=dof == 4)
+    return refine_components(maps, joined, is_upright=dof == 4, run=run)
 
 
-def refine_components(maps: Sequence[OwnMap], alignment: TeamAlignment, *, is_upright: bool = True) -> TeamAlignment:
+def refine_components(
+    maps: Sequence[OwnMap], alignment: TeamAlignment, *, is_upright: bool = True, run: Run = map
+) -> TeamAlignment:
     """Return an alignment whose poses are registered together in each component.
 
     The cells of three robots and more are registered first, and then the planes around the measured points where all
-    maps have them. The pairs through which robots got their poses are changed with them.
+    maps have them. The pairs through which robots got their poses are changed with them. ``run`` is that of
+    ``align_team``.
     """
     poses = list(alignment.T_component_map)
     for component in alignment.components:
@@ -84,9 +87,9 @@ def refine_components(maps: Sequence[OwnMap], alignment: TeamAlignment, *, is_up
             surfaces = [map_.upright_surface if is_upright else map_.surface for map_ in own]
             gates = [gate * own[0].resolution for gate in FINE_GATES]
             found = register_together(surfaces, found, gates=gates, tilt_sigma=TILT_SIGMA if is_upright else None)
-        planes = [map_.planes for map_ in own if map_.planes is not None]
+        planes = [of_map for of_map in run(lambda map_: map_.planes, own if len(own) > 1 else ()) if of_map is not None]
         if len(planes) == len(component) > 1:
-            found = register_planes(planes, found)
+            found = register_planes(planes, found, run=run)
         for index, T in zip(component, found, strict=True):
             poses[index] = T
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import Any, TypeVar
 
 import numpy as np
@@ -276,10 +276,13 @@ def _align_pairs(
     num_pairs = math.comb(len(maps), 2)
     with ThreadPoolExecutor(num_threads or min(num_pairs, os.cpu_count() or 1)) as threads:
 
+        done = itertools.count(1)
+
         def run(function: Callable[[Any], Any], items: Any) -> Iterator[Any]:
-            for done, found in enumerate(threads.map(function, items), start=1):
+            for found in threads.map(function, items):
                 if progress is not None:
-                    progress(done / num_pairs)
+                    # The pairs come first; the joint registration after them is the short part.
+                    progress(min(next(done) / num_pairs, 1.0))
                 yield found
 
         try:
@@ -379,7 +382,7 @@ def _candidates(
     # A robot with a frame and one without are not related by the identity.
     is_known = [robot.T_team_map is not None for robot in config.robots]
     found: dict[tuple[int, int], list[Float64Array]] = {}
-    for i, j in combinations(range(len(config.robots)), 2):
+    for i, j in itertools.combinations(range(len(config.robots)), 2):
         poses = [inverse(configured[i]) @ configured[j]] if is_known[i] == is_known[j] else []
         if i in guessed and j in guessed:
             poses.append(inverse(guessed[i]) @ guessed[j])
