@@ -275,7 +275,6 @@ def _align_pairs(
     """The alignment of all pairs, in threads."""
     num_pairs = math.comb(len(maps), 2)
     with ThreadPoolExecutor(num_threads or min(num_pairs, os.cpu_count() or 1)) as threads:
-
         done = itertools.count(1)
 
         def run(function: Callable[[Any], Any], items: Any) -> Iterator[Any]:

@@ -58,7 +58,7 @@ def test_an_exact_public_map_is_a_copy_with_its_revisions():
     assert held.octree.revisions.tolist() == [3, 6]
     assert octree.revisions.tolist() == [1, 1]
     before = cells_of(held.octree)
-    octree.overwrite(octree_of({(0, 0, 0): [9.0, 9.0]}), np.arange(1))
+    octree.overwrite(octree_of({(0, 0, 0): [9.0, 9.0]}), np.arange(1), 7)
     assert cells_of(held.octree) == before
     assert cells_of(public.advance(octree, octree.revisions, 8).octree) == cells_of(octree)
     assert cells_of(held.octree) == before
@@ -72,6 +72,18 @@ def test_an_exact_public_map_is_a_copy_with_its_revisions():
 )  # fmt: skip
 def test_an_inexact_public_map_is_marked(parameters):
     assert not _public_map(**parameters)[0].is_exact
+
+
+@pytest.mark.parametrize("parameters", [{}, {"content": "int8"}], ids=str)
+def test_a_map_that_did_not_change_is_published_without_a_copy(parameters):
+    public, _ = _public_map(**parameters)
+    octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [-0.3, 0.7]})
+    first = public.advance(octree, np.array([3, 6]), 7)
+    second = public.advance(octree, np.array([3, 6]), 8)
+    assert second.octree is first.octree
+    assert second.version == 8
+    third = public.advance(octree, np.array([3, 8]), 9)
+    assert third.octree is not first.octree
 
 
 # --- rounded ----------------------------------------------------------------------------------------------------------
@@ -95,7 +107,7 @@ def test_only_bricks_that_changed_after_rounding_get_a_revision(parameters, roun
     num_kept = 0
     for version in range(5, 12):
         octree = octree_of(cells)
-        held = public.advance(octree, octree.revisions, version)
+        held = public.advance(octree, np.full(octree.num_bricks, version - 1), version)
         expected = cells_of(rounded(octree))
         assert cells_of(held.octree) == expected
         assert held.version == version
@@ -131,7 +143,7 @@ def test_published_versions_do_not_change():
     versions = []
     for version in range(1, 6):
         octree = octree_of(_random_cells(random, 5))
-        held = public.advance(octree, np.zeros(octree.num_bricks, np.int64), version)
+        held = public.advance(octree, np.full(octree.num_bricks, version - 1), version)
         versions.append((held, cells_of(held.octree)))
     assert all(cells_of(held.octree) == cells for held, cells in versions)
     assert len({str(cells) for _, cells in versions}) == 5

@@ -61,8 +61,8 @@ class PublicMap:
     def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, *, num_shares: int = 1) -> HeldMap:
         """Next version of the map.
 
-        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``. ``num_shares``
-        maps share the budget.
+        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``; those of bricks that
+        changed since the last version are at least that. ``num_shares`` maps share the budget.
         """
         last = self._last
         if last is not None and self._packet.budget is None and not (revisions >= last.version).any():
