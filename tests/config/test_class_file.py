@@ -261,8 +261,7 @@ def test_the_option_classes_accepts_a_table_or_a_file(tmp_path, capsys):
 
 def test_unknown_colours_are_reported_as_colours():
     counts = FrameCounts(unknown_label_pixels={7: 1}, unknown_colors={0x0A0B0C: 1200, 255: 3})
-    sentences = list(progress.losses(counts))
-    assert sentences == [
-        "1 pixels or points with labels without a class were ignored: 7",
-        "1,203 pixels or points with colours without a class were ignored: #0000ff, #0a0b0c",
+    assert list(progress.lost_data({"husky_1": counts})) == [
+        "husky_1: 1 pixels or points with labels without a class were ignored: 7",
+        "husky_1: 1,203 pixels or points with colours without a class were ignored: #0000ff, #0a0b0c",
     ]
