@@ -13,6 +13,7 @@ _POINTS_PER_SCAN = 5000
 # Number of groups in batches that are not merged yet.
 _MAX_PENDING = 1 << 20
 _VOXELS_PER_CELL = 2
+_POINTS_PER_VOXEL = 3
 _KEY_BITS = 18
 _KEY_OFFSET = 1 << (_KEY_BITS - 1)
 _CLASS_BITS = 8
@@ -67,8 +68,8 @@ class MeasuredPoints:
         means = centres + chosen[:, :3] / np.where(has_points, chosen[:, 3], 1.0)[:, None]
         return np.where(has_points[:, None], means, centres)
 
-    def planes(self, min_points: int = 3) -> PlanePoints:
-        """Return the planes around the means of the most frequent class in each voxel with at least ``min_points``.
+    def planes(self) -> PlanePoints:
+        """Return the planes around the means of the most frequent class in each voxel, where it has enough points.
 
         Points without a class (0) are left out.
         """
@@ -76,7 +77,7 @@ class MeasuredPoints:
         class_ids, cells = (self._codes & 255).astype(np.uint8), self._codes >> _CLASS_BITS
         counts = np.where(class_ids > 0, self._sums[:, 7], 0)
         chosen = most_frequent(cells, class_ids, counts)
-        chosen = chosen[counts[chosen] >= min_points]
+        chosen = chosen[counts[chosen] >= _POINTS_PER_VOXEL]
         sums = self._sums[chosen].astype(np.float64)
         points = (_keys_of(cells[chosen]) + 0.5) * self._voxel + sums[:, :3] / sums[:, 6:7]
         return PlanePoints.of_points(
