@@ -22,10 +22,10 @@ def one_in(step: int, *factors: Iterable[Any]) -> list[Any]:
 
 
 def examples(number: int) -> Callable[[Any], Any]:
-    """Return a decorator for a random test: a fifth of the examples in the default suite, all in the long one."""
+    """Return a decorator for a random test: an eighth of the examples in the default suite, all in the long one."""
 
     def decorate(test: Any) -> Any:
-        max_examples = number if is_long_suite else -(-number // 5)
+        max_examples = number if is_long_suite else -(-number // 8)
         return pytest.mark.examples(settings(max_examples=max_examples)(test))
 
     return decorate

@@ -23,14 +23,15 @@ from octoreplay.registration.planes import PlanePoints, plane_distances
 from octoreplay.registration.rigid import rotation_logs
 from octoreplay.transforms import inverse
 
-_NUM_ITERATIONS = 12
+_NUM_ITERATIONS = 4
 # Iterations of a stage end where no pose moves by more than this [m], or [rad] times ten metres.
 _LEAST_STEP = 1e-3
 _LEVER = 10.0
 # Planes, lengths in spacings of the points: largest distances between correspondences in each stage, and under the
-# guess; least cosine between normals; standard deviation of a distance; distance at which a weight is 1/4, as a share
+# guess; most iterations of each stage; least cosine between normals; standard deviation of a distance; distance at which a weight is 1/4, as a share
 # of the gate; standard deviations of the guesses, rotations in radians.
 _PLANE_GATES, _SEARCH_GATE = (8 / 3, 4 / 3, 2 / 3), 4.0
+_PLANE_ITERATIONS = (2, 2, 4)
 _LEAST_COSINE = 0.95
 _PLANE_SIGMA, _ROBUST_SHARE = 1 / 3, 1 / 3
 _GUESS_SHIFT, _GUESS_ANGLE = 2 / 3, math.radians(1.0)
@@ -107,8 +108,8 @@ def register_planes(
     pairs = _close_samples(planes, guesses, _SEARCH_GATE * spacing, run)
     prior = np.diag([_GUESS_ANGLE**-2.0] * 3 + [(_GUESS_SHIFT * spacing) ** -2.0] * 3)
     poses = guesses
-    for gate in _PLANE_GATES:
-        for _ in range(_NUM_ITERATIONS):
+    for gate, num_iterations in zip(_PLANE_GATES, _PLANE_ITERATIONS, strict=True):
+        for _ in range(num_iterations):
             centres = [T[:3, :3] @ middle + T[:3, 3] for T, middle in zip(poses, middles, strict=True)]
             hessian, gradient = _plane_equations(planes, pairs, poses, centres, gate * spacing, run)
             for n, (T, guess) in enumerate(zip(poses, guesses, strict=True)):
