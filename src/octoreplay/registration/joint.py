@@ -28,8 +28,8 @@ _NUM_ITERATIONS = 4
 _LEAST_STEP = 1e-3
 _LEVER = 10.0
 # Planes, lengths in spacings of the points: largest distances between correspondences in each stage, and under the
-# guess; most iterations of each stage; least cosine between normals; standard deviation of a distance; distance at which a weight is 1/4, as a share
-# of the gate; standard deviations of the guesses, rotations in radians.
+# guess; most iterations of each stage; least cosine between normals; standard deviation of a distance; distance at
+# which a weight is 1/4, as a share of the gate; standard deviations of the guesses, rotations in radians.
 _PLANE_GATES, _SEARCH_GATE = (8 / 3, 4 / 3, 2 / 3), 4.0
 _PLANE_ITERATIONS = (2, 2, 4)
 _LEAST_COSINE = 0.95
