@@ -191,13 +191,13 @@ def _village_map(duration: float) -> tuple[str, SemanticOctree, Int64Array]:
     assert config.classes is not None
     num_classes, resolution = config.classes.num_classes, 0.2
     map_config = dataclasses.replace(config.map, resolution=resolution)
-    caster = ScanCaster(config.sensor, map_config, num_classes)
+    caster = ScanCaster(config.effective_sensor, map_config, num_classes)
     evidence = []
     for frames in recorded_frames(duration):
         octree = SemanticOctree(resolution, num_classes)
         for frame in frames:
             is_last = frame.stamp_ns >= frames[-1].stamp_ns - 10**9
-            add_scan(octree, caster.cast(frame), clamped_increments(config.sensor), int(is_last))
+            add_scan(octree, caster.cast(frame), clamped_increments(config.effective_sensor), int(is_last))
         evidence.append(octree)
     agreed = SemanticOctree(resolution, num_classes)
     codes = np.unique(np.concatenate([octree.codes for octree in evidence]))

@@ -6,23 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from octoreplay.registration.joint import register_planes
 from octoreplay.registration.planes import PlanePoints, plane_distances
 from octoreplay.transforms import inverse
 from support.block_worlds import pose_error
 from support.long_suite import examples
+from support.poses import pose_of
 
 SPACING = 0.2
 NOISE = 0.02
-
-
-def _pose(numbers):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(numbers[:3]).as_matrix()
-    T[:3, 3] = numbers[3:]
-    return T
 
 
 def _walls(seed, T_world_own=None, *, axes=(0, 1, 2), from_behind=False, shift=0.0):
@@ -78,7 +71,7 @@ def test_distances_are_those_along_the_normals():
     assert np.median(found.distances) == pytest.approx(0.07, abs=0.01)
 
 
-TRUE = [_pose((0.0, 0.0, 0.1 * n, 0.4 * n, 0.0, 0.2)) for n in range(4)]
+TRUE = [pose_of((0.0, 0.0, 0.1 * n, 0.4 * n, 0.0, 0.2)) for n in range(4)]
 small = st.tuples(*[st.floats(-0.015, 0.015)] * 3, *[st.floats(-0.1, 0.1)] * 3)
 
 
@@ -86,7 +79,7 @@ small = st.tuples(*[st.floats(-0.015, 0.015)] * 3, *[st.floats(-0.1, 0.1)] * 3)
 @examples(10)
 def test_known_poses_are_recovered(errors):
     planes = [_walls(seed, T) for seed, T in enumerate(TRUE)]
-    guesses = [TRUE[0], *(T @ _pose(error) for T, error in zip(TRUE[1:], errors, strict=True))]
+    guesses = [TRUE[0], *(T @ pose_of(error) for T, error in zip(TRUE[1:], errors, strict=True))]
     found = register_planes(planes, guesses)
     assert np.array_equal(found[0], guesses[0])
     for T, expected in zip(found, TRUE, strict=True):
@@ -97,7 +90,7 @@ def test_known_poses_are_recovered(errors):
 
 def test_free_directions_stay_near_the_guess():
     planes = [_walls(seed, axes=(2,)) for seed in range(2)]
-    guess = _pose((0.0, 0.0, 0.0, 0.4, -0.3, 0.06))
+    guess = pose_of((0.0, 0.0, 0.0, 0.4, -0.3, 0.06))
     found = register_planes(planes, [np.eye(4), guess])[1]
     assert np.linalg.norm(found[:2, 3] - guess[:2, 3]) < SPACING / 2
     assert abs(found[2, 3]) < 0.01
@@ -105,7 +98,7 @@ def test_free_directions_stay_near_the_guess():
 
 def test_swapping_two_robots_inverts_the_pose():
     planes = [_walls(seed, T) for seed, T in enumerate(TRUE[:2])]
-    guess = inverse(TRUE[0]) @ TRUE[1] @ _pose((0.0, 0.005, 0.01, 0.05, 0.05, -0.05))
+    guess = inverse(TRUE[0]) @ TRUE[1] @ pose_of((0.0, 0.005, 0.01, 0.05, 0.05, -0.05))
     forth = register_planes(planes, [np.eye(4), guess])[1]
     back = register_planes(planes[::-1], [np.eye(4), inverse(guess)])[1]
     np.testing.assert_allclose(forth @ back, np.eye(4), atol=2e-3)
@@ -113,8 +106,8 @@ def test_swapping_two_robots_inverts_the_pose():
 
 def test_moving_all_frames_changes_nothing():
     planes = [_walls(seed, T) for seed, T in enumerate(TRUE)]
-    guesses = [TRUE[0], *(T @ _pose((0.0, 0.01, 0.01, 0.05, 0.0, -0.05)) for T in TRUE[1:])]
-    move = _pose((0.3, -0.2, 2.0, 5.0, -7.0, 3.0))
+    guesses = [TRUE[0], *(T @ pose_of((0.0, 0.01, 0.01, 0.05, 0.0, -0.05)) for T in TRUE[1:])]
+    move = pose_of((0.3, -0.2, 2.0, 5.0, -7.0, 3.0))
     found = register_planes(planes, guesses)
     for T, other in zip(found, register_planes(planes, [move @ T for T in guesses]), strict=True):
         np.testing.assert_allclose(inverse(move) @ other, T, atol=2e-3)
@@ -124,7 +117,7 @@ def test_empty_planes_and_planes_far_away_stay():
     nothing = PlanePoints.of_points(
         np.empty((0, 3)), np.empty(0, np.uint8), SPACING, num_samples=3000, views=np.empty((0, 3))
     )
-    far = _pose((0.0, 0.0, 0.0, 50.0, 0.0, 0.0))
-    found = register_planes([_walls(0), nothing, _walls(1)], [np.eye(4), _pose((0, 0, 1, 1, 2, 3)), far])
-    np.testing.assert_allclose(found[1], _pose((0, 0, 1, 1, 2, 3)), atol=1e-9)
+    far = pose_of((0.0, 0.0, 0.0, 50.0, 0.0, 0.0))
+    found = register_planes([_walls(0), nothing, _walls(1)], [np.eye(4), pose_of((0, 0, 1, 1, 2, 3)), far])
+    np.testing.assert_allclose(found[1], pose_of((0, 0, 1, 1, 2, 3)), atol=1e-9)
     np.testing.assert_allclose(found[2], far, atol=1e-9)

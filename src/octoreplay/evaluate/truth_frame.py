@@ -14,7 +14,7 @@ from octoreplay.transforms import pose_difference, transform_of
 FRAMES_FILE = "frames.yaml"
 """File beside a simulated team's truth with the true T_team_map of each robot."""
 
-# Largest difference of a robot's frame from the true one, of a team in the frame of the truth [m], [rad].
+# A team is in the frame of the truth where a robot's frame differs from its true one by at most this [m], [rad].
 _SAME_SHIFT, _SAME_ANGLE = 2.0, math.radians(10.0)
 
 
