@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoreplay.records import Float64Array
+from octoreplay.records import BoolArray, Float64Array, Int64Array
 
 BITS_PER_SETTLING_TICK = 2
 """Growth of flow_bits in every settling tick."""
+BLOCK_EDGE = 4
+"""Edge of the blocks that ``flow_gate`` holds back, in cells."""
 EXTRA_SETTLING_TICKS = 8
 """Least addition to the default maximum number of settling ticks."""
 
@@ -40,6 +42,21 @@ def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: 
     """
     largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1, keepdims=True)
     return np.maximum(flow_step(largest, flow_bits), quantum)
+
+
+def is_held_back(own: Float64Array, other: Float64Array, blocks: Int64Array, gate: float) -> BoolArray:
+    """Return for each cell whether the gate makes the flow of its block 0, (M, 1).
+
+    A block flows where in one of its cells no class has the largest value of both maps, or a class differs, by at least
+    gate m, m the largest |log-odds| of both. ``blocks`` (M,) are the cells' blocks. The product is float32.
+    """
+    is_largest = [values == values.max(axis=-1, keepdims=True) for values in (own, other)]
+    has_common = (is_largest[0] & is_largest[1]).any(axis=-1)
+    largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1)
+    change = np.abs(other - own).max(axis=-1)
+    differs = (change > 0.0) & (change.astype(np.float32) >= np.float32(gate) * largest.astype(np.float32))
+    is_open = np.isin(blocks, blocks[differs | ~has_common])
+    return ~is_open[:, np.newaxis]
 
 
 def flow(own: Float64Array, other: Float64Array, weight: float, steps: Float64Array) -> Float64Array:

@@ -168,6 +168,7 @@ class Twin:
         self.sensor = config.effective_sensor
         self.quantum = config.consensus.effective_quantum
         self.flow_bits = config.effective_flow_bits
+        self.blocks = _codes(recording.keys // flows.BLOCK_EDGE)
         self._graph_of(tuple([True] * self.num_robots), self.start_ns)
         self.scans = [scan for scan in recording.scans if not self._is_off(scan.robot, scan.stamp_ns)]
         self.stamps = [[scan.stamp_ns for scan in self.scans if scan.robot == i] for i in range(self.num_robots)]
@@ -383,7 +384,11 @@ class Twin:
     def _flow(self, own: Float64Array, other: Float64Array, weight: float, stage: Stage) -> Float64Array:
         """Return the flow from a neighbour."""
         steps = flows.flow_steps(own, other, stage.flow_bits, self.quantum)
-        return flows.flow(own, other, weight, steps)
+        amounts = flows.flow(own, other, weight, steps)
+        gate = self.config.consensus.flow_gate
+        if stage.settling or gate == 0.0:
+            return amounts
+        return np.where(flows.is_held_back(own, other, self.blocks, gate), 0.0, amounts)
 
     def _base(self, own: Float64Array) -> Float64Array:
         """Return the map that is subtracted from a neighbour's: the robot's own, or 0 for 'merge'."""

@@ -55,6 +55,13 @@ class ConsensusConfig:
         minimum=0,
         maximum=20,
     )
+    flow_gate: float = parameter(
+        0.0,
+        "rule bayes with flows: a block of 4^3 cells flows over a link only where the labels of a cell differ, or its"
+        " log-odds by at least this share of the largest, until the logs end; 1 sends least, 0 holds nothing back",
+        minimum=0.0,
+        maximum=1.0,
+    )
     quantum: float | None = parameter(
         None,
         "smallest step of log-odds, a power of two, for evidence sum and the rules bayes, gradient and natural; 0: none"

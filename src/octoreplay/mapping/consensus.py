@@ -50,10 +50,13 @@ class Flows:
 
     - ``bits``: the step of a cell is its largest |log-odds|, rounded down to a power of two, times 2^-bits.
     - ``has_flow``: True for each neighbour whose link has flows; the others' amounts are exact.
+    - ``gate``: a brick has no flow over a link where in each of its cells both ends have the same label and no class
+      differs by ``gate`` times the cell's largest |log-odds| or more; 0 holds nothing back.
     """
 
     bits: int
     has_flow: Sequence[bool]
+    gate: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,8 @@ def team_step(
 
     The mixed map is h~ = h_i + sum_j f_ij, summed over the neighbours, with f_ij = w_ij (h_j - b_i), or with flows
     f_ij = e trunc(w_ij (h_j - b_i) / e), evaluated in float32. The step e of a cell is
-    2^(floor(log2 max_c(|h_j[c]|, |b_i[c]|)) - bits), and at least ``quantum``. The new map is
+    2^(floor(log2 max_c(|h_j[c]|, |b_i[c]|)) - bits), and at least ``quantum``. The gate of the flows
+    makes all f_ij of a brick 0. The new map is
 
     - ``GRADIENT`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
       sigma = softmax(h~);
@@ -131,14 +135,16 @@ def team_step(
     list(run(prepare, range(len(steps))))
     all_columns = np.concatenate(columns)
     first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
-    weights, flow_weights, flow_shares, has_plain = _link_weights(steps)
+    weights, flow_weights, has_plain = _link_weights(steps)
+    flow_shares = np.array([1.0 if step.flows is None else 2.0**-step.flows.bits for step in steps], np.float32)
+    flow_gates = np.array([0.0 if step.flows is None else step.flows.gate for step in steps], np.float32)
     gammas = np.array([step.gamma for step in steps], np.float32)
 
     def work(part: Int64Array) -> None:
         consensus_kernels.team_step(
-            part[0], part[-1] + 1, table, all_columns, first_columns, weights, flow_weights, flow_shares, has_plain,
-            np.float32(quantum), gammas, int(update), num_classes, np.float32(clamp[0]), np.float32(clamp[1]),
-            layouts.reshape(-1, layouts.shape[2]), known.ravel(), needs_update,
+            part[0], part[-1] + 1, table, all_columns, first_columns, weights, flow_weights, flow_shares, flow_gates,
+            has_plain, np.float32(quantum), gammas, int(update), num_classes, np.float32(clamp[0]),
+            np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(), needs_update,
             *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
         )  # fmt: skip
 
@@ -153,17 +159,16 @@ def team_step(
     return list(run(finish, range(len(steps))))
 
 
-def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, Float32Array, BoolArray]:
-    """Weights of the links without and with flows at the kernel's columns, each robot's 2^-bits and plain links."""
-    plain, flowing, shares, has_plain = [], [], [], []
+def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, BoolArray]:
+    """Weights of the links without and with flows at the kernel's columns, and which robots have plain links."""
+    plain, flowing, has_plain = [], [], []
     for step in steps:
         has_flow = step.flows.has_flow if step.flows is not None else [False] * len(step.neighbours)
         own = [0.0] * FIRST_NEIGHBOUR
         plain += [*own, *(0.0 if flow else w for w, flow in zip(step.step_weights, has_flow, strict=True))]
         flowing += [*own, *(w if flow else 0.0 for w, flow in zip(step.step_weights, has_flow, strict=True))]
-        shares.append(2.0**-step.flows.bits if step.flows is not None else 1.0)
         has_plain.append(not all(has_flow))
-    return np.array(plain, np.float32), np.array(flowing, np.float32), np.array(shares, np.float32), np.array(has_plain)
+    return np.array(plain, np.float32), np.array(flowing, np.float32), np.array(has_plain)
 
 
 def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, BrickTable, list[Int64Array]]:

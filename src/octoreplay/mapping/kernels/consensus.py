@@ -190,10 +190,60 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 
 @kernel
+def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, gate):
+    """Return True where the gate holds a link's flow back in all cells of a brick.
+
+    A cell is at rest where the same class has the largest log-odds in both maps, counting free space with 0, and no
+    class differs by ``gate`` x m or more.
+
+    - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
+    - ``scratch_at``: address of three blocks of ``room`` bytes; the first holds m of the cells, and is kept.
+    - ``spare_at``: address of one more block.
+    - ``terms_at``: address of 128 float32; the first 64 are the number of classes of the shared rows, and are kept.
+    - ``octets``, ``num_shared``, ``rows``, ``room``: as for ``_add_gradient``.
+    - ``gate``: float32 above 0.
+    """
+    size, shared_size = rows * OCTETS, num_shared * OCTETS
+    base, other, largest = float_array(base_at, (size,)), float_array(map_at, (size,)), float_array(scratch_at, (size,))
+    change_at, base_best_at, other_best_at = scratch_at + room, scratch_at + 2 * room, spare_at
+    change, base_best = float_array(change_at, (size,)), float_array(base_best_at, (size,))
+    other_best = float_array(other_best_at, (size,))
+    terms, common = float_array(terms_at, (shared_size,)), float_array(terms_at + BRICK_CELLS * 4, (shared_size,))
+    zero = np.float32(0.0)
+    for i in range(size):
+        change[i] = abs(other[i] - base[i])
+        base_best[i] = max(base[i], zero)
+        other_best[i] = max(other[i], zero)
+    for i in range(shared_size):
+        if terms[i] <= zero:
+            change[i], base_best[i], other_best[i] = zero, zero, zero
+    for r in range(num_shared, rows):
+        max_octet(change_at + octets[r] * ROW_BYTES, change_at + r * ROW_BYTES)
+        max_octet(base_best_at + octets[r] * ROW_BYTES, base_best_at + r * ROW_BYTES)
+        max_octet(other_best_at + octets[r] * ROW_BYTES, other_best_at + r * ROW_BYTES)
+    # 0 where one class is the best of both maps, below 0 elsewhere.
+    for i in range(shared_size):
+        common[i] = min(-base_best[i], -other_best[i])
+        if terms[i] > zero:
+            common[i] = max(common[i], min(base[i] - base_best[i], other[i] - other_best[i]))
+    for r in range(num_shared, rows):
+        first = octets[r] * OCTETS
+        for k in range(OCTETS):
+            i, cell = r * OCTETS + k, first + k
+            common[cell] = max(common[cell], min(base[i] - base_best[cell], other[i] - other_best[cell]))
+    is_moving = np.int32(0)
+    for i in range(shared_size):
+        differs = change[i] > zero and change[i] >= gate * largest[i]
+        is_moving |= np.int32(differs) | np.int32(common[i] < zero)
+    return is_moving == 0
+
+
+@kernel
 def _add_flows(
-    mixed_at, base_at, map_at, scratch_at, terms_at, octets, num_shared, rows, num_classes, weight, share, quantum
-):
-    """Add the flow of one link to the mixed map: e trunc(weight (map - base) / e).
+    mixed_at, base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, num_classes, weight,
+    share, gate, quantum,
+):  # fmt: skip
+    """Add the flow of one link to the mixed map: e trunc(weight (map - base) / e), or 0 in a brick at rest.
 
     The step e of a cell is the largest power of two that is not above m, times ``share``, and at least the quantum; m
     is the cell's largest |log-odds| in either map. Both ends of a link find the same amount with opposite signs,
@@ -201,9 +251,10 @@ def _add_flows(
 
     - ``mixed_at``: address of the mixed map (rows, 8), in place.
     - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
-    - ``scratch_at``, ``terms_at``: addresses of (rows, 8) float32 and of 64 float32.
-    - ``octets``, ``num_shared``, ``rows``, ``num_classes``: as for ``_add_gradient``.
-    - ``weight``, ``share``, ``quantum``: float32; ``share`` is 2^-flow_bits.
+    - ``scratch_at``, ``spare_at``: addresses of three blocks of ``room`` bytes and of one more.
+    - ``terms_at``: address of 128 float32.
+    - ``octets``, ``num_shared``, ``rows``, ``room``, ``num_classes``: as for ``_add_gradient``.
+    - ``weight``, ``share``, ``gate``, ``quantum``: float32; ``share`` is 2^-flow_bits, ``gate`` 0 holds nothing back.
     """
     size, shared_size = rows * OCTETS, num_shared * OCTETS
     mixed, base, other = float_array(mixed_at, (size,)), float_array(base_at, (size,)), float_array(map_at, (size,))
@@ -220,6 +271,10 @@ def _add_flows(
         steps[i] = steps[i] if terms[i] > np.float32(0.0) else np.float32(0.0)
     for r in range(num_shared, rows):
         max_octet(scratch_at + octets[r] * ROW_BYTES, scratch_at + r * ROW_BYTES)
+    if gate > np.float32(0.0) and _is_at_rest(
+        base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, gate
+    ):
+        return
     for i in range(shared_size):
         # Without its mantissa a float is the largest power of two that is not above it.
         power = same_bits(np.int32(same_bits(steps[i]) & np.int32(0x7F800000)))
@@ -232,8 +287,8 @@ def _add_flows(
 
 @kernel
 def team_step(
-    start, end, table, columns, first_columns, weights, flow_weights, flow_shares, has_plain, quantum, gammas, update,
-    num_classes, clamp_min, clamp_max, layouts, known, needs_update, scratch, int_scratch, changes, is_even,
+    start, end, table, columns, first_columns, weights, flow_weights, flow_shares, flow_gates, has_plain, quantum, gammas,
+    update, num_classes, clamp_min, clamp_max, layouts, known, needs_update, scratch, int_scratch, changes, is_even,
 ):  # fmt: skip
     """One iteration of R robots, in place in their own maps.
 
@@ -251,6 +306,7 @@ def team_step(
     - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours without flows, parallel to ``columns``.
     - ``flow_weights`` float32: 2 epsilon A_ij at the entries of neighbours with flows, parallel to ``columns``.
     - ``flow_shares`` (R,) float32: 2^-flow_bits.
+    - ``flow_gates`` (R,) float32: least difference of a moving cell, relative to its largest |log-odds|; 0 for none.
     - ``has_plain`` (R,) bool: True where any of a robot's ``weights`` is not 0.
     - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT and NATURAL; 0 for none.
     - ``gammas`` (R,) float32: gradient step sizes.
@@ -299,8 +355,8 @@ def team_step(
             for k in range(FIRST_NEIGHBOUR, num_columns):
                 if flow_weights[first + k] != np.float32(0.0):
                     _add_flows(
-                        mixed_at, base_at, places[k], gradient_at, terms_at, octets, num_shared, rows, num_classes,
-                        flow_weights[first + k], flow_shares[robot], least_step,
+                        mixed_at, base_at, places[k], gradient_at, delta_at, terms_at, octets, num_shared, rows, room,
+                        num_classes, flow_weights[first + k], flow_shares[robot], flow_gates[robot], least_step,
                     )  # fmt: skip
             for k in range(FIRST_NEIGHBOUR, num_columns if has_plain[robot] else 0, 3):
                 b_at, b_weight, c_at, c_weight = base_at, np.float32(0.0), base_at, np.float32(0.0)

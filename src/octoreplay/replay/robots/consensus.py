@@ -153,7 +153,8 @@ class ConsensusRobot(Robot):
         bits = self._config.effective_flow_bits
         if not bits:
             return None
-        return Flows(bits + phase.extra_flow_bits, [self._is_mutual(arrival, tick) for arrival in arrived])
+        gate = 0.0 if phase.is_settling else self._config.consensus.flow_gate
+        return Flows(bits + phase.extra_flow_bits, [self._is_mutual(arrival, tick) for arrival in arrived], gate)
 
     def _is_mutual(self, arrival: Arrival, tick: int) -> bool:
         """True where both ends of a link published to each other in this tick."""
