@@ -112,7 +112,7 @@ class Team:
         """Add new evidence to the maps, as ``bayes`` does before it publishes; seconds that it takes."""
         started = time.perf_counter()
         for octree, evidence, last in zip(self.maps, self.evidence, self._last_evidence, strict=True):
-            step = Step(octree, (), (), evidence, 0.0, last_log_likelihood=last, since=self._last_tick + 1)
+            step = Step(octree, (), (), evidence, 0.0, last_evidence=last, since=self._last_tick + 1)
             team_step([step], update=Update.ADD, revision=self.tick_number)
             changed = np.flatnonzero(evidence.revisions > self._last_tick)
             last.overwrite(evidence, changed, self.tick_number)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from octoreplay.records import CENTRAL, TEAM, FrameCounts
@@ -211,7 +211,7 @@ class LinkTotals:
         """Add the links of one tick."""
         for link in links:
             ends = (link.sender, link.receiver)
-            values = astuple(link)[2:]
+            values = list(vars(link).values())[2:]
             sums = self._sums.get(ends, [0] * len(values))
             self._sums[ends] = [a + b for a, b in zip(sums, values, strict=True)]
             self._num_ticks[ends] = self._num_ticks.get(ends, 0) + 1

@@ -88,10 +88,10 @@ def test_step_on_octrees_equals_the_step_cell_by_cell(seed, update, gamma, with_
         update, dense_own, _dense(keys, base) if with_base else dense_own, [_dense(keys, n) for n in neighbours],
         weights, _dense(keys, log_q), _dense(keys, last), gamma,
     )  # fmt: skip
-    octree = _octree(own)
+    octree, evidence = _octree(own), _octree(log_q)
     change = consensus_step(
-        octree, [_octree(n) for n in neighbours], weights.tolist(), _octree(log_q), update=update, gamma=gamma,
-        revision=4, base=_octree(base) if with_base else None, last_log_likelihood=_octree(last),
+        octree, [_octree(n) for n in neighbours], weights.tolist(), evidence, update=update, gamma=gamma,
+        revision=4, base=_octree(base) if with_base else None, last_evidence=_last(_octree(last), evidence),
     )  # fmt: skip
     found = {key: np.frombuffer(value, np.float32) for key, value in cells_of(octree).items()}
     keys_known = set(keys) if with_base else set().union(own, log_q, last, *neighbours)
@@ -104,6 +104,12 @@ def test_step_on_octrees_equals_the_step_cell_by_cell(seed, update, gamma, with_
     changed = {key for key in keys_known if np.abs(expected[keys.index(key)] - dense_own[keys.index(key)]).max() > 1e-4}
     revised = set(octree.codes[octree.revisions == 4].tolist())
     assert {int(storage.key_to_code(*key)) >> storage.CELL_BITS for key in changed} <= revised
+
+
+def _last(last, evidence):
+    """Evidence at the last iteration: bricks that are new in the evidence are in it without known cells."""
+    last.find_or_add(evidence.codes)
+    return last
 
 
 def _octree(cells):
@@ -163,7 +169,7 @@ def test_equal_maps_do_not_change_by_a_bit(seed, update):
     cells = _random_cells(rng, scale=10.0 ** rng.integers(-3, 8))
     weights = rng.uniform(0.0, 0.5, rng.integers(0, 4)).tolist()
     octree, same = _octree(cells), _octree(cells)
-    last = {"last_log_likelihood": same} if update is Update.ADD else {}
+    last = {"last_evidence": same} if update is Update.ADD else {}
     assert (
         consensus_step(octree, [same] * len(weights), weights, same, update=update, gamma=0.5, revision=4, **last)
         == 0.0
@@ -184,7 +190,7 @@ def test_skipping_unchanged_bricks_does_not_change_the_result(seed, update):
     full = skipping.copy()
     for revision in range(5, 11):
         maps = (log_q, *neighbours)
-        arguments = {"update": update, "gamma": 0.5, "revision": revision, "last_log_likelihood": last}
+        arguments = {"update": update, "gamma": 0.5, "revision": revision, "last_evidence": _last(last, log_q)}
         since = revision - 1 if revision > 5 else None
         changes = [
             consensus_step(full, neighbours, [0.3, 0.4], log_q, **arguments),
@@ -257,7 +263,7 @@ def test_neighbours_and_evidence_are_not_changed():
     own, other, log_q, last = (octree_of(cube((i, 0, 0), 9, [i - 1.0, -i])) for i in range(4))
     before = [cells_of(octree) for octree in (other, log_q, last)]
     for update in UPDATES:
-        consensus_step(own, [other], [0.5], log_q, update=update, gamma=0.5, revision=1, last_log_likelihood=last)
+        consensus_step(own, [other], [0.5], log_q, update=update, gamma=0.5, revision=1, last_evidence=last)
     assert [cells_of(octree) for octree in (other, log_q, last)] == before
 
 

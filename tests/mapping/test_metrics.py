@@ -187,6 +187,11 @@ def test_incremental_comparison_equals_a_new_one(seed):
         target.overwrite(source, np.arange(source.num_bricks), revision)
         if rng.random() < 0.3:
             links = links[:1] if len(links) == 2 else [(0, 1), (1, 2)]
+        if rng.random() < 0.5:
+            before = MapComparer(3, -0.5).compare(octrees, oracle, links, 0).total_distance
+            assert comparer.link_distance(octrees, links, revision) == pytest.approx(before, rel=1e-12)
+            again = octree_of(_random_cells(rng))
+            octrees[0].overwrite(again, np.arange(again.num_bricks), revision)
         updated = comparer.compare(octrees, oracle, links, revision)
         fresh = MapComparer(3, -0.5).compare(octrees, oracle, links, 0)
         for name in vars(fresh):

@@ -103,6 +103,11 @@ class ConsensusConfig:
         return RULES[self.rule]
 
     @property
+    def has_anchor(self) -> bool:
+        """True where the pull is anchored while other robots are absent."""
+        return self.anchor_after > 0 and self.traits.has_gamma
+
+    @property
     def map_is_mean(self) -> bool:
         """True where robots agree on the mean of their evidence: N times it is the posterior of N robots."""
         return self.traits.map_is_mean and self.evidence == "sum"

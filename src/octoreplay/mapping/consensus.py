@@ -13,7 +13,7 @@ import numpy as np
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.kernels.consensus import FIRST_NEIGHBOUR, OWN
+from octoreplay.mapping.kernels.consensus import EVIDENCE, FIRST_NEIGHBOUR, LAST_EVIDENCE, OWN
 from octoreplay.mapping.kernels.storage import BrickTable
 from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned, parts_of
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
@@ -70,7 +70,8 @@ class Step:
     - ``log_likelihood``: log q_i.
     - ``gamma``: gradient step size.
     - ``base``: the robot's own published map b_i (default: ``own``).
-    - ``last_log_likelihood``: log q_i at the last iteration (default: ``log_likelihood``).
+    - ``last_evidence``: bricks of log q_i that changed since the last iteration, as they were then; new bricks are in
+      it without known cells (default: none changed).
     - ``since``: revision of an earlier step with the same update, gamma, weights and neighbours. Bricks of which all
       revisions are below ``since`` are skipped: the earlier step did not change them, so this one would not either.
       The revisions of all maps must then be correct, including those of decoded maps.
@@ -82,7 +83,7 @@ class Step:
     log_likelihood: SemanticOctree
     gamma: float
     base: SemanticOctree | None = None
-    last_log_likelihood: SemanticOctree | None = None
+    last_evidence: SemanticOctree | None = None
     since: int | None = None
     flows: Flows | None = None
 
@@ -119,44 +120,89 @@ def team_step(
     if not steps:
         return []
     run: Run = map if threads is None else threads.map
-    since, codes, table, columns = _locate_bricks(steps, run)
-    shape, num_classes = (len(steps), codes.size), steps[0].own.num_classes
-    needs_update, known_changed, is_even = np.zeros((3, *shape), np.bool_)
-    changes, indices = np.zeros(shape, np.float32), np.empty(shape, np.int64)
-    layouts, known = np.empty((*shape, table.masks.shape[2]), np.uint64), np.empty(shape, np.uint64)
+    since = min((step.since for step in steps if step.since is not None), default=0)
+    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
+    codes = union_codes(octrees, None if any(step.since is None for step in steps) else since)
+    largest = np.zeros(len(steps), np.float32)
+    for start in range(0, codes.size, MOST_BRICKS):
+        team = _TeamBricks(steps, octrees, codes[start : start + MOST_BRICKS], since, run)
+        team.update(update, clamp, quantum, threads)
+        np.maximum(largest, team.finish(revision), out=largest)
+    return [float(change) for change in largest]
 
-    def prepare(n: int) -> None:
-        own = steps[n].own
-        needs_update[n] = steps[n].since is None
-        expanded = expand_to_columns(own, codes, table, columns[n], needs_update[n])
-        indices[n], layouts[n], known[n], known_changed[n] = expanded
-        storage.fill_table(own.bricks, indices[n], since, table, columns[n][OWN])
 
-    list(run(prepare, range(len(steps))))
-    all_columns = np.concatenate(columns)
-    first_columns = np.cumsum([0, *(of_robot.size for of_robot in columns)])
-    weights, flow_weights, has_plain = _link_weights(steps)
-    flow_shares = np.array([1.0 if step.flows is None else 2.0**-step.flows.bits for step in steps], np.float32)
-    flow_gates = np.array([0.0 if step.flows is None else step.flows.gate for step in steps], np.float32)
-    gammas = np.array([step.gamma for step in steps], np.float32)
+MOST_BRICKS = 1 << 15
+"""Largest number of bricks that are located at once: the table takes about 30 bytes for each octree and brick."""
 
-    def work(part: Int64Array) -> None:
-        consensus_kernels.team_step(
-            part[0], part[-1] + 1, table, all_columns, first_columns, weights, flow_weights, flow_shares, flow_gates,
-            has_plain, np.float32(quantum), gammas, int(update), num_classes, np.float32(clamp[0]),
-            np.float32(clamp[1]), layouts.reshape(-1, layouts.shape[2]), known.ravel(), needs_update,
-            *_scratch(num_classes, np.diff(first_columns).max()), changes, is_even,
-        )  # fmt: skip
 
-    list(run(work, parts_of(codes.size, threads)))
+class _TeamBricks:
+    """Bricks ``codes`` (n,) of all octrees of a team's steps; the robots' own ones get the layout of the new values."""
 
-    def finish(n: int) -> float:
-        largest = consensus_kernels.finish_step(
-            steps[n].own.bricks, indices[n], table, columns[n][OWN], changes[n], is_even[n], known_changed[n], revision
-        )
-        return float(largest)
+    def __init__(
+        self, steps: Sequence[Step], octrees: Sequence[SemanticOctree], codes: Int64Array, since: int, run: Run
+    ) -> None:
+        self._steps = steps
+        self._run = run
+        column_of = {id(octree): column for column, octree in enumerate(octrees)}
+        self._columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
+        self._table = brick_table(octrees, codes, since, run)
+        for step, columns in zip(steps, self._columns, strict=True):
+            if step.last_evidence is not None:
+                _copy_absent(self._table, step.last_evidence.find(codes), columns[LAST_EVIDENCE], columns[EVIDENCE])
+        shape, num_words = (len(steps), codes.size), self._table.masks.shape[2]
+        self._needs_update, self._known_changed, self._is_even = np.zeros((3, *shape), np.bool_)
+        self._changes, self._indices = np.zeros(shape, np.float32), np.empty(shape, np.int64)
+        self._layouts, self._known = np.empty((*shape, num_words), np.uint64), np.empty(shape, np.uint64)
 
-    return list(run(finish, range(len(steps))))
+        def expand(n: int) -> None:
+            own, columns = steps[n].own, self._columns[n]
+            self._needs_update[n] = steps[n].since is None
+            expanded = expand_to_columns(own, codes, self._table, columns, self._needs_update[n])
+            self._indices[n], self._layouts[n], self._known[n], self._known_changed[n] = expanded
+            storage.fill_table(own.bricks, self._indices[n], since, self._table, columns[OWN])
+
+        list(run(expand, range(len(steps))))
+
+    def update(self, update: Update, clamp: tuple[float, float], quantum: float, threads: Executor | None) -> None:
+        """Write the new values of the bricks that need it."""
+        columns = np.concatenate(self._columns)
+        first_columns = np.cumsum([0, *(of_robot.size for of_robot in self._columns)])
+        weights, flow_weights, has_plain = _link_weights(self._steps)
+        flows = [step.flows for step in self._steps]
+        shares = np.array([1.0 if f is None else 2.0**-f.bits for f in flows], np.float32)
+        gates = np.array([0.0 if f is None else f.gate for f in flows], np.float32)
+        gammas = np.array([step.gamma for step in self._steps], np.float32)
+        num_classes = self._steps[0].own.num_classes
+
+        def work(part: Int64Array) -> None:
+            consensus_kernels.team_step(
+                part[0], part[-1] + 1, self._table, columns, first_columns, weights, flow_weights, shares, gates,
+                has_plain, np.float32(quantum), gammas, int(update), num_classes, np.float32(clamp[0]),
+                np.float32(clamp[1]), self._layouts.reshape(-1, self._layouts.shape[2]), self._known.ravel(),
+                self._needs_update, *_scratch(num_classes, np.diff(first_columns).max()), self._changes, self._is_even,
+            )  # fmt: skip
+
+        list(self._run(work, parts_of(self._known.shape[1], threads)))
+
+    def finish(self, revision: int) -> list[float]:
+        """Set the revisions of changed bricks and prune them; return each robot's largest change."""
+
+        def finish(n: int) -> float:
+            own, column = self._steps[n].own, self._columns[n][OWN]
+            largest = consensus_kernels.finish_step(
+                own.bricks, self._indices[n], self._table, column, self._changes[n], self._is_even[n],
+                self._known_changed[n], revision,
+            )  # fmt: skip
+            return float(largest)
+
+        return list(self._run(finish, range(len(self._steps))))
+
+
+def _copy_absent(table: BrickTable, indices: Int64Array, column: int, source: int) -> None:
+    """Copy the entries of the absent bricks of a column, where ``indices`` (n,) are -1, from the column ``source``."""
+    is_absent = indices < 0
+    for array in table:
+        array[column, is_absent] = array[source, is_absent]
 
 
 def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, BoolArray]:
@@ -171,20 +217,10 @@ def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, Bo
     return np.array(plain, np.float32), np.array(flowing, np.float32), np.array(has_plain)
 
 
-def _locate_bricks(steps: Sequence[Step], run: Run) -> tuple[int, Int64Array, BrickTable, list[Int64Array]]:
-    """Return the lowest ``since``, the codes (n,) of the bricks to update, their table, and each step's columns."""
-    since = min((step.since for step in steps if step.since is not None), default=0)
-    octrees = list({id(octree): octree for step in steps for octree in _octrees(step)}.values())
-    column_of = {id(octree): column for column, octree in enumerate(octrees)}
-    codes = union_codes(octrees, None if any(step.since is None for step in steps) else since)
-    columns = [np.array([column_of[id(octree)] for octree in _octrees(step)], np.int64) for step in steps]
-    return since, codes, brick_table(octrees, codes, since, run), columns
-
-
 def _octrees(step: Step) -> list[SemanticOctree]:
     """Return the octrees of a step in the order of the kernel's columns."""
     base = step.own if step.base is None else step.base
-    last = step.log_likelihood if step.last_log_likelihood is None else step.last_log_likelihood
+    last = step.log_likelihood if step.last_evidence is None else step.last_evidence
     return [step.own, base, step.log_likelihood, last, *step.neighbours]
 
 

@@ -221,7 +221,7 @@ class SemanticOctree:
 
         ``prior`` is h_0 [log-odds], which is added to the deviations.
         """
-        streams = self.streams()
+        streams = self.streams(self._occupied_bricks(prior) if occupied_only else None)
         codes, depths, is_vector = leaf_list(streams)
         if occupied_only:
             num_own = np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)
@@ -237,6 +237,12 @@ class SemanticOctree:
         sizes = np.exp2(KEY_BITS - depths.astype(np.float64)) * self.resolution
         centers = codes_to_keys(codes) * self.resolution + sizes[:, None] / 2
         return LeafTable(centers, sizes, leaf_values(streams, is_vector, self.num_classes) + np.float32(prior))
+
+    def _occupied_bricks(self, prior: float) -> Int64Array:
+        """Return the indices (n,) of the bricks with a value above free, which include those of all occupied leaves."""
+        largest = np.empty(self.num_bricks, np.float32)
+        storage.largest_values(self.bricks, largest)
+        return np.flatnonzero(largest + np.float32(prior) > 0)
 
     def spans(self) -> LeafSpans:
         """Return all leaves as spans of finest cells."""

@@ -111,7 +111,8 @@ def add_evidence(
     """Add the change of a robot's evidence since ``last_evidence`` [log-odds] to a mass, in place.
 
     Both are rounded to units before they are subtracted, so that the changes add up to the rounded evidence. Only
-    bricks with a revision of the evidence >= ``since`` are used. Changed bricks get ``revision``.
+    bricks with a revision of the evidence >= ``since`` are used; ``last_evidence`` has at least these bricks. Changed
+    bricks get ``revision``.
     """
     codes = evidence.codes[evidence.revisions >= since]
     _add_differences([(mass, [evidence, last_evidence])], codes, revision, of_evidence=True)

@@ -12,6 +12,7 @@ from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import casting, ends, evidence, storage
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.records import (
     CloudFrame,
     DepthFrame,
@@ -333,8 +334,13 @@ def _boxes(frame: Frame) -> Float64Array:
     return boxes
 
 
-def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int) -> None:
-    """Add the increments of one scan to an octree, in place; changed bricks get ``revision``."""
+def add_scan(
+    octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int, before: Snapshot | None = None
+) -> None:
+    """Add the increments of one scan to an octree, in place; changed bricks get ``revision``.
+
+    ``before`` is a snapshot of the octree from before its first scan with this revision.
+    """
     indices = octree.find_or_add(cells.codes)
     words = cells.marks.view(np.uint64)
     miss, least, most = np.float32(increments.miss), np.float32(increments.least), np.float32(increments.most)
@@ -343,6 +349,8 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
     evidence.wanted_rows(
         octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
     )
+    if before is not None:
+        before.save(octree.codes[indices[changes & (octree.revisions[indices] < revision)]])
     octree.expand_bricks(indices, wanted, known, changes)
     brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
     others = miss, np.float32(increments.hit_other), least, most

@@ -86,8 +86,9 @@ class Joining:
         if public is None:
             public = self._public[robot.index] = PublicMap(self._config, self._packet_codec, robot.source)
         evidence, exchange = robot.evidence.octree, self._exchanges[robot.index]
-        # Scans of a tick precede its publication, so their bricks count as changed before this version.
-        exchange.hold(robot.source, public.advance(evidence, evidence.revisions - 1, tick))
+        # The scans of a tick precede its publication.
+        mine = exchange.held.get(robot.source)
+        exchange.hold(robot.source, public.advance(evidence, 0 if mine is None else mine.version + 1, tick))
         return exchange.outbox(strangers, [robot.source], keep_alive=False)
 
     # --- search and joins ---------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -63,20 +62,24 @@ class _Component:
         self._since = 0 if self._is_new else number
         self._is_new = False
         sum_of_evidence(self.oracle, team.evidence(self.members), changed, number)
-        return self._compare_maps(team, graph).total_distance
+        maps, links = self._maps_and_links(team, graph)
+        return self._comparer.link_distance(maps, links, self._since, self._threads)
 
     def compare(self, team: Team[Robot], graph: CommunicationGraph) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
         """Comparison of the maps after a tick, arrays over the members, and the metrics of the pairs of members."""
+        maps, links = self._maps_and_links(team, graph)
+        least_tie = len(team.robots) * rest_difference(self._config, graph)
+        comparison = self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
         evidence = [team.robots[index].evidence.octree for index in self.members]
-        return self._compare_maps(team, graph), self._evidence_comparer.compare(evidence, self._since, self._threads)
+        return comparison, self._evidence_comparer.compare(evidence, self._since, self._threads)
 
-    def _compare_maps(self, team: Team[Robot], graph: CommunicationGraph) -> MapComparison:
-        """Comparison of the maps as they are, in bricks that changed in this tick."""
+    def _maps_and_links(
+        self, team: Team[Robot], graph: CommunicationGraph
+    ) -> tuple[list[SemanticOctree], list[tuple[int, int]]]:
+        """The members' maps, and the links between members as positions among them."""
         position = {index: place for place, index in enumerate(self.members)}
         links = [(position[i], position[j]) for i, j in graph.pairs if i in position and j in position]
-        maps = [team.robots[index].map for index in self.members]
-        least_tie = len(team.robots) * rest_difference(self._config, graph)
-        return self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
+        return [team.robots[index].map for index in self.members], links
 
     def spread(self, values: npt.NDArray[Any], num_robots: int) -> npt.NDArray[Any]:
         """Return values (M,) of the members as an array (N,) over the robots, 0 for other robots."""
@@ -238,7 +241,7 @@ class TickMeasurer:
             entries.append(
                 LinkMetrics(
                     sender=self._robot_ids[sender], receiver=self._robot_ids[receiver],
-                    **dataclasses.asdict(count), num_stale=receipt.num_stale, num_gaps=receipt.num_gaps,
+                    **vars(count), num_stale=receipt.num_stale, num_gaps=receipt.num_gaps,
                     num_damaged=receipt.num_damaged, bytes_per_second=count.sent_bytes / self._period_ns * 1e9,
                 )
             )  # fmt: skip

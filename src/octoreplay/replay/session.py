@@ -212,6 +212,7 @@ class Session:
         def publish(index: int) -> Publication:
             return robots[index].publication(graph.receivers(index), number, with_unpruned=with_unpruned)
 
+        self._each(lambda index: robots[index].advance_map(number), due)
         published = dict(zip(due, self._each(publish, due), strict=True))
         self._add_own_evidence(published, graph, number)
         for sender, publication in sorted(published.items()):

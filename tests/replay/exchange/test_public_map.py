@@ -12,6 +12,7 @@ from octoreplay.config.run import RunConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.records import ClassTable, SemanticClass
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
@@ -19,10 +20,12 @@ from support.long_suite import one_in
 from support.octree_factory import cells_of, octree_of
 
 SOURCE = Source(0, 0)
+CLASSES = ClassTable((SemanticClass(1, "wall", (1,), ()), SemanticClass(2, "ground", (2,), ())))
 
 
 def _public_map(**parameters):
-    config = RunConfig(robots=(RobotConfig("a", (Path("a.mcap"),)),)).with_parameters(parameters)
+    config = RunConfig(robots=(RobotConfig("a", (Path("a.mcap"),)),), classes=CLASSES)
+    config = config.with_parameters({"resolution": 0.25, **parameters})
     encoder = PacketCodec(config.packet)
     return PublicMap(config, encoder, SOURCE), encoder
 
@@ -48,20 +51,23 @@ def _changed_since(held, base):
 # --- exact ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_exact_public_map_is_a_copy_with_its_revisions():
+def test_an_exact_public_map_is_a_copy_that_keeps_its_versions():
     public, _ = _public_map()
     assert public.is_exact
     octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [-0.3, 0.7]})
-    held = public.advance(octree, np.array([3, 6]), 7)
+    held = public.advance(octree, 0, 7)
     assert held.version == 7
     assert cells_of(held.octree) == cells_of(octree)
-    assert held.octree.revisions.tolist() == [3, 6]
+    assert held.octree.revisions.tolist() == [6, 6]
     assert octree.revisions.tolist() == [1, 1]
     before = cells_of(held.octree)
-    octree.overwrite(octree_of({(0, 0, 0): [9.0, 9.0]}), np.arange(1), 7)
+    octree.overwrite(octree_of({(0, 0, 0): [9.0, 9.0], (0, 8, 0): [1.0, 1.0]}), np.arange(2), 7)
     assert cells_of(held.octree) == before
-    assert cells_of(public.advance(octree, octree.revisions, 8).octree) == cells_of(octree)
+    new = public.advance(octree, 7, 8)
+    assert cells_of(new.octree) == cells_of(octree)
+    assert sorted(new.octree.revisions.tolist()) == [6, 7, 7]
     assert cells_of(held.octree) == before
+    assert held.octree.revisions.tolist()[:2] == [6, 6]
 
 
 @pytest.mark.parametrize(
@@ -78,11 +84,12 @@ def test_an_inexact_public_map_is_marked(parameters):
 def test_a_map_that_did_not_change_is_published_without_a_copy(parameters):
     public, _ = _public_map(**parameters)
     octree = octree_of({(0, 0, 0): [1.0, 2.0], (4, 0, 0): [-0.3, 0.7]})
-    first = public.advance(octree, np.array([3, 6]), 7)
-    second = public.advance(octree, np.array([3, 6]), 8)
+    first = public.advance(octree, 0, 7)
+    second = public.advance(octree, 7, 8)
     assert second.octree is first.octree
     assert second.version == 8
-    third = public.advance(octree, np.array([3, 8]), 9)
+    octree.overwrite(octree_of({(0, 0, 0): [9.0, 9.0]}), np.arange(1), 8)
+    third = public.advance(octree, 8, 9)
     assert third.octree is not first.octree
 
 
@@ -107,7 +114,7 @@ def test_only_bricks_that_changed_after_rounding_get_a_revision(parameters, roun
     num_kept = 0
     for version in range(5, 12):
         octree = octree_of(cells)
-        held = public.advance(octree, np.full(octree.num_bricks, version - 1), version)
+        held = public.advance(octree, 0, version)
         expected = cells_of(rounded(octree))
         assert cells_of(held.octree) == expected
         assert held.version == version
@@ -132,7 +139,7 @@ def test_pruning_merges_close_values_only():
     close = {(x, y, z): [1.0 + 0.01 * (x + y + z), -1.0] for x in range(2) for y in range(2) for z in range(2)}
     far = {(4 + x, y, z): [1.0 + 0.2 * x, -1.0] for x in range(2) for y in range(2) for z in range(2)}
     octree = octree_of({**close, **far})
-    shown = cells_of(public.advance(octree, octree.revisions, 3).octree)
+    shown = cells_of(public.advance(octree, 0, 3).octree)
     assert len({shown[key] for key in close}) == 1
     assert {key: shown[key] for key in far} == {key: cells_of(octree)[key] for key in far}
 
@@ -143,7 +150,7 @@ def test_published_versions_do_not_change():
     versions = []
     for version in range(1, 6):
         octree = octree_of(_random_cells(random, 5))
-        held = public.advance(octree, np.full(octree.num_bricks, version - 1), version)
+        held = public.advance(octree, 0, version)
         versions.append((held, cells_of(held.octree)))
     assert all(cells_of(held.octree) == cells for held, cells in versions)
     assert len({str(cells) for _, cells in versions}) == 5
@@ -187,7 +194,7 @@ def test_within_a_budget_the_largest_changes_go_first(parameters, seed):
     cells = _random_cells(random, 36)
     octree = octree_of(cells)
     target = quantised(octree, parameters.get("content", "float32"), 0.05)
-    revisions = np.zeros(octree.num_bricks, np.int64)
+    octree.revisions[:] = 0
     before, num_versions = None, 0
     for version in range(1, 25):
         if version == 3:
@@ -196,12 +203,12 @@ def test_within_a_budget_the_largest_changes_go_first(parameters, seed):
             cells.update(changes)
             octree = octree_of(cells)
             changed = octree.find(octree_of(changes).codes)
-            revisions = np.zeros(octree.num_bricks, np.int64)
-            revisions[changed] = version - 1
+            octree.revisions[:] = 0
+            octree.revisions[changed] = version - 1
             target = quantised(octree, parameters.get("content", "float32"), 0.05)
         distances, is_new = _distances(target, before)
         waiting = [brick for brick in distances if distances[brick] > 0 or brick in is_new]
-        held = public.advance(octree, revisions, version)
+        held = public.advance(octree, version - 1, version)
         sent = _changed_since(held, version - 1)
         packet = encoder.packet(SOURCE, held, version - 1)
         assert len(packet) <= parameters["budget"]
@@ -230,7 +237,7 @@ def test_the_budget_is_shared_with_the_maps_of_others():
     sizes = []
     for num_shares in (1, 2, 4):
         public, encoder = _public_map(packets="delta", budget=8192)
-        held = public.advance(octree, np.zeros(octree.num_bricks, np.int64), 1, num_shares=num_shares)
+        held = public.advance(octree, 0, 1, num_shares=num_shares)
         sizes.append(len(encoder.packet(SOURCE, held, 0)))
         assert sizes[-1] <= 8192 // num_shares
     assert sizes[0] > sizes[1] > sizes[2] > 500
@@ -239,10 +246,10 @@ def test_the_budget_is_shared_with_the_maps_of_others():
 def test_cells_without_evidence_are_published():
     public, _ = _public_map(packets="delta", budget=1024)
     octree = octree_of({(0, 0, 0): [0.0, 0.0], (4, 1, 0): [2.0, 0.0]})
-    held = public.advance(octree, np.zeros(2, np.int64), 1)
+    held = public.advance(octree, 0, 1)
     assert cells_of(held.octree) == cells_of(octree)
     octree = octree_of({(0, 0, 0): [0.0, 0.0], (4, 1, 0): [2.0, 0.0], (4, 2, 0): [0.0, 0.0]})
-    held = public.advance(octree, np.zeros(2, np.int64), 2)
+    held = public.advance(octree, 0, 2)
     assert cells_of(held.octree) == cells_of(octree)
     assert _changed_since(held, 1) == [1]
 
@@ -250,7 +257,7 @@ def test_cells_without_evidence_are_published():
 def test_an_empty_map_is_published():
     public, encoder = _public_map(packets="delta", budget=1024)
     nothing = SemanticOctree(0.25, 2)
-    held = public.advance(nothing, nothing.revisions, 1)
+    held = public.advance(nothing, 0, 1)
     assert held.octree.num_bricks == 0
     assert isinstance(held, HeldMap)
     assert codec.read_header(encoder.packet(SOURCE, held, 0)).num_leaves == 0

@@ -162,16 +162,12 @@ class ResultWriter:
         self._start(metrics.stamp_ns)
         fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
         del fields["stamp_ns"], fields["pairs"], fields["places"]
-        fields["robots"] = [
-            message("octoreplay_msgs/msg/RobotMetrics", **dataclasses.asdict(robot)) for robot in metrics.robots
-        ]
-        fields["links"] = [
-            message("octoreplay_msgs/msg/LinkMetrics", **dataclasses.asdict(link)) for link in metrics.links
-        ]
+        fields["robots"] = [message("octoreplay_msgs/msg/RobotMetrics", **vars(robot)) for robot in metrics.robots]
+        fields["links"] = [message("octoreplay_msgs/msg/LinkMetrics", **vars(link)) for link in metrics.links]
         type_name = "octoreplay_msgs/msg/TickMetrics"
         value = message(type_name, header=header(metrics.stamp_ns, TEAM), **fields)
         self._writer.write(METRICS_TOPIC, type_name, value, metrics.stamp_ns)
-        pairs = [message("octoreplay_msgs/msg/PairMetrics", **dataclasses.asdict(pair)) for pair in metrics.pairs]
+        pairs = [message("octoreplay_msgs/msg/PairMetrics", **vars(pair)) for pair in metrics.pairs]
         type_name = "octoreplay_msgs/msg/Contradiction"
         value = message(
             type_name, header=header(metrics.stamp_ns, TEAM), tick=metrics.tick,

@@ -223,7 +223,7 @@ def _link_distance(bricks, link_ends, square):
 
 @kernel
 def compare_maps(
-    table, link_ends, prior, tie_share, least_tie, num_classes, scratch, int_scratch, places, distances,
+    table, link_ends, prior, tie_share, least_tie, num_classes, distances_only, scratch, int_scratch, places, distances,
     counts, entropies,
 ):  # fmt: skip
     """Contribution of each brick to the metrics.
@@ -236,6 +236,7 @@ def compare_maps(
     - ``tie_share``: float32, tolerance of ties as a share of a cell's largest |log-odds|.
     - ``least_tie``: float32, least tolerance of ties.
     - ``num_classes``: C.
+    - ``distances_only``: True where ``counts`` and ``entropies`` are not written.
     - ``scratch`` float32: room for N + 1 bricks of all classes and 6 + N of one class.
     - ``int_scratch`` (3 + N, 64) int32.
     - ``places`` (n,) int64: row of each brick in the outputs.
@@ -268,6 +269,13 @@ def compare_maps(
         for r in range(robots + 1):
             prefetch(table, ahead, r)
             _load_classes(bricks_at + r * width * BRICK_CELLS * 4, table, b, r, width)
+        repeats = num_classes if width == 1 else 1
+        distances[place, 1] = repeats * _pair_distance(bricks[:robots], total, weighted)
+        distances[place, 0] = distances[place, 1]
+        if not is_complete:
+            distances[place, 0] = repeats * _link_distance(bricks, link_ends, total)
+        if distances_only:
+            continue
         link_cells = 0
         for k in range(link_ends.shape[0]):
             link_cells += count_ones(table.known[link_ends[k, 0], b] | table.known[link_ends[k, 1], b])
@@ -302,8 +310,3 @@ def compare_maps(
         counts[place, 1] = num_occupied
         counts[place, 2] = _num_differing(bricks[:robots], labels, least_tied, differs, prior)
         counts[place, 3] = link_cells
-        repeats = num_classes if width == 1 else 1
-        distances[place, 1] = repeats * _pair_distance(bricks[:robots], total, weighted)
-        distances[place, 0] = distances[place, 1]
-        if not is_complete:
-            distances[place, 0] = repeats * _link_distance(bricks, link_ends, total)

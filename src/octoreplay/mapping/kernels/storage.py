@@ -377,6 +377,21 @@ def prune_brick(bricks, index):
         bricks.values[index] = first
 
 
+@kernel
+def largest_values(bricks, largest):
+    """Write the largest value of each brick of ``bricks`` into ``largest`` (n,) float32."""
+    for index in range(largest.size):
+        block = np.int64(bricks.blocks[index])
+        if block < 0:
+            largest[index] = bricks.values[index]
+            continue
+        most = bricks.rows[block, 0]
+        for row in range(block, block + num_rows(bricks.known[index], bricks.masks, index)):
+            for k in range(OCTETS):
+                most = max(most, bricks.rows[row, k])
+        largest[index] = most
+
+
 class BrickTable(NamedTuple):
     """Locations of the same n bricks in J octrees (columns). Valid until one of the octrees grows.
 

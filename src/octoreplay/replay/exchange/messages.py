@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.snapshot import Snapshot
 
 
 class Source(NamedTuple):
@@ -23,9 +24,14 @@ class HeldMap:
     All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio'.
     """
 
-    octree: SemanticOctree
+    content: SemanticOctree | Snapshot
     version: int
     weight: int = 0
+
+    @property
+    def octree(self) -> SemanticOctree:
+        """The map."""
+        return self.content.octree if isinstance(self.content, Snapshot) else self.content
 
 
 def _with_flipped_bit(data: bytes, place: int) -> bytes:

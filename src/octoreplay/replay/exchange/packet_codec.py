@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
+from weakref import ReferenceType, ref
 
 import numpy as np
 
@@ -10,8 +11,11 @@ from octoreplay.config.packets import PacketConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import MapVersion, PacketFormat
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, Source
+
+_PacketKey: TypeAlias = tuple[int, int, int | None]
 
 
 class PacketStamp(NamedTuple):
@@ -39,16 +43,19 @@ class PacketCodec:
             step=config.int8_step,
             zstd_level=config.zstd_level if config.packet_compression == "zstd" else None,
         )
-        # Keys are the octree's identity, version and base; the octree is kept so that its identity is not reused.
-        self._packets: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
-        self._older: dict[tuple[int, int, int | None], tuple[SemanticOctree, bytes]] = {}
+        # Packets of this tick and of the last one. Keys are the content's identity, version and base. The reference
+        # tells whether the identity was reused, and does not keep the content.
+        self._packets: dict[_PacketKey, tuple[ReferenceType[SemanticOctree | Snapshot], bytes]] = {}
+        self._older: dict[_PacketKey, tuple[ReferenceType[SemanticOctree | Snapshot], bytes]] = {}
         # Keys are the identities of the packets, which are kept for the same reason.
         self._states: dict[int, tuple[bytes, HeldMap]] = {}
 
     def packet(self, source: Source, held: HeldMap, base: int | None) -> bytes:
         """Packet of a full map (``base`` None), or of the changes after version ``base``."""
-        key = (id(held.octree), held.version, base)
-        entry = self._packets.get(key) or self._older.get(key) or (held.octree, self.encode(source, held, base))
+        key = (id(held.content), held.version, base)
+        entry = self._packets.get(key) or self._older.get(key)
+        if entry is None or entry[0]() is not held.content:
+            entry = ref(held.content), self.encode(source, held, base)
         self._packets[key] = entry
         return entry[1]
 
@@ -56,10 +63,11 @@ class PacketCodec:
         """Encode a packet; ``indices`` (n,) int64 selects bricks in place of all changed ones."""
         version = MapVersion(source.origin, source.epoch, held.version, base or 0, held.weight)
         if base is None:
-            return codec.pack(held.octree, held.octree.streams(), codec.FULL, self._format, version)
+            return codec.encode_packet(held.octree, packet_format=self._format, map_version=version)
+        octree = held.octree
         if indices is None:
-            indices = np.flatnonzero(held.octree.revisions >= base)
-        return codec.encode_delta(held.octree, indices, packet_format=self._format, map_version=version)
+            indices = np.flatnonzero(octree.revisions >= base)
+        return codec.encode_delta(octree, indices, packet_format=self._format, map_version=version)
 
     @staticmethod
     def stamp(data: bytes) -> PacketStamp:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakSet
+
 import numpy as np
 
 from octoreplay.config.packets import PacketConfig
@@ -12,6 +14,7 @@ from octoreplay.mapping.consensus import Step, Update, team_step
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import BRICK_CELLS, BRICK_DEPTH, SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import quantised, top_classes
+from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.mapping.streams import mask_bytes
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, Source
@@ -42,7 +45,7 @@ def check_budget(packet: PacketConfig, num_classes: int) -> None:
 
 
 class PublicMap:
-    """Versions of a robot's published map. Every version is an octree of its own, so that older versions stay valid.
+    """Published map of a robot, in versions. Earlier versions keep their content while a receiver holds them.
 
     ``is_exact`` is True where the published map equals the map in every tick.
     """
@@ -53,41 +56,51 @@ class PublicMap:
         self._tolerance = config.map.prune_tolerance
         self._packet_codec = packet_codec
         self._source = source
+        self._octree = SemanticOctree(config.map.resolution, config.classes.num_classes)
+        self._snapshots: WeakSet[Snapshot] = WeakSet()
         self._last: HeldMap | None = None
         self._comparer = MapComparer(2, 0.0)
         self._filled = 0
         self._bytes_per_brick = 100.0
 
-    def advance(self, octree: SemanticOctree, revisions: Int64Array, version: int, *, num_shares: int = 1) -> HeldMap:
-        """Next version of the map.
+    def advance(self, octree: SemanticOctree, since: int, version: int, *, num_shares: int = 1) -> HeldMap:
+        """Next version of the map. Bricks that change get the revision ``version`` - 1.
 
-        ``revisions`` (n,) int64 are the revisions of the octree's bricks, all below ``version``; those of bricks that
-        changed since the last version are at least that. ``num_shares`` maps share the budget.
+        Bricks of ``octree`` with revisions below ``since`` are as in the last version. ``num_shares`` maps share the
+        budget.
         """
-        last = self._last
-        if last is not None and self._packet.budget is None and not (revisions >= last.version).any():
-            self._last = HeldMap(last.octree, version)
+        last, since = self._last, 0 if self._last is None else since
+        if last is not None and self._packet.budget is None and not (octree.revisions >= since).any():
+            self._last = HeldMap(last.content, version)
             return self._last
-        public = octree.copy()
-        public.revisions[:] = revisions
-        if not self.is_exact:
-            public = self._within_packets(public, last, version, num_shares)
-        self._last = HeldMap(public, version)
-        return self._last
-
-    def _within_packets(
-        self, octree: SemanticOctree, last: HeldMap | None, version: int, num_shares: int
-    ) -> SemanticOctree:
-        """Next published octree: the last one, with the changes of ``octree`` that packets can hold."""
-        target = self._rounded(octree)
-        public = SemanticOctree(octree.resolution, octree.num_classes) if last is None else last.octree.copy()
         if self._packet.budget is None:
-            # Unchanged bricks keep their revisions and stay out of deltas.
-            team_step([Step(public, (), (), target, 0.0)], update=Update.COPY, revision=version - 1)
+            self._copy_changes(octree, since, version)
         else:
             least = least_budget(self._packet, octree.num_classes)
-            self._fill(public, target, version, max(self._packet.budget // num_shares, least))
-        return public
+            self._fill(self._rounded(octree), version, max(self._packet.budget // num_shares, least))
+        snapshot = Snapshot(self._octree)
+        self._snapshots.add(snapshot)
+        self._last = HeldMap(snapshot, version)
+        return self._last
+
+    def _copy_changes(self, octree: SemanticOctree, since: int, version: int) -> None:
+        """Copy the bricks that changed ``since`` a revision; bricks without a change of values keep their revisions."""
+        if self._tolerance > 0:
+            # A change may prune bricks beside it differently.
+            target, since = self._rounded(octree), 0
+        elif self.is_exact:
+            target = octree
+        else:
+            changed = SemanticOctree(octree.resolution, octree.num_classes)
+            changed.overwrite(octree, np.flatnonzero(octree.revisions >= since), since)
+            target = self._rounded(changed)
+        self._save(target.codes[target.revisions >= since])
+        team_step([Step(self._octree, (), (), target, 0.0, since=since)], update=Update.COPY, revision=version - 1)
+
+    def _save(self, codes: Int64Array) -> None:
+        """Save bricks for the versions that are still in use."""
+        for snapshot in list(self._snapshots):
+            snapshot.save(codes)
 
     def _rounded(self, octree: SemanticOctree) -> SemanticOctree:
         """Map with the values that packets can hold."""
@@ -101,8 +114,9 @@ class PublicMap:
             octree = top_classes(octree, self._packet.top_classes)
         return quantised(octree, self._packet.content, self._packet.int8_step)
 
-    def _fill(self, public: SemanticOctree, target: SemanticOctree, version: int, budget: int) -> None:
+    def _fill(self, target: SemanticOctree, version: int, budget: int) -> None:
         """Update as many bricks as fit into a packet, those with the largest change first."""
+        public = self._octree
         self._comparer.compare([public, target], target, [(0, 1)], self._filled - 1)
         self._filled = version
         codes, distances = self._comparer.brick_distances
@@ -124,6 +138,7 @@ class PublicMap:
             if best == order.size or 0.85 * budget < size <= 0.95 * budget:
                 break
             wanted = max(self._guess(order.size, budget), best + 1)
+        self._save(target.codes[order[:best]])
         public.overwrite(target, order[:best], version - 1)
 
     def _guess(self, num_bricks: int, budget: int) -> int:

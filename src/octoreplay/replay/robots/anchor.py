@@ -19,8 +19,6 @@ class Anchor:
 
     Attributes
     ----------
-    is_used : bool
-        True for a run with anchors.
     target : SemanticOctree or None
         log q_i + o; None for log q_i.
     absent : frozenset of int
@@ -32,7 +30,6 @@ class Anchor:
         self.absent: frozenset[int] = frozenset()
         self._config = config
         self._after = config.consensus.anchor_after
-        self.is_used = self._after > 0 and config.consensus.traits.has_gamma
         self._heard: dict[int, int] = {}
 
     def advance(
@@ -46,9 +43,9 @@ class Anchor:
         """Update the absent robots and the target for the iterations of a tick.
 
         ``origins`` are the robots whose maps arrived, ``own`` is the map h_i, ``log_likelihood`` log q_i, and ``last``
-        log q_i at the last iteration.
+        its bricks that changed since the last iteration, as they were.
         """
-        if not self.is_used:
+        if not self._config.consensus.has_anchor:
             return
         self._heard.update(dict.fromkeys(origins, tick))
         absent = frozenset(
@@ -58,5 +55,5 @@ class Anchor:
             self.absent = absent
             self.target = own.copy() if absent else None
         if self.target is not None:
-            step = Step(self.target, (), (), log_likelihood, 0.0, last_log_likelihood=last, since=tick)
+            step = Step(self.target, (), (), log_likelihood, 0.0, last_evidence=last, since=tick)
             team_step([step], update=Update.ADD, revision=tick)

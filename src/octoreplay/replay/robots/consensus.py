@@ -11,7 +11,7 @@ import numpy as np
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Flows, Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import Float64Array, Frame, Int64Array
+from octoreplay.records import Float64Array, Frame
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
@@ -33,9 +33,6 @@ class ConsensusRobot(Robot):
         self._last_step_tick = -1
         self._last_conditions: tuple[object, ...] = ()
         self._nothing = SemanticOctree(config.map.resolution, config.classes.num_classes)
-        # Bricks that got new evidence before the tick's publication, and those of them that kept its values since.
-        self._early: Int64Array = np.empty(0, np.int64)
-        self._unchanged: Int64Array = np.empty(0, np.int64)
         self._receivers: frozenset[int] = frozenset()
         self._anchor = Anchor(config)
 
@@ -45,26 +42,22 @@ class ConsensusRobot(Robot):
         if not self._rule.adds_evidence_first or self._scan_tick < tick:
             return
         self._update_log_likelihood(tick)
-        step = Step(
-            self.map, (), (), self._log_likelihood, 0.0, last_log_likelihood=self._last_log_likelihood, since=tick
-        )
+        step = Step(self.map, (), (), self._log_likelihood, 0.0, last_evidence=self._last_evidence.saved, since=tick)
         team_step([step], update=Update.ADD, revision=tick)
         self._keep_log_likelihood(tick)
         self._measure_map(tick)
 
+    def advance_map(self, tick: int) -> None:
+        """Advance the published map to this tick."""
+        # The iteration of a tick follows its publication.
+        last = self._published
+        self._published = self._public.advance(self.map, 0 if last is None else last.version, tick)
+        self.exchange.hold(self.source, self._published)
+
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Messages with the robot's map; without changes an empty delta, which keeps the link alive."""
-        revisions = self.map.revisions.copy()
-        if self._published is not None:
-            # The last version has the values of these bricks already.
-            unchanged = self.map.find(self._unchanged)
-            unchanged = unchanged[revisions[unchanged] == self._published.version]
-            revisions[unchanged] = self._published.version - 1
-        self._early = self.map.codes[revisions == tick]
-        revisions[revisions == tick] = tick - 1
-        self._published = self._public.advance(self.map, revisions, tick)
+        del tick
         self._receivers = frozenset(receivers)
-        self.exchange.hold(self.source, self._published)
         return self.exchange.outbox(receivers, [self.source], keep_alive=True)
 
     def next_step(self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, tick: int) -> Step:
@@ -89,7 +82,7 @@ class ConsensusRobot(Robot):
     def end_step(self, tick: int) -> None:
         """Complete the iteration of ``next_step``."""
         self._finish_step(tick)
-        self._end_tick(tick)
+        self._measure_map(tick)
 
     def iterate_on_arrival(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, tick: int
@@ -111,26 +104,15 @@ class ConsensusRobot(Robot):
                 quantum=quantum_in(self._config, phase),
             )  # fmt: skip
             self._finish_step(tick)
-        self._end_tick(tick)
+        self._measure_map(tick)
         # One arrival may undo the change of another, so the change over the whole tick counts.
         return self._change_since(before, tick)
 
     def _begin_step(self, arrived: Sequence[Arrival], tick: int) -> None:
-        """Prepare the evidence for the iterations of a tick, and the revisions for what they change."""
-        if self._has_published(tick):
-            self.map.revisions[self.map.find(self._early)] = tick - 1
+        """Prepare the evidence for the iterations of a tick."""
         self._update_log_likelihood(tick)
         origins = (source.origin for source, _ in arrived)
-        self._anchor.advance(origins, self.map, self._log_likelihood, self._last_log_likelihood, tick)
-
-    def _end_tick(self, tick: int) -> None:
-        """Restore the revisions of bricks with new evidence that the iterations did not change."""
-        if self._has_published(tick):
-            early = self.map.find(self._early)
-            unchanged = early[self.map.revisions[early] < tick]
-            self._unchanged = self.map.codes[unchanged]
-            self.map.revisions[unchanged] = tick
-        self._measure_map(tick)
+        self._anchor.advance(origins, self.map, self._log_likelihood, self._last_evidence.saved, tick)
 
     def _step(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, gamma: float,
@@ -145,7 +127,7 @@ class ConsensusRobot(Robot):
         target = self._log_likelihood if self._anchor.target is None else self._anchor.target
         return Step(
             self.map, neighbours, [float(step_weights[source.origin]) for source, _ in arrived], target, gamma, base,
-            self._last_log_likelihood, since, self._flows(arrived, phase, tick),
+            self._last_evidence.saved if self._keeps_last else None, since, self._flows(arrived, phase, tick),
         )  # fmt: skip
 
     def _flows(self, arrived: Sequence[Arrival], phase: Phase, tick: int) -> Flows | None:
@@ -188,7 +170,7 @@ class ConsensusRobot(Robot):
     def _finish_step(self, tick: int) -> None:
         """Count an iteration and store its evidence."""
         self.num_iterations += 1
-        if self._rule.keeps_last_evidence or self._anchor.is_used:
+        if self._keeps_last:
             self._keep_log_likelihood(tick)
 
 

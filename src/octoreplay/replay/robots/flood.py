@@ -15,6 +15,7 @@ import numpy as np
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
@@ -30,20 +31,27 @@ class FloodRobot(Robot):
     def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
         super().__init__(index, config, packet_codec, epoch)
         self._public = PublicMap(config, packet_codec, self.source)
+        self._published_tick = -1
         self._summed: dict[Source, int] = {}
+
+    def advance_map(self, tick: int) -> None:
+        """Advance the published evidence to this tick."""
+        self._update_log_likelihood(tick)
+        mine = self.exchange.held.get(self.source)
+        if not self._is_behind(mine):
+            return
+        # The scans of a tick precede its publication.
+        new = self._public.advance(
+            self._log_likelihood, self._published_tick + 1, tick, num_shares=max(len(self.exchange.held), 1)
+        )
+        self._published_tick = tick
+        if mine is None or (new.octree.revisions >= mine.version).any():
+            self.exchange.hold(self.source, new)
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Evidence, by origin, that the neighbours are not known to hold."""
-        self._update_log_likelihood(tick)
-        held = self.exchange.held
-        mine = held.get(self.source)
-        evidence = self._log_likelihood
-        if self._is_behind(mine):
-            # Scans of a tick precede its publication, so their bricks count as changed before this version.
-            new = self._public.advance(evidence, evidence.revisions - 1, tick, num_shares=max(len(held), 1))
-            if mine is None or (new.octree.revisions >= mine.version).any():
-                self.exchange.hold(self.source, new)
-        return self.exchange.outbox(receivers, sorted(held), keep_alive=False)
+        del tick
+        return self.exchange.outbox(receivers, sorted(self.exchange.held), keep_alive=False)
 
     def sum_up(self, arrived: Sequence[Arrival], tick: int) -> float:
         """Update the sum where evidence changed; the largest change of a log-odds."""
@@ -58,11 +66,13 @@ class FloodRobot(Robot):
         octrees[self.source] = self._log_likelihood
         share = 1.0 / len(self._config.robots)
         terms = [Evidence(octrees[source], scale=share) for source in sorted(octrees)]
-        before = self.map.copy()
-        sum_of_evidence(self.map, terms, np.unique(np.concatenate(changed)), tick)
+        codes = np.unique(np.concatenate(changed))
+        before = Snapshot(self.map)
+        before.save(codes)
+        sum_of_evidence(self.map, terms, codes, tick)
         self.num_iterations += 1
         self._measure_map(tick)
-        return self._change_since(before, tick)
+        return self._change_since(before.saved, tick)
 
     def _is_behind(self, mine: HeldMap | None) -> bool:
         """True when some of the evidence is not published, because it is new or held back by the budget."""

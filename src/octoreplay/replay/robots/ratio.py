@@ -39,6 +39,9 @@ class RatioRobot(Robot):
         self._receivers: frozenset[int] = frozenset()
         self._taken: dict[Source, HeldMap] = {}
 
+    def advance_map(self, tick: int) -> None:
+        """The running sums depend on the receivers, so ``publish`` advances them."""
+
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Share the mass among the receivers, and send the running sums."""
         self._pause(self._receivers.difference(receivers), tick)
@@ -73,13 +76,13 @@ class RatioRobot(Robot):
         """Add new evidence to the mass and compute the map; the largest change of a log-odds."""
         self._update_log_likelihood(tick)
         running_sums.add_evidence(
-            self.mass, self._log_likelihood, self._last_log_likelihood, self._likelihood_tick + 1, tick
+            self.mass, self._log_likelihood, self._last_evidence.saved, self._likelihood_tick + 1, tick
         )
         if self._weight >= running_sums.LEAST_WEIGHT:
             change = running_sums.recover_map(self.mass, self._weight, self.map, tick, REST * running_sums.UNIT)
         else:
             # Most of the mass is in transit and the rest is too coarse: new evidence is added to the last map instead.
-            step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_log_likelihood)
+            step = Step(self.map, (), (), self._log_likelihood, 0.0, None, self._last_evidence.saved)
             (change,) = team_step([step], update=Update.ADD, revision=tick)
         self._keep_log_likelihood(tick)
         self.num_iterations += 1

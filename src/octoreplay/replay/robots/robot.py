@@ -21,6 +21,7 @@ from octoreplay.mapping.sensor import (
     clamped_increments,
     unclamped_increments,
 )
+from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.mapping.stream_size import StreamMeter
 from octoreplay.mapping.streams import StreamSize
 from octoreplay.records import Float64Array, Frame, Int64Array
@@ -149,8 +150,11 @@ class Robot(ABC):
         self._own_sum = octree()
         self._scan_counts = octree(1) if config.consensus.evidence == "cell-average" else None
         self._log_likelihood = octree() if self._is_average else self._own_sum
-        self._last_log_likelihood = octree()
         self._scan_tick = -1
+        # log q_i as of the last iteration, for the rules that need it.
+        consensus = config.consensus
+        self._keeps_last = consensus.traits.keeps_last_evidence or consensus.has_anchor
+        self._last_evidence = Snapshot(self._log_likelihood)
         self._likelihood_tick = -1
         self._arrived: list[Arrival] = []
         self.map = octree()
@@ -174,7 +178,7 @@ class Robot(ABC):
 
     def _octrees(self) -> list[SemanticOctree]:
         """The robot's octrees, possibly with repetitions."""
-        octrees = [self._own_sum, self._log_likelihood, self._last_log_likelihood, self.map]
+        octrees = [self._own_sum, self._log_likelihood, self._last_evidence.saved, self.map]
         return octrees if self._scan_counts is None else [*octrees, self._scan_counts]
 
     # --- scans --------------------------------------------------------------------------------------------------------
@@ -183,7 +187,8 @@ class Robot(ABC):
         """Add the scans of one tick to the evidence."""
         for frame in frames:
             cells = self._caster.cast(frame)
-            add_scan(self._own_sum, cells, self._increments, tick)
+            before = self._last_evidence if self._keeps_last and not self._is_average else None
+            add_scan(self._own_sum, cells, self._increments, tick, before)
             if self._scan_counts is not None:
                 add_scan(self._scan_counts, cells, COUNT_SCANS, tick)
             self.num_scans += 1
@@ -203,12 +208,14 @@ class Robot(ABC):
     def _update_log_likelihood(self, tick: int) -> None:
         """Update log q_i with the scans of this tick; with evidence 'sum' it is the evidence itself."""
         if self._is_average:
-            sum_of_evidence(self._log_likelihood, [self.evidence], self.changed_evidence(tick), tick)
+            changed = self.changed_evidence(tick)
+            if self._keeps_last:
+                self._last_evidence.save(changed)
+            sum_of_evidence(self._log_likelihood, [self.evidence], changed, tick)
 
     def _keep_log_likelihood(self, tick: int) -> None:
-        """Store log q_i as that of the last iteration."""
-        changed = np.flatnonzero(self._log_likelihood.revisions > self._likelihood_tick)
-        self._last_log_likelihood.overwrite(self._log_likelihood, changed, tick)
+        """Note that log q_i is that of the last iteration."""
+        self._last_evidence = Snapshot(self._log_likelihood)
         self._likelihood_tick = tick
 
     # --- exchange -----------------------------------------------------------------------------------------------------
@@ -236,6 +243,13 @@ class Robot(ABC):
             unpruned_bytes=codec.HEADER_BYTES + plain if with_unpruned else 0,
             unpruned_compressed_bytes=compressed if with_unpruned else 0,
         )
+
+    @abstractmethod
+    def advance_map(self, tick: int) -> None:
+        """Advance the published map to this tick; precedes ``publish``.
+
+        Robots that forward maps read those of others in ``publish``, so all robots' maps are advanced before.
+        """
 
     @abstractmethod
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
