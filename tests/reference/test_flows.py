@@ -68,6 +68,27 @@ def test_a_flow_that_is_not_0_lowers_the_sum_of_squares(own, other, weight, flow
     assert after < before if amount.any() else after == before
 
 
+@examples(200)
+@given(own=log_odds, other=log_odds, gate=st.sampled_from([0.0, 0.25, 0.5, 1.0]))
+def test_the_gate_is_the_same_at_both_ends(own, other, gate):
+    blocks = np.array([0, 0, 1, 1])
+    here = flows.is_held_back(own, other, blocks, gate)
+    np.testing.assert_array_equal(here, flows.is_held_back(other, own, blocks, gate))
+    np.testing.assert_array_equal(here[::2], here[1::2])
+    if gate == 0.0:
+        np.testing.assert_array_equal(here[:, 0], np.repeat((own == other).all(axis=1).reshape(2, 2).all(axis=1), 2))
+
+
+def test_a_gate_opens_for_labels_and_for_differences():
+    own = np.array([[0.0, 1.0, 0.5], [0.0, 1.0, 0.5], [0.0, 1.0, 0.5], [0.0, -1.0, -1.0], [0.0, 0.0, 0.0]])
+    other = np.array([[0.0, 1.0, 1.5], [0.0, 2.0, 1.0], [0.0, 2.0, 1.1], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    each = np.arange(5)
+    # Cell 0 has other labels. The others differ by 1/2, 1/2, 1 and 0 of the largest.
+    assert flows.is_held_back(own, other, each, 0.5)[:, 0].tolist() == [False, False, False, False, True]
+    assert flows.is_held_back(own, other, each, 0.75)[:, 0].tolist() == [False, True, True, False, True]
+    assert flows.is_held_back(own, other, each // 2, 0.75)[:, 0].tolist() == [False, False, False, False, True]
+
+
 # --- teams -----------------------------------------------------------------------------------------------------------
 
 
@@ -97,12 +118,34 @@ def random_team(seed, num_robots, num_ticks, *, last_evidence=None, **options):
     num_robots=st.integers(2, 6),
     mode=st.sampled_from(["sync", "on-arrival"]),
     quantum=st.sampled_from([2.0**-16, 2.0**-12, 2.0**-6]),
+    gate=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(seed, num_robots, mode, quantum):
-    config, recording = random_team(seed, num_robots, 220, mode=mode, quantum=quantum)
+def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(seed, num_robots, mode, quantum, gate):
+    config, recording = random_team(seed, num_robots, 220, mode=mode, quantum=quantum, flow_gate=gate)
     tick = check_conservation(config, recording)
     assert tick.tick == 219
     assert tick.maps.any()
+
+
+@examples(50)
+@given(seed=st.integers(0, 2**32), num_robots=st.integers(2, 5))
+def test_a_team_at_rest_with_a_gate_has_the_labels_of_all_evidence(seed, num_robots):
+    """Where all maps have the same largest class, so has their sum, which is that of the evidence."""
+    config, recording = random_team(
+        seed, num_robots, 400, last_evidence=10, has_failures=False, flow_bits=20, flow_gate=1.0
+    )
+    before = None
+    for tick in Twin(config, recording, with_metrics=False).ticks():
+        is_at_rest = before is not None and (tick.maps == before).all()
+        before = tick.maps
+    assert is_at_rest
+    total = tick.evidence.sum(axis=0)
+    # Labels may still differ where the flows are below the quantum.
+    team = graph.team_graph(config.network, config.consensus, [r.robot_id for r in config.robots], tick.active)
+    least = 2.0 * team.epsilon * team.weights[team.weights > 0].min()
+    for log_odds in tick.maps:
+        value = np.take_along_axis(total, log_odds.argmax(axis=-1)[:, np.newaxis], axis=-1)[:, 0]
+        assert (total.max(axis=-1) - value <= 2 * num_robots**2 * QUANTUM / least).all()
 
 
 @long

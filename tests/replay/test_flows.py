@@ -31,6 +31,7 @@ TEAMS = (
     {"topology": "ring", "schedule": (ScheduleEntry(4.0, 8.0, robots_off=("robot_1",)),)},
     {"topology": "ring", "packets": "delta", "content": "int8", "flow_bits": 4},
     {"topology": "line", "period": 3.0},
+    {"topology": "ring", "packets": "delta", "flow_gate": 1.0},
 )
 
 
@@ -51,17 +52,20 @@ def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(parameters
     assert num_mixed > tick.number / 2
 
 
-def _num_moved(flow_bits):
-    """Bricks of all maps that changed, summed over the ticks after the last new evidence of a ring."""
+def _num_moved(flow_bits, flow_gate=0.0):
+    """Bricks of all maps that changed in a tick of a ring, summed over the ticks of the logs."""
+    config = configured(rule="bayes", topology="ring", flow_bits=flow_bits, flow_gate=flow_gate, settle=0)
     return sum(
-        np.count_nonzero(octree.revisions == tick.number)
-        for tick in session_of(configured(rule="bayes", topology="ring", flow_bits=flow_bits, settle=0)).ticks()
-        for octree in tick.maps
+        np.count_nonzero(octree.revisions == tick.number) for tick in session_of(config).ticks() for octree in tick.maps
     )
 
 
 def test_fewer_bricks_move_with_flows_than_without():
     assert _num_moved(4) < 0.9 * _num_moved(0)
+
+
+def test_fewer_bricks_move_with_a_gate():
+    assert _num_moved(6, 1.0) < _num_moved(6, 0.5) < _num_moved(6)
 
 
 def test_neighbours_at_rest_differ_by_less_than_the_bound():
@@ -72,7 +76,11 @@ def test_neighbours_at_rest_differ_by_less_than_the_bound():
         assert np.abs(maps[i] - maps[j]).max() < QUANTUM / tick.graph.weights[i, j]
 
 
-@pytest.mark.parametrize("parameters", [{"topology": "ring"}, {"topology": "line", "schedule": (GROUPS,)}], ids=str)
+@pytest.mark.parametrize(
+    "parameters",
+    [{"topology": "ring"}, {"topology": "line", "schedule": (GROUPS,)}, {"topology": "line", "flow_gate": 0.5}],
+    ids=str,
+)
 def test_skipping_bricks_at_rest_does_not_change_a_byte_of_the_deltas(parameters, monkeypatch):
     config = configured(rule="bayes", packets="delta", settle=2, **parameters)
     right, num_skipping, runs = consensus_module.team_step, 0, []

@@ -55,6 +55,14 @@ def test_six_robots(rule, mode, topology):
     assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
 
 
+@pytest.mark.parametrize(("gate", "mode", "topology"), one_in(5, [0.5, 1.0], MODES, ["line", "star"]))
+def test_flows_with_a_gate(gate, mode, topology):
+    outcome = compare(
+        SMALL, rule="bayes", mode=mode, topology=topology, flow_gate=gate, flow_bits=6, every=5, with_metrics=True
+    )
+    assert outcome.twin_tick.settling
+
+
 @pytest.mark.parametrize(("rule", "mode", "topology"), one_in(9, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""

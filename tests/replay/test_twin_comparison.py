@@ -157,7 +157,7 @@ def _flows_are_rounded_at_one_end(monkeypatch):
 
 def _flows_have_a_bit_more(monkeypatch):
     right = consensus_module.Flows
-    monkeypatch.setattr(consensus_module, "Flows", lambda bits, has_flow: right(bits + 1, has_flow))
+    monkeypatch.setattr(consensus_module, "Flows", lambda bits, *args: right(bits + 1, *args))
 
 
 def _flows_are_rounded_to_nearest_in_the_twin(monkeypatch):
@@ -167,6 +167,41 @@ def _flows_are_rounded_to_nearest_in_the_twin(monkeypatch):
 def _flow_steps_of_one_robot_in_the_twin(monkeypatch):
     right = flows.flow_steps
     monkeypatch.setattr(flows, "flow_steps", lambda own, other, *args: right(own, own, *args))
+
+
+def _gate_of(change):
+    """Fault in which ``change`` replaces the gate of every flow."""
+
+    def fault(monkeypatch):
+        right = consensus_module.Flows
+        monkeypatch.setattr(consensus_module, "Flows", lambda bits, has_flow, gate: right(bits, has_flow, change(gate)))
+
+    return fault
+
+
+def _gate_takes_labels_of_one_cell(monkeypatch):
+    """Let a cell flow alone, not its block, in the twin."""
+    right = flows.is_held_back
+    monkeypatch.setattr(
+        flows, "is_held_back", lambda own, other, blocks, gate: right(own, other, np.arange(len(own)), gate)
+    )
+
+
+def _gate_at_one_end(monkeypatch):
+    right = consensus_module.team_step
+
+    def without(step):
+        return dataclasses.replace(step, flows=step.flows and dataclasses.replace(step.flows, gate=0.0))
+
+    def wrong(steps, **kwargs):
+        return right([*steps[:1], *map(without, steps[1:])], **kwargs)
+
+    monkeypatch.setattr(consensus_module, "team_step", wrong)
+
+
+def _labels_do_not_open_the_gate(monkeypatch):
+    """Compare values alone in the twin."""
+    monkeypatch.setattr(flows, "have_common_label", lambda own, other: np.ones(len(own), np.bool_))
 
 
 def _evidence_comes_after_publishing(monkeypatch):
@@ -264,6 +299,25 @@ def test_the_comparison_fails_with_ties_that_are_absolute(monkeypatch):
     monkeypatch.setattr(MapComparer, "compare", absolute)
     with pytest.raises(AssertionError):
         compare_averages()
+
+
+@pytest.mark.parametrize(
+    ("gate", "mode", "fault"),
+    [
+        (0.5, "sync", _gate_of(lambda gate: 0.0)), (0.5, "on-arrival", _gate_of(lambda gate: 0.0)),
+        (0.5, "sync", _gate_of(lambda gate: 0.6)), (0.5, "sync", _gate_takes_labels_of_one_cell),
+        (0.5, "sync", _gate_at_one_end), (1.0, "sync", _labels_do_not_open_the_gate),
+    ],
+)  # fmt: skip
+def test_the_comparison_fails_with_a_fault_of_the_gate(monkeypatch, gate, mode, fault):
+    _compare_gate(gate, mode)
+    fault(monkeypatch)
+    with pytest.raises(AssertionError, match=LOG_ODDS_DIFFER):
+        _compare_gate(gate, mode)
+
+
+def _compare_gate(gate, mode):
+    compare(SMALL, topology="line", rule="bayes", mode=mode, flow_gate=gate, flow_bits=6, settle=0, every=5)
 
 
 def _each_robot(robots, name, change):

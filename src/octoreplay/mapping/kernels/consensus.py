@@ -287,8 +287,9 @@ def _add_flows(
 
 @kernel
 def team_step(
-    start, end, table, columns, first_columns, weights, flow_weights, flow_shares, flow_gates, has_plain, quantum, gammas,
-    update, num_classes, clamp_min, clamp_max, layouts, known, needs_update, scratch, int_scratch, changes, is_even,
+    start, end, table, columns, first_columns, weights, flow_weights, flow_shares, flow_gates, has_plain, quantum,
+    gammas, update, num_classes, clamp_min, clamp_max, layouts, known, needs_update, scratch, int_scratch, changes,
+    is_even,
 ):  # fmt: skip
     """One iteration of R robots, in place in their own maps.
 
