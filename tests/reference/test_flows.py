@@ -127,7 +127,7 @@ def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(seed, num_
     assert tick.maps.any()
 
 
-@examples(50)
+@examples(24)
 @given(seed=st.integers(0, 2**32), num_robots=st.integers(2, 5))
 def test_a_team_at_rest_with_a_gate_has_the_labels_of_all_evidence(seed, num_robots):
     """Where all maps have the same largest class, so has their sum, which is that of the evidence."""
