@@ -199,7 +199,7 @@ def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_sha
     - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
     - ``scratch_at``: address of three blocks of ``room`` bytes; the first holds m of the cells, and is kept.
     - ``spare_at``: address of one more block.
-    - ``terms_at``: address of 128 float32; the first 64 are the number of classes of the shared rows, and are kept.
+    - ``terms_at``: address of the number of classes of the shared rows, 64 float32.
     - ``octets``, ``num_shared``, ``rows``, ``room``: as for ``_add_gradient``.
     - ``gate``: float32 above 0.
     """
@@ -207,35 +207,42 @@ def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_sha
     base, other, largest = float_array(base_at, (size,)), float_array(map_at, (size,)), float_array(scratch_at, (size,))
     change_at, base_best_at, other_best_at = scratch_at + room, scratch_at + 2 * room, spare_at
     change, base_best = float_array(change_at, (size,)), float_array(base_best_at, (size,))
-    other_best = float_array(other_best_at, (size,))
-    terms, common = float_array(terms_at, (shared_size,)), float_array(terms_at + BRICK_CELLS * 4, (shared_size,))
+    other_best, terms = float_array(other_best_at, (size,)), float_array(terms_at, (shared_size,))
     zero = np.float32(0.0)
     for i in range(size):
         change[i] = abs(other[i] - base[i])
         base_best[i] = max(base[i], zero)
         other_best[i] = max(other[i], zero)
     for i in range(shared_size):
-        if terms[i] <= zero:
-            change[i], base_best[i], other_best[i] = zero, zero, zero
+        # Where every class has a row of its own, the shared row stands for none.
+        has_classes = terms[i] > zero
+        change[i] = change[i] if has_classes else zero
+        base_best[i] = base_best[i] if has_classes else zero
+        other_best[i] = other_best[i] if has_classes else zero
     for r in range(num_shared, rows):
         max_octet(change_at + octets[r] * ROW_BYTES, change_at + r * ROW_BYTES)
         max_octet(base_best_at + octets[r] * ROW_BYTES, base_best_at + r * ROW_BYTES)
         max_octet(other_best_at + octets[r] * ROW_BYTES, other_best_at + r * ROW_BYTES)
-    # 0 where one class is the best of both maps, below 0 elsewhere.
+    is_open = np.int32(0)
     for i in range(shared_size):
-        common[i] = min(-base_best[i], -other_best[i])
-        if terms[i] > zero:
-            common[i] = max(common[i], min(base[i] - base_best[i], other[i] - other_best[i]))
+        is_open |= np.int32(change[i] > zero) & np.int32(change[i] >= gate * largest[i])
+    if is_open != 0:
+        return False
     for r in range(num_shared, rows):
-        first = octets[r] * OCTETS
-        for k in range(OCTETS):
-            i, cell = r * OCTETS + k, first + k
-            common[cell] = max(common[cell], min(base[i] - base_best[cell], other[i] - other_best[cell]))
-    is_moving = np.int32(0)
+        copy_octet(base_best_at + r * ROW_BYTES, base_best_at + octets[r] * ROW_BYTES)
+        copy_octet(other_best_at + r * ROW_BYTES, other_best_at + octets[r] * ROW_BYTES)
+    # 0 where a class is the best of both maps, and below 0 elsewhere.
+    common_at, common = change_at, change
+    for i in range(size):
+        common[i] = min(base[i] - base_best[i], other[i] - other_best[i])
     for i in range(shared_size):
-        differs = change[i] > zero and change[i] >= gate * largest[i]
-        is_moving |= np.int32(differs) | np.int32(common[i] < zero)
-    return is_moving == 0
+        of_free = min(-base_best[i], -other_best[i])
+        common[i] = max(common[i], of_free) if terms[i] > zero else of_free
+    for r in range(num_shared, rows):
+        max_octet(common_at + octets[r] * ROW_BYTES, common_at + r * ROW_BYTES)
+    for i in range(shared_size):
+        is_open |= np.int32(common[i] < zero)
+    return is_open == 0
 
 
 @kernel
@@ -252,7 +259,7 @@ def _add_flows(
     - ``mixed_at``: address of the mixed map (rows, 8), in place.
     - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
     - ``scratch_at``, ``spare_at``: addresses of three blocks of ``room`` bytes and of one more.
-    - ``terms_at``: address of 128 float32.
+    - ``terms_at``: address of 64 float32.
     - ``octets``, ``num_shared``, ``rows``, ``room``, ``num_classes``: as for ``_add_gradient``.
     - ``weight``, ``share``, ``gate``, ``quantum``: float32; ``share`` is 2^-flow_bits, ``gate`` 0 holds nothing back.
     """
