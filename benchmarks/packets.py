@@ -141,7 +141,7 @@ def _codec(report: Report, options: argparse.Namespace) -> None:
         report.add(Row(f"{title}: grid / packet", smaller, ""))
         report.add(measured(f"{title}: encoding", encode, "ms"))
         report.add(measured(f"{title}: decoding", decode, "ms"))
-        report.add(measured(f"{title}: encoding + decoding, for 1 M cells", both, "ms", must=20.0))
+        report.add(measured(f"{title}: encoding + decoding, for 1 M cells", both, "ms", must=18.0, goal=12.0))
         _delta_speed(report, title, octree, changed, options.rounds)
 
 

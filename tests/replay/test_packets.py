@@ -9,6 +9,7 @@ import pytest
 
 from octoreplay.errors import ConfigError
 from octoreplay.mapping import codec
+from octoreplay.replay.exchange.packet_codec import PacketCodec
 from support.faulty_team import (
     PACKETS,
     RATIO_TOLERANCE,
@@ -57,6 +58,27 @@ def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
             assert others == [expected, expected]
     kinds = [{codec.read_header(data).kind for data in sent_packets(tick)} for tick in ticks]
     assert kinds[:2] == [{codec.FULL}, {codec.DELTA}]
+
+
+@pytest.mark.parametrize(
+    ("rule", "radio"),
+    one_in(
+        3, ["gradient", "bayes", "flood", "ratio", "merge"],
+        [{}, {"latency": 1.5, "loss": 0.3, "network_seed": 2}, {"content": "int8"}],
+    ),
+    ids=str,
+)  # fmt: skip
+def test_receivers_that_share_the_senders_state_have_the_maps_of_receivers_that_decode(monkeypatch, rule, radio):
+    radio = {} if rule == "ratio" and "content" in radio else radio
+
+    def maps_of(decodes):
+        monkeypatch.setattr(PacketCodec, "always_decodes", decodes)
+        session = session_of(configured(rule=rule, topology="ring", settle=2, settle_max=3, **radio))
+        return [[dense(octree) for octree in tick.maps] for tick in session.ticks()]
+
+    for shared, decoded in zip(maps_of(False), maps_of(True), strict=True):
+        # Decoded bricks may have other class rows, and the gradient's sums then other rounding.
+        np.testing.assert_allclose(shared, decoded, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

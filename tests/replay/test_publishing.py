@@ -14,6 +14,8 @@ from octoreplay.config.rules import RULES
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.replay import session as session_module
+from octoreplay.replay.exchange.packet_codec import PacketCodec
+from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.run import replay_team
 from octoreplay.replay.session import Session
 from octoreplay.result import open_result
@@ -92,6 +94,22 @@ def test_the_same_seed_gives_the_same_run_in_any_number_of_threads(rule, packets
     # Ends at the first tick with a difference.
     assert any(other[0] != first[0] for other, first in zip(run(1, 1), one, strict=False))
     assert sum(link.num_lost for metrics, _ in one for link in metrics.links) > 5
+
+
+@pytest.mark.parametrize(("radio", "keeps"), [({}, False), ({"latency": 1.5}, True)], ids=["at once", "late"])
+@pytest.mark.parametrize("rule", ["bayes", "natural"])
+def test_versions_are_kept_only_for_receivers_that_need_them(monkeypatch, rule, radio, keeps):
+    """Where receivers share the sender's state instead of decoding packets."""
+    monkeypatch.setattr(PacketCodec, "always_decodes", False)
+    saved = []
+    right = PublicMap._save
+    monkeypatch.setattr(
+        PublicMap, "_save", lambda self, codes: (saved.append(len(self._snapshots)), right(self, codes))
+    )
+    for tick in session_of(configured(rule=rule, topology="ring", **radio)).ticks():
+        del tick
+    assert len(saved) > 10
+    assert any(saved) == keeps
 
 
 @pytest.mark.parametrize("rule", ["natural", "flood", "ratio"])

@@ -131,7 +131,7 @@ def team_step(
     return [float(change) for change in largest]
 
 
-MOST_BRICKS = 1 << 15
+MOST_BRICKS = 1 << 14
 """Largest number of bricks that are located at once: the table takes about 30 bytes for each octree and brick."""
 
 

@@ -6,6 +6,7 @@ Values are deviations h - h_0 from the prior; an unknown cell has deviation 0. k
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple, Self
@@ -54,6 +55,10 @@ BRICK_ARRAYS = ("codes", "blocks", "values", "masks", "known", "revisions")
 
 CACHE_LINE = 64
 """Size of a cache line [byte]."""
+
+MAPPED_BYTES = 1 << 18
+"""Size from which arrays get memory of their own from the system, which gets it back at once [byte]. Growing octrees
+would leave gaps in the memory of the C library that add up to a third of a process."""
 
 
 class LeafSpans(NamedTuple):
@@ -298,6 +303,8 @@ def _grown(array: npt.NDArray[Any], used: int, wanted: int) -> npt.NDArray[Any]:
 def cache_aligned(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     """Return an uninitialised array that starts at a cache line: a vector load across two lines takes twice as long."""
     num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    if num_bytes >= MAPPED_BYTES:
+        return np.frombuffer(mmap.mmap(-1, num_bytes), dtype).reshape(shape)
     room = np.empty(num_bytes + CACHE_LINE, np.uint8)
     start = -room.ctypes.data % CACHE_LINE
     return room[start : start + num_bytes].view(dtype).reshape(shape)

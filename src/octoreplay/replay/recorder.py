@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
@@ -144,7 +145,8 @@ class Recorder:
         """Record one tick."""
         if self.last is None:
             self.start_ns = tick.stamp_ns
-        self.last = tick
+        # The messages hold versions of maps.
+        self.last = dataclasses.replace(tick, published=())
         self._add_up(tick.metrics)
         self._count_averaged(tick.graph)
         if self._writer is None:

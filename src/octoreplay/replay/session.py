@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import TypeVar
@@ -10,6 +11,7 @@ from typing import TypeVar
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import InputError
+from octoreplay.mapping.sensor import ScanCaster
 from octoreplay.records import Frame, RobotPose
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
 from octoreplay.replay.exchange.neighbours import Exchange
@@ -30,6 +32,13 @@ MAX_TICKS = 10_000_000
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+class _ThreadCaster(threading.local):
+    """Ray caster of each thread: its scratch memory is larger than most maps."""
+
+    def __init__(self, config: ResolvedRun) -> None:
+        self.caster = ScanCaster(config.effective_sensor, config.map, config.classes.num_classes)
 
 
 class Session:
@@ -91,6 +100,7 @@ class Session:
         self.team = make_team(config, self._packet_codec)
         self.joining = Joining(config, self._packet_codec, threads) if config.alignment.is_on_air else None
         self._reopen = reopen
+        self._of_thread = _ThreadCaster(config)
         self._links: Links[Content] = Links(config)
         self._measurer = TickMeasurer(config, threads)
         if self.joining is not None:
@@ -125,6 +135,8 @@ class Session:
             tick = self._exchange(number, start_ns + number * self._period_ns, phase)
             settling.note(tick.metrics.max_change)
             yield tick
+            # Its messages hold versions of maps.
+            del tick
             number += 1
         self.stop_reason = settling.stop_reason
 
@@ -187,7 +199,8 @@ class Session:
         def integrate(index: int) -> None:
             frames = self._timeline.frames_before(index, stamp_ns)
             kept = (frame for frame in frames if schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, elapsed))
-            self.team.robots[index].integrate((self._with_bodies(index, frame) for frame in kept), number)
+            scans = (self._with_bodies(index, frame) for frame in kept)
+            self.team.robots[index].integrate(scans, self._of_thread.caster, number)
 
         self._each(integrate, range(len(self.team.robots)))
         leaves = self.config.network.after_end == "leave"

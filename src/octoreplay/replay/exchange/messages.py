@@ -22,15 +22,17 @@ class HeldMap:
     """Immutable state of a robot's map, at the robot itself or at another.
 
     All revisions of its bricks are below ``version``. ``weight`` is the running sum of weights of rule 'ratio'.
+    ``content`` is None where the robot needs the version alone.
     """
 
-    content: SemanticOctree | Snapshot
+    content: SemanticOctree | Snapshot | None
     version: int
     weight: int = 0
 
     @property
     def octree(self) -> SemanticOctree:
-        """The map."""
+        """The map. Do not call it without content."""
+        assert self.content is not None
         return self.content.octree if isinstance(self.content, Snapshot) else self.content
 
 

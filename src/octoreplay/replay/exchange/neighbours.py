@@ -51,6 +51,18 @@ class Exchange:
         """Store a state of the robot's own map, to be sent by ``outbox``."""
         self._held[source] = held
 
+    def release(self, source: Source) -> None:
+        """Release the robot's own map before it changes; ``hold`` must follow."""
+        self._held.pop(source, None)
+
+    def forget_contents(self, own: Source) -> None:
+        """Forget the maps of others, but not their versions, where packets bring the state of the whole map."""
+        if self._codec.decodes or self._config.budget is not None:
+            return
+        for source, held in self._held.items():
+            if source != own and held.content is not None:
+                self._held[source] = HeldMap(None, held.version, held.weight)
+
     def outbox(
         self, receivers: Sequence[int], sources: Sequence[Source], *, keep_alive: bool
     ) -> list[tuple[tuple[int, ...], MapMessage]]:

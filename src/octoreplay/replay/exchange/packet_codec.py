@@ -52,6 +52,7 @@ class PacketCodec:
 
     def packet(self, source: Source, held: HeldMap, base: int | None) -> bytes:
         """Packet of a full map (``base`` None), or of the changes after version ``base``."""
+        assert held.content is not None
         key = (id(held.content), held.version, base)
         entry = self._packets.get(key) or self._older.get(key)
         if entry is None or entry[0]() is not held.content:

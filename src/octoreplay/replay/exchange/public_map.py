@@ -47,7 +47,14 @@ def check_budget(packet: PacketConfig, num_classes: int) -> None:
 class PublicMap:
     """Published map of a robot, in versions. Earlier versions keep their content while a receiver holds them.
 
-    ``is_exact`` is True where the published map equals the map in every tick.
+    Attributes
+    ----------
+    is_exact : bool
+        True where the published map equals the map in every tick.
+    octree : SemanticOctree
+        The last version.
+    version : int or None
+        Its tick; None before the first version.
     """
 
     def __init__(self, config: ResolvedRun, packet_codec: PacketCodec, source: Source) -> None:
@@ -56,9 +63,9 @@ class PublicMap:
         self._tolerance = config.map.prune_tolerance
         self._packet_codec = packet_codec
         self._source = source
-        self._octree = SemanticOctree(config.map.resolution, config.classes.num_classes)
+        self.octree = SemanticOctree(config.map.resolution, config.classes.num_classes)
+        self.version: int | None = None
         self._snapshots: WeakSet[Snapshot] = WeakSet()
-        self._last: HeldMap | None = None
         self._comparer = MapComparer(2, 0.0)
         self._filled = 0
         self._bytes_per_brick = 100.0
@@ -69,19 +76,15 @@ class PublicMap:
         Bricks of ``octree`` with revisions below ``since`` are as in the last version. ``num_shares`` maps share the
         budget.
         """
-        last, since = self._last, 0 if self._last is None else since
-        if last is not None and self._packet.budget is None and not (octree.revisions >= since).any():
-            self._last = HeldMap(last.content, version)
-            return self._last
-        if self._packet.budget is None:
-            self._copy_changes(octree, since, version)
-        else:
+        since = 0 if self.version is None else since
+        if self._packet.budget is not None:
             least = least_budget(self._packet, octree.num_classes)
             self._fill(self._rounded(octree), version, max(self._packet.budget // num_shares, least))
-        snapshot = Snapshot(self._octree)
+        elif (octree.revisions >= since).any():
+            self._copy_changes(octree, since, version)
+        self.version, snapshot = version, Snapshot(self.octree)
         self._snapshots.add(snapshot)
-        self._last = HeldMap(snapshot, version)
-        return self._last
+        return HeldMap(snapshot, version)
 
     def _copy_changes(self, octree: SemanticOctree, since: int, version: int) -> None:
         """Copy the bricks that changed ``since`` a revision; bricks without a change of values keep their revisions."""
@@ -95,7 +98,7 @@ class PublicMap:
             changed.overwrite(octree, np.flatnonzero(octree.revisions >= since), since)
             target = self._rounded(changed)
         self._save(target.codes[target.revisions >= since])
-        team_step([Step(self._octree, (), (), target, 0.0, since=since)], update=Update.COPY, revision=version - 1)
+        team_step([Step(self.octree, (), (), target, 0.0, since=since)], update=Update.COPY, revision=version - 1)
 
     def _save(self, codes: Int64Array) -> None:
         """Save bricks for the versions that are still in use."""
@@ -116,7 +119,7 @@ class PublicMap:
 
     def _fill(self, target: SemanticOctree, version: int, budget: int) -> None:
         """Update as many bricks as fit into a packet, those with the largest change first."""
-        public = self._octree
+        public = self.octree
         self._comparer.compare([public, target], target, [(0, 1)], self._filled - 1)
         self._filled = version
         codes, distances = self._comparer.brick_distances

@@ -11,6 +11,7 @@ import numpy as np
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Flows, Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.sensor import ScanCaster
 from octoreplay.records import Float64Array, Frame
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
@@ -27,7 +28,6 @@ class ConsensusRobot(Robot):
         self._rule = config.consensus.traits
         self._update = update
         self._public = PublicMap(config, packet_codec, self.source)
-        self._published: HeldMap | None = None
         self._has_budget = config.effective_packet.budget is not None
         self._used: dict[Source, int] = {}
         self._last_step_tick = -1
@@ -36,9 +36,9 @@ class ConsensusRobot(Robot):
         self._receivers: frozenset[int] = frozenset()
         self._anchor = Anchor(config)
 
-    def integrate(self, frames: Iterable[Frame], tick: int) -> None:
+    def integrate(self, frames: Iterable[Frame], caster: ScanCaster, tick: int) -> None:
         """Add the scans of one tick to the evidence, and to the map for rules that do so before they publish."""
-        super().integrate(frames, tick)
+        super().integrate(frames, caster, tick)
         if not self._rule.adds_evidence_first or self._scan_tick < tick:
             return
         self._update_log_likelihood(tick)
@@ -50,9 +50,8 @@ class ConsensusRobot(Robot):
     def advance_map(self, tick: int) -> None:
         """Advance the published map to this tick."""
         # The iteration of a tick follows its publication.
-        last = self._published
-        self._published = self._public.advance(self.map, 0 if last is None else last.version, tick)
-        self.exchange.hold(self.source, self._published)
+        self.exchange.release(self.source)
+        self.exchange.hold(self.source, self._public.advance(self.map, self._public.version or 0, tick))
 
     def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
         """Messages with the robot's map; without changes an empty delta, which keeps the link alive."""
@@ -82,7 +81,7 @@ class ConsensusRobot(Robot):
     def end_step(self, tick: int) -> None:
         """Complete the iteration of ``next_step``."""
         self._finish_step(tick)
-        self._measure_map(tick)
+        self._end_tick(tick)
 
     def iterate_on_arrival(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, tick: int
@@ -104,7 +103,7 @@ class ConsensusRobot(Robot):
                 quantum=quantum_in(self._config, phase),
             )  # fmt: skip
             self._finish_step(tick)
-        self._measure_map(tick)
+        self._end_tick(tick)
         # One arrival may undo the change of another, so the change over the whole tick counts.
         return self._change_since(before, tick)
 
@@ -113,6 +112,11 @@ class ConsensusRobot(Robot):
         self._update_log_likelihood(tick)
         origins = (source.origin for source, _ in arrived)
         self._anchor.advance(origins, self.map, self._log_likelihood, self._last_evidence.saved, tick)
+
+    def _end_tick(self, tick: int) -> None:
+        """Complete the iterations of a tick; an iteration uses only maps that arrived since the last one."""
+        self.exchange.forget_contents(self.source)
+        self._measure_map(tick)
 
     def _step(
         self, arrived: Sequence[Arrival], step_weights: Float64Array, phase: Phase, gamma: float,
@@ -145,13 +149,14 @@ class ConsensusRobot(Robot):
 
     def _has_published(self, tick: int) -> bool:
         """True where the robot published in this tick."""
-        return self._published is not None and self._published.version == tick
+        return self._public.version == tick
 
     def _published_octree(self, tick: int) -> SemanticOctree | None:
         """The published map of this tick; None where nothing was published or, without budget, an older version."""
-        if self._published is None or (self._published.version < tick and not self._has_budget):
+        version = self._public.version
+        if version is None or (version < tick and not self._has_budget):
             return None
-        return self._published.octree
+        return self._public.octree
 
     def _used_once(self, own: SemanticOctree, source: Source, held: HeldMap) -> SemanticOctree:
         """A neighbour's map, with the bricks of ``own`` where neither robot has sent the brick since the last use.

@@ -138,7 +138,6 @@ class Robot(ABC):
         self.T_team_sensor: Float64Array | None = None
         self.exchange = Exchange(config.effective_packet, packet_codec)
         self._config = config
-        self._caster = ScanCaster(config.effective_sensor, config.map, num_classes)
         self._increments = clamped_increments(config.effective_sensor, config.consensus.effective_quantum)
         self._is_average = config.consensus.evidence != "sum"
         if self._is_average:
@@ -183,10 +182,10 @@ class Robot(ABC):
 
     # --- scans --------------------------------------------------------------------------------------------------------
 
-    def integrate(self, frames: Iterable[Frame], tick: int) -> None:
+    def integrate(self, frames: Iterable[Frame], caster: ScanCaster, tick: int) -> None:
         """Add the scans of one tick to the evidence."""
         for frame in frames:
-            cells = self._caster.cast(frame)
+            cells = caster.cast(frame)
             before = self._last_evidence if self._keeps_last and not self._is_average else None
             add_scan(self._own_sum, cells, self._increments, tick, before)
             if self._scan_counts is not None:
