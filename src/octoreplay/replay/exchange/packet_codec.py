@@ -43,8 +43,8 @@ class PacketCodec:
             step=config.int8_step,
             zstd_level=config.zstd_level if config.packet_compression == "zstd" else None,
         )
-        # Packets of this tick and of the last one. Keys are the content's identity, version and base. The reference
-        # tells whether the identity was reused, and does not keep the content.
+        # Packets of this tick and the last one, for as long as their content exists. Keys are the content's identity,
+        # version and base.
         self._packets: dict[_PacketKey, tuple[ReferenceType[SemanticOctree | Snapshot], bytes]] = {}
         self._older: dict[_PacketKey, tuple[ReferenceType[SemanticOctree | Snapshot], bytes]] = {}
         # Keys are the identities of the packets, which are kept for the same reason.
@@ -56,7 +56,7 @@ class PacketCodec:
         key = (id(held.content), held.version, base)
         entry = self._packets.get(key) or self._older.get(key)
         if entry is None or entry[0]() is not held.content:
-            entry = ref(held.content), self.encode(source, held, base)
+            entry = ref(held.content, lambda _: self._drop(key)), self.encode(source, held, base)
         self._packets[key] = entry
         return entry[1]
 
@@ -88,6 +88,13 @@ class PacketCodec:
         if entry is None:
             entry = self._states[id(data)] = data, _decoded(data, mine)
         return entry[1]
+
+    def _drop(self, key: _PacketKey) -> None:
+        """Drop a packet whose content no longer exists."""
+        for packets in (self._packets, self._older):
+            entry = packets.get(key)
+            if entry is not None and entry[0]() is None:
+                packets.pop(key, None)
 
     def end_tick(self) -> None:
         """Drop the packets that no robot sent in this tick, and all decoded states."""
