@@ -129,9 +129,10 @@ class ConsensusRobot(Robot):
         elif base is not None and self._has_budget:
             neighbours = [self._used_once(base, source, held) for source, held in arrived]
         target = self._log_likelihood if self._anchor.target is None else self._anchor.target
+        last = self._last_evidence.saved if self._update is Update.MERGE else None
         return Step(
             self.map, neighbours, [float(step_weights[source.origin]) for source, _ in arrived], target, gamma, base,
-            self._last_evidence.saved if self._keeps_last else None, since, self._flows(arrived, phase, tick),
+            last, since, self._flows(arrived, phase, tick),
         )  # fmt: skip
 
     def _flows(self, arrived: Sequence[Arrival], phase: Phase, tick: int) -> Flows | None:
