@@ -344,13 +344,10 @@ def add_scan(octree: SemanticOctree, cells: TouchedCells, increments: Increments
         octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
     )
     octree.expand_bricks(indices, wanted, known, changes)
-    brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
-    others = miss, np.float32(increments.hit_other), least, most
-    num_words = storage.OCTETS * (octree.num_classes + 1) + 1
-    if increments.is_count or cells.strengths.size == 0:
-        scratch = np.empty((2, num_words), np.uint64)
-        evidence.apply_marks(*brick_marks, octree.num_classes, np.float32(increments.hit), *others, revision, scratch)
-    else:
-        strengths, scratch = cells.strengths.view(np.uint64), np.empty((3, num_words), np.uint64)
-        hits = increments.weighted_hits()
-        evidence.apply_weighted_marks(*brick_marks, strengths, octree.num_classes, hits, *others, revision, scratch)
+    is_weighted = not increments.is_count and cells.strengths.size > 0
+    hits = increments.weighted_hits() if is_weighted else np.full(256, increments.hit, np.float32)
+    evidence.apply_marks(
+        octree.bricks, indices[changes], cells.touched[changes], words,
+        cells.strengths if is_weighted else np.empty(0, np.uint8), octree.num_classes, hits, miss,
+        np.float32(increments.hit_other), least, most, revision, np.empty(storage.BRICK_CELLS, np.float32),
+    )  # fmt: skip
