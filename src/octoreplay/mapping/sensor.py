@@ -117,6 +117,8 @@ class ScanCaster:
         key space, and ConfigError where max_range is too long for the resolution.
         """
         origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
+        if not np.all(np.abs(np.floor(origin / self._resolution)) < storage.KEY_OFFSET):
+            raise self._outside(frame)
         self._find_runs(frame)
         runs = self._runs
         low, high = self._box(frame, origin)
@@ -198,8 +200,6 @@ class ScanCaster:
     def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
         """Return the lowest and highest key (3,) of the origin and all ends."""
         start = np.floor(origin / self._resolution)
-        if np.any(np.abs(start) >= storage.KEY_OFFSET):
-            raise self._outside(frame)
         low, high = start.astype(np.int64), start.astype(np.int64)
         ends.extend_bounds(self._runs.keys[: self._runs.num_runs], low, high)
         if np.any(low <= -storage.KEY_OFFSET) or np.any(high >= storage.KEY_OFFSET):

@@ -11,13 +11,13 @@ import numpy as np
 
 from octoreplay.mapping.kernels.compiler import allocating_kernel, inline_kernel, kernel
 
-_CUT = np.int16(255)
+_CUT = np.int32(255)
 """Kind of a ray that was cut at max_range; above every class_id."""
 
-_UNUSABLE = np.int16(0)
+_UNUSABLE = np.int32(0)
 """Kind of a point that frees its ray and hits nothing, such as one with an ignored label."""
 
-_UNLABELLED = np.int16(1)
+_UNLABELLED = np.int32(1)
 """Kind of a point in a scan without labels: class 1."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
@@ -26,7 +26,7 @@ NUM_RUNS, NUM_POINTS = 0, 1
 IS_OWN = 3
 """Row of a box after those of the three axes; its first number is 1 for the robot's own body, 0 for another robot's."""
 
-_NONE = np.int16(-1)
+_NONE = np.int32(-1)
 """Kind of a point that carries no information."""
 
 _FARTHEST_KEY = float(1 << 20)
@@ -37,6 +37,23 @@ _CLOSE = 1e-8
 
 _BLOCK = 1024
 """Number of points of a cloud that are processed together."""
+
+_SEGMENT = 64
+"""Number of neighbouring points that are computed again in float64 where float32 does not decide one of them."""
+
+_ROUNDING = np.float32(2.0**-20)
+"""Bound on the relative error of a float32 computation: 16 roundings of 2^-24 each. The longest chain in float32 is the
+coordinate of a pixel of a ray that was cut:
+
+    q = z (a + b) + c,  z = r / sqrt(s + t),  all inputs rounded once
+
+    s + t: 2, square root: 2, z: 4 roundings;  a + b: 2 (|a| + |b|);  product: 7 r (|a| + |b|);  q: 8 r (|a| + |b|) + 2
+
+with r the range in cells and |c| < 1. Twice this bound holds terms of second order and the float64 reference, with an
+error below 2^-33 cells, too."""
+
+_TINY = np.float32(1e-18)
+"""Depth [m] in float32 of smaller ones, with a square that does not underflow."""
 
 
 @allocating_kernel
@@ -69,58 +86,177 @@ def depth_to_runs(
     - ``counters`` (2,) int64: m at NUM_RUNS and n at NUM_POINTS, in place.
     """
     height, width = depth_image.shape
-    labelled = class_image.size > 0
-    least, most = min_range * min_range, max_range * max_range
     ratios = np.empty(width)
     for u in range(width):
         ratios[u] = (u - camera[2]) / camera[0]
-    z = np.empty(width)
+    slopes, squares = np.empty((3, width), np.float32), np.empty(width, np.float32)
+    downs, rest, base = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.int32)
+    farthest = 0.0
+    for axis in range(keys.shape[1]):
+        base[axis] = np.int32(np.floor(pose[axis, 3] / resolution))
+        rest[axis] = pose[axis, 3] / resolution - base[axis]
+        steepest = max(abs(camera[3]), abs(height - 1 - camera[3])) * abs(pose[axis, 1] / camera[1])
+        widest = 0.0
+        for u in range(width):
+            slope = pose[axis, 0] * ratios[u] + pose[axis, 2]
+            slopes[axis, u], squares[u] = slope / resolution, ratios[u] * ratios[u]
+            widest = max(widest, abs(slope))
+        farthest = max(farthest, max_range * (steepest + widest) / resolution)
+    tolerance = _ROUNDING * np.float32(farthest + 1.0)
+    # Boxes and rays to points need points in float64; a tolerance of half a cell decides no key.
+    is_rough = boxes.size + ends.size == 0 and tolerance < 0.5
+    z, near = np.empty(_SEGMENT), np.empty(width, np.float32)
     world = np.empty((3, width))
-    row_kinds = np.empty(width, np.int16)
-    row_keys = np.empty((3, width), np.int32)
+    row_kinds, row_keys = np.empty(width, np.int32), np.empty((3, width), np.int32)
+    is_unsure = np.ones(width, np.int32)
     starts = np.empty(width + 1, np.int32)
+    labels = np.empty(0, np.uint8)
     for v in range(height):
         ratio = (v - camera[3]) / camera[1]
-        _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z)
-        num_cut = 0
         plus = ratio * ratio + 1.0
-        for u in range(width):
-            distance = z[u] * z[u] * (ratios[u] * ratios[u] + plus)
-            kind = _UNLABELLED if (z[u] > 0.0) & (distance >= least) else _NONE
-            row_kinds[u] = _CUT if distance > most else kind
-            num_cut += distance > most
-        if labelled:
-            for u in range(width):
-                row_kinds[u] = class_image[v, u] if row_kinds[u] == _UNLABELLED else row_kinds[u]
-        if num_cut > 0:
-            for u in range(width):
-                square = ratios[u] * ratios[u] + plus
-                z[u] = max_range / np.sqrt(square) if row_kinds[u] == _CUT else z[u]
-        # range(3) would be unrolled: three times as much code to compile, and no faster.
-        for axis in range(keys.shape[1]):
-            along, down = pose[axis, 0], pose[axis, 1] * ratio
-            ahead, shift = pose[axis, 2], pose[axis, 3]
-            for u in range(width):
-                world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
+        if class_image.size > 0:
+            labels = class_image[v]
+        if is_rough:
+            _depths_of_row(depth_image[v], np.float32(depth_unit), np.float32(largest), special, meanings, _TINY, near)
+            _kinds_of_row(near, squares, np.float32(plus), min_range, max_range, labels, row_kinds, is_unsure)
+            for axis in range(keys.shape[1]):
+                downs[axis] = pose[axis, 1] * ratio / resolution
+            _keys_of_row(near, slopes, downs, rest, base, tolerance, row_keys, is_unsure)
+        if _sum(is_unsure) > 0:
+            for first in range(0, width, _SEGMENT):
+                part = slice(first, min(first + _SEGMENT, width))
+                if _sum(is_unsure[part]) > 0:
+                    depths = z[: part.stop - first]
+                    _depths_of_row(depth_image[v, part], depth_unit, largest, special, meanings, 0.0, depths)
+                    _exact_pixels(
+                        depths, ratios[part], ratio, plus, pose, resolution, min_range, max_range, labels[first:],
+                        world[:, part], row_kinds[part], row_keys[:, part],
+                    )  # fmt: skip
         if boxes.size + confidences.size > 0:
             _filter_points(world, width, v * width, confidences, boxes, row_kinds)
         num_runs = counters[NUM_RUNS]
-        _add_runs(world, row_kinds, width, resolution, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
+        _add_runs(world, row_kinds, width, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
         if confidences.size > 0:
             _sum_over_runs(confidences, v * width, starts, width, row_kinds, sums, num_runs)
 
 
 @inline_kernel
-def _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z):
-    """Write the depths of row ``v`` into ``z`` (W,) float64 [m], 0 without information; see depth_to_runs."""
+def _sum(numbers):
+    """Sum of ``numbers`` (n,) int32 as int32: a loop that also had a wider sum would compute in shorter vectors."""
+    total = np.int32(0)
+    for i in range(numbers.size):
+        total = np.int32(total + numbers[i])
+    return total
+
+
+@inline_kernel
+def _kinds_of_row(near, squares, plus, min_range, max_range, labels, kinds, is_unsure):
+    """Find the kinds of pixels, and cut rays at ``max_range``.
+
+    - ``near`` (W,) float32: depths [m], 0 without information; in place.
+    - ``squares`` (W,) float32, ``plus`` float32: squared length of a pixel's ray at depth 1 is squares + plus.
+    - ``min_range``, ``max_range``: as for depth_to_runs.
+    - ``labels`` (W,) uint8: class ids; size 0 for class 1 everywhere.
+    - ``kinds`` (W,) int32: output.
+    - ``is_unsure`` (W,) int32: output, 1 where float32 does not decide on which side of a limit the point is.
+    """
+    least, most = np.float32(min_range * min_range), np.float32(max_range * max_range)
+    least_margin, most_margin = _ROUNDING * least + _TINY, _ROUNDING * most
+    num_cut = np.int32(0)
+    for u in range(near.size):
+        distance = near[u] * near[u] * (squares[u] + plus)
+        is_sure = (abs(distance - least) > least_margin) & (abs(distance - most) > most_margin)
+        is_measured = near[u] > 0
+        kind = _UNLABELLED if is_measured & (distance >= least) else _NONE
+        kinds[u] = _CUT if distance > most else kind
+        is_unsure[u] = np.int32(is_measured & ~is_sure)
+        num_cut = np.int32(num_cut + (distance > most))
+    if labels.size > 0:
+        for u in range(near.size):
+            kinds[u] = np.int32(labels[u]) if kinds[u] == _UNLABELLED else kinds[u]
+    if num_cut > 0:
+        for u in range(near.size):
+            near[u] = np.float32(max_range) / np.sqrt(squares[u] + plus) if kinds[u] == _CUT else near[u]
+
+
+@inline_kernel
+def _keys_of_row(near, slopes, downs, rest, base, tolerance, keys, is_unsure):
+    """Compute keys in float32.
+
+    - ``near`` (W,) float32: depths [m].
+    - ``slopes`` (3, W) float32, ``downs`` (3,) float32: cells along each axis for a depth of 1 m are slopes + downs.
+    - ``rest`` (3,) float32, ``base`` (3,) int32: position of the sensor in its cell, and the cell.
+    - ``tolerance`` float32: bound on the error [cell].
+    - ``keys`` (3, W) int32: output.
+    - ``is_unsure`` (W,) int32: in place, 1 where the point is too close to a border of a cell.
+    """
+    # One loop for all axes reads and writes the other arrays once.
+    slopes_x, slopes_y, slopes_z = slopes[0], slopes[1], slopes[2]
+    keys_x, keys_y, keys_z = keys[0], keys[1], keys[2]
+    down_x, down_y, down_z = downs[0], downs[1], downs[2]
+    rest_x, rest_y, rest_z = rest[0], rest[1], rest[2]
+    base_x, base_y, base_z = base[0], base[1], base[2]
+    half = np.float32(0.5)
+    from_middle = half - tolerance
+    for u in range(near.size):
+        x = near[u] * (slopes_x[u] + down_x) + rest_x
+        y = near[u] * (slopes_y[u] + down_y) + rest_y
+        z = near[u] * (slopes_z[u] + down_z) + rest_z
+        cell_x, cell_y, cell_z = np.floor(x), np.floor(y), np.floor(z)
+        keys_x[u], keys_y[u], keys_z[u] = np.int32(cell_x) + base_x, np.int32(cell_y) + base_y, np.int32(cell_z) + base_z
+        off_x, off_y, off_z = abs(x - cell_x - half), abs(y - cell_y - half), abs(z - cell_z - half)
+        is_sure = max(max(off_x, off_y), off_z) < from_middle
+        is_unsure[u] |= np.int32((near[u] > 0) & ~is_sure)
+
+
+@inline_kernel
+def _exact_pixels(z, ratios, ratio, plus, pose, resolution, min_range, max_range, labels, world, kinds, keys):
+    """Compute pixels of one row in float64: kinds, points in the team's frame and keys. The other outputs follow these.
+
+    - ``z`` (n,) float64: depths [m], 0 without information; those of rays that are cut become depths at ``max_range``.
+    - ``ratios`` (n,) float64: x / z of each pixel; ``ratio``: y / z of the row, ``plus`` = ``ratio`` squared + 1.
+    - ``pose``, ``resolution``, ``min_range``, ``max_range``: as for depth_to_runs.
+    - ``labels`` (>= n,) uint8: class ids; size 0 for class 1 everywhere.
+    - ``world`` (3, n) float64: output, points [m].
+    - ``kinds`` (n,) int32, ``keys`` (3, n) int32: output.
+    """
+    least, most = min_range * min_range, max_range * max_range
+    num_cut = 0
     for u in range(z.size):
-        raw = depth_image[v, u]
-        value = raw * depth_unit
-        z[u] = value if (value > 0.0) & (value < np.inf) & (raw != largest) else 0.0
+        distance = z[u] * z[u] * (ratios[u] * ratios[u] + plus)
+        kind = _UNLABELLED if (z[u] > 0.0) & (distance >= least) else _NONE
+        kinds[u] = _CUT if distance > most else kind
+        num_cut += distance > most
+    if labels.size > 0:
+        for u in range(z.size):
+            kinds[u] = labels[u] if kinds[u] == _UNLABELLED else kinds[u]
+    if num_cut > 0:
+        for u in range(z.size):
+            square = ratios[u] * ratios[u] + plus
+            z[u] = max_range / np.sqrt(square) if kinds[u] == _CUT else z[u]
+    # range(3) would be unrolled: three times as much code to compile, and no faster.
+    for axis in range(pose.shape[0] - 1):
+        along, down = pose[axis, 0], pose[axis, 1] * ratio
+        ahead, shift = pose[axis, 2], pose[axis, 3]
+        for u in range(z.size):
+            world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
+    _coords_to_keys(world, z.size, resolution, keys)
+
+
+@inline_kernel
+def _depths_of_row(values, depth_unit, largest, special, meanings, least, z):
+    """Write the depths of the ``values`` (n,) of a depth image into ``z`` (n,) [m], 0 without information.
+
+    ``z`` is of the type of ``depth_unit``, ``largest`` and ``least``, float32 or float64. Depths above 0 are at least
+    ``least``; see depth_to_runs for the others.
+    """
+    for u in range(z.size):
+        value = z.dtype.type(values[u])
+        is_depth = (value > 0) & (value < np.inf) & (value != largest)
+        z[u] = max(value * depth_unit, least) if is_depth else least - least
     for k in range(special.size):
         for u in range(z.size):
-            raw = depth_image[v, u]
-            is_special = (raw == special[k]) | ((raw != raw) & (special[k] != special[k]))
+            is_special = (values[u] == special[k]) | ((values[u] != values[u]) & (special[k] != special[k]))
             z[u] = meanings[k] if is_special else z[u]
 
 
@@ -139,7 +275,7 @@ def depth_to_points(depth_image, depth_unit, slopes, farthest, largest, special,
     height, width = depth_image.shape
     z = np.empty(width)
     for v in range(height):
-        _depths_of_row(depth_image, v, depth_unit, largest, special, meanings, z)
+        _depths_of_row(depth_image[v], depth_unit, largest, special, meanings, 0.0, z)
         for u in range(width):
             depth, place = min(z[u], farthest), v * width + u
             points[place, 0] = depth * slopes[0, v, u]
@@ -167,7 +303,7 @@ def points_to_runs(
     sensor = np.empty((3, _BLOCK))
     squares = np.empty(_BLOCK)
     world = np.empty((3, _BLOCK))
-    block_kinds = np.empty(_BLOCK, np.int16)
+    block_kinds = np.empty(_BLOCK, np.int32)
     block_keys = np.empty((3, _BLOCK), np.int32)
     starts = np.empty(_BLOCK + 1, np.int32)
     for first in range(0, points.shape[0], _BLOCK):
@@ -202,27 +338,24 @@ def points_to_runs(
         if boxes.size + confidences.size > 0:
             _filter_points(world, size, first, confidences, boxes, block_kinds)
         num_runs = counters[NUM_RUNS]
-        _add_runs(
-            world, block_kinds, size, resolution, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters
-        )
+        _coords_to_keys(world, size, resolution, block_keys)
+        _add_runs(world, block_kinds, size, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
         if confidences.size > 0:
             _sum_over_runs(confidences, first, starts, size, block_kinds, sums, num_runs)
 
 
 @allocating_kernel
-def _add_runs(world, point_kinds, size, resolution, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
+def _add_runs(world, point_kinds, size, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
     """Append the runs of points to the outputs of depth_to_runs.
 
-    - ``world`` (3, >= size) float64: points in the team's frame [m].
-    - ``point_kinds`` (>= size,) int16: kinds of the points.
+    - ``world`` (3, >= size) float64: points in the team's frame [m]; not used where ``ends`` is empty.
+    - ``point_kinds`` (>= size,) int32: kinds of the points.
     - ``size``: number of points.
-    - ``resolution``: edge of a cell [m].
-    - ``point_keys`` (3, >= size) int32: output, keys of the points.
+    - ``point_keys`` (3, >= size) int32: keys of the points.
     - ``starts`` (>= size + 1,) int32: output, first point of each run, then ``size``.
     - ``keys``, ``kinds``, ``lengths``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
     """
-    _coords_to_keys(world, size, resolution, point_keys)
-    is_start = np.empty(size + 1, np.uint8)
+    is_start = np.empty(size + 1, np.int32)
     is_start[0] = 1
     for i in range(1, size):
         is_start[i] = (
@@ -263,7 +396,7 @@ def _filter_points(world, size, first, confidences, boxes, point_kinds):
     - ``size``: number of points.
     - ``first``: position of the first point in the scan.
     - ``confidences``, ``boxes``: as for depth_to_runs.
-    - ``point_kinds`` (>= size,) int16: in place.
+    - ``point_kinds`` (>= size,) int32: in place.
     """
     for i in range(size if confidences.size > 0 else 0):
         is_measured = (point_kinds[i] != _NONE) & (point_kinds[i] != _CUT)
@@ -288,7 +421,7 @@ def _sum_over_runs(confidences, first, starts, size, point_kinds, sums, place):
 
     - ``confidences`` (p,) uint8: of the scan.
     - ``first``: position of the first point in the scan.
-    - ``starts`` int32, ``size``, ``point_kinds`` int16: as for _add_runs.
+    - ``starts`` int32, ``size``, ``point_kinds`` int32: as for _add_runs.
     - ``sums`` int32: output, from position ``place`` on.
     - ``place``: number of runs before these.
     """
