@@ -29,6 +29,9 @@ IS_OWN = 3
 _NONE = np.int32(-1)
 """Kind of a point that carries no information."""
 
+_OPEN = np.uint8(1)
+"""Mark of a cell with a class to be voted on."""
+
 _FARTHEST_KEY = float(1 << 20)
 """Limit of keys, outside the key space and within 32 bits."""
 
@@ -79,7 +82,7 @@ def depth_to_runs(
     - ``boxes`` (b, 4, 6) float64: a row (r_x, r_y, r_z, t, low, high) for each axis. A box holds the points p in the
       team's frame with low <= r p + t <= high. Its points carry no information where the number at (IS_OWN, 0) is not
       0; otherwise they free their rays and hit nothing.
-    - ``keys`` (>= m + 1, 3) int32, ``kinds`` (>= m + 1,) uint8, ``lengths`` (>= m + 1,) int32: output, runs.
+    - ``keys`` (3, >= m + 1) int32, ``kinds`` (>= m + 1,) uint8, ``lengths`` (>= m + 1,) int32: output, runs.
     - ``sums`` (>= m + 1,) int32: output, confidences summed over each run.
     - ``ends`` (>= n + 1, 3) float64: output, end point of each ray in the team's frame [m]; size 0 for none.
     - ``end_keys`` (>= n + 1, 3) int32: output, key of each end point.
@@ -92,7 +95,7 @@ def depth_to_runs(
     slopes, squares = np.empty((3, width), np.float32), np.empty(width, np.float32)
     downs, rest, base = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.int32)
     farthest = 0.0
-    for axis in range(keys.shape[1]):
+    for axis in range(keys.shape[0]):
         base[axis] = np.int32(np.floor(pose[axis, 3] / resolution))
         rest[axis] = pose[axis, 3] / resolution - base[axis]
         steepest = max(abs(camera[3]), abs(height - 1 - camera[3])) * abs(pose[axis, 1] / camera[1])
@@ -119,7 +122,7 @@ def depth_to_runs(
         if is_rough:
             _depths_of_row(depth_image[v], np.float32(depth_unit), np.float32(largest), special, meanings, _TINY, near)
             _kinds_of_row(near, squares, np.float32(plus), min_range, max_range, labels, row_kinds, is_unsure)
-            for axis in range(keys.shape[1]):
+            for axis in range(keys.shape[0]):
                 downs[axis] = pose[axis, 1] * ratio / resolution
             _keys_of_row(near, slopes, downs, rest, base, tolerance, row_keys, is_unsure)
         if _sum(is_unsure) > 0:
@@ -331,7 +334,7 @@ def points_to_runs(
                 sensor[0, i] *= scale
                 sensor[1, i] *= scale
                 sensor[2, i] *= scale
-        for axis in range(keys.shape[1]):
+        for axis in range(keys.shape[0]):
             along_x, along_y, along_z, shift = pose[axis, 0], pose[axis, 1], pose[axis, 2], pose[axis, 3]
             for i in range(size):
                 world[axis, i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
@@ -357,34 +360,32 @@ def _add_runs(world, point_kinds, size, point_keys, starts, keys, kinds, lengths
     """
     is_start = np.empty(size + 1, np.int32)
     is_start[0] = 1
+    x, y, z = point_keys[0], point_keys[1], point_keys[2]
     for i in range(1, size):
         is_start[i] = (
-            (point_keys[0, i] != point_keys[0, i - 1])
-            | (point_keys[1, i] != point_keys[1, i - 1])
-            | (point_keys[2, i] != point_keys[2, i - 1])
-            | (point_kinds[i] != point_kinds[i - 1])
+            (x[i] != x[i - 1]) | (y[i] != y[i - 1]) | (z[i] != z[i - 1]) | (point_kinds[i] != point_kinds[i - 1])
         )
-    num_starts = 0
+    # numba tests signed indices for being negative.
+    num_starts = np.uint64(0)
     for i in range(size):
         starts[num_starts] = i
-        num_starts += is_start[i]
+        num_starts += np.uint64(is_start[i])
     starts[num_starts] = size
-    place = counters[NUM_RUNS]
-    for run in range(num_starts):
-        i = starts[run]
-        for axis in range(3):
-            keys[place, axis] = point_keys[axis, i]
+    place = np.uint64(counters[NUM_RUNS])
+    for run in range(np.int64(num_starts)):
+        i = np.uint64(starts[run])
+        keys[0, place], keys[1, place], keys[2, place] = x[i], y[i], z[i]
         kinds[place] = np.uint8(point_kinds[i])
-        lengths[place] = starts[run + 1] - i
-        place += point_kinds[i] != _NONE
+        lengths[place] = starts[run + 1] - starts[run]
+        place += np.uint64(point_kinds[i] != _NONE)
     counters[NUM_RUNS] = place
     if ends.size > 0:
-        place = counters[NUM_POINTS]
+        place = np.uint64(counters[NUM_POINTS])
         for i in range(size):
             for axis in range(3):
                 ends[place, axis] = world[axis, i]
                 end_keys[place, axis] = point_keys[axis, i]
-            place += point_kinds[i] != _NONE
+            place += np.uint64(point_kinds[i] != _NONE)
         counters[NUM_POINTS] = place
 
 
@@ -452,98 +453,98 @@ def _coords_to_keys(coords, size, resolution, keys):
 
 
 @kernel
-def extend_bounds(keys, low, high):
-    """Extend the box from ``low`` to ``high`` (3,) int64, in place, so that it holds all ``keys`` (n, 3) int32."""
-    for axis in range(3):
-        least, most = low[axis], high[axis]
-        for i in range(keys.shape[0]):
-            least = min(least, np.int64(keys[i, axis]))
-            most = max(most, np.int64(keys[i, axis]))
+def extend_bounds(keys, num_runs, low, high):
+    """Extend the box from ``low`` to ``high`` (3,) int64, in place, by the first ``num_runs`` of ``keys`` (3, m) int32."""
+    for axis in range(keys.shape[0]):
+        least, most = np.int32(low[axis]), np.int32(high[axis])
+        for i in range(num_runs):
+            least, most = min(least, keys[axis, i]), max(most, keys[axis, i])
         low[axis], high[axis] = least, most
 
 
-@inline_kernel
-def _slot_of(cell, table, end_cells):
-    """Slot of ``cell`` int64 in the hash ``table``: entries are positions in ``end_cells``, -1 for an empty slot."""
-    mask = table.size - 1
-    place = np.int64((np.uint64(cell) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)) & mask
-    while table[place] >= 0 and end_cells[table[place]] != cell:
-        place = (place + 1) & mask
-    return place
+@kernel
+def mark_ends(
+    keys, kinds, num_runs, corner, tables, num_classes, is_weighted, marks, places, end_places, end_keys,
+):  # fmt: skip
+    """Find the distinct cells of runs and mark each with its class; returns their number n and that of open cells.
+
+    A cell stays *open*, with mark 1, where its runs differ in class or have none, or labels are weighted. The marks of
+    the scratch grid serve as the table of cells: most runs continue a cell of the row of pixels above.
+
+    - ``keys`` (3, >= m) int32, ``kinds`` (>= m,) uint8, ``num_runs``: m runs.
+    - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
+    - ``tables`` uint32: as filled by casting.fill_tables.
+    - ``num_classes``: C.
+    - ``is_weighted``: True leaves every cell open.
+    - ``marks`` uint8: of the scratch grid, in place from 0.
+    - ``places`` (>= m,) uint32: output, place of each run's cell.
+    - ``end_places`` (>= n,) uint32, ``end_keys`` (>= n, 3) int32: output, places and keys of the cells.
+    """
+    num_ends, num_open = np.uint64(0), 0
+    low_x, low_y, low_z = np.int32(corner[0]), np.int32(corner[1]), np.int32(corner[2])
+    for run in range(num_runs):
+        x, y, z = keys[0, run], keys[1, run], keys[2, run]
+        place = np.uint32(
+            tables[0, np.uint32(x - low_x)] + tables[1, np.uint32(y - low_y)] + tables[2, np.uint32(z - low_z)]
+        )
+        places[run] = place
+        has_class = (0 < kinds[run]) & (kinds[run] <= num_classes) & (not is_weighted)
+        mark = np.uint8(kinds[run] + 1) if has_class else _OPEN
+        old = marks[place]
+        if old == mark or old == _OPEN:
+            continue
+        if old == 0:
+            end_places[num_ends] = place
+            end_keys[num_ends, 0], end_keys[num_ends, 1], end_keys[num_ends, 2] = x, y, z
+            num_ends += np.uint64(1)
+        else:
+            mark = _OPEN
+        marks[place] = mark
+        num_open += mark == _OPEN
+    return np.int64(num_ends), num_open
 
 
 @kernel
-def distinct_ends(keys, kinds, lengths, low, edges, num_classes, table, votes, end_cells, end_keys, end_marks):
-    """Find the distinct cells of runs, each with the class of most of its points; returns their number n.
+def vote_in_open_cells(
+    places, kinds, lengths, weights, num_runs, num_classes, table, open_places, votes, sums, marks, strengths
+):
+    """Mark each open cell with the class that has the largest weight there, after mark_ends.
 
-    - ``keys`` (m, 3) int32, ``kinds`` (>= m,) uint8, ``lengths`` (>= m,) int32: runs.
-    - ``low``, ``edges`` (3,) int64: lowest key and edges of a box that holds the keys.
+    Ties go to the lower class_id. The mark becomes 0 where no point has a class.
+
+    - ``places`` (>= m,) uint32: as left by mark_ends.
+    - ``kinds``, ``lengths``, ``num_runs``: as for mark_ends; number of points of each run.
+    - ``weights`` (>= m,) int32: weight of each run, the sum over its points.
     - ``num_classes``: C.
-    - ``table`` int32: hash table of -1, its size a power of two of at least 2 m; overwritten.
-    - ``votes`` (>= n, C) int32: output, points of each class in each cell.
-    - ``end_cells`` (>= n,) int64: output, numbers of the cells in the box.
-    - ``end_keys`` (>= n, 3) int32: output, keys of the cells.
-    - ``end_marks`` (>= n,) uint8: output, 1 + class_id; 0 where no point has a class. Ties go to the lower class_id.
+    - ``table`` int32: hash table of -1, its size a power of two above that of ``open_places``; overwritten.
+    - ``open_places`` (n,) uint32: output, places of the n open cells.
+    - ``votes`` (n, C) int32, ``sums`` (n, C) int64: output from 0, points and weights by cell and class.
+    - ``marks`` uint8: in place.
+    - ``strengths`` uint8: output, mean weight of the class's points, rounded half up, parallel to the marks; size 0 for
+      none.
     """
-    num_ends = 0
-    last_cell, slot = np.int64(-1), np.int64(0)
-    for run in range(keys.shape[0]):
-        x, y, z = keys[run, 0] - low[0], keys[run, 1] - low[1], keys[run, 2] - low[2]
-        cell = (z * edges[1] + y) * edges[0] + x
-        if cell != last_cell:
-            last_cell = cell
-            place = _slot_of(cell, table, end_cells)
-            slot = np.int64(table[place])
-            if slot < 0:
-                slot = num_ends
-                table[place] = slot
-                end_cells[slot] = cell
-                for axis in range(3):
-                    end_keys[slot, axis] = keys[run, axis]
-                for c in range(num_classes):
-                    votes[slot, c] = 0
-                num_ends += 1
+    mask, num_open = np.uint64(table.size - 1), 0
+    for run in range(num_runs):
+        place = places[run]
+        if marks[place] != _OPEN:
+            continue
+        entry = (np.uint64(place) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40) & mask
+        while table[entry] >= 0 and open_places[table[entry]] != place:
+            entry = (entry + np.uint64(1)) & mask
+        slot = np.int64(table[entry])
+        if slot < 0:
+            slot = num_open
+            table[entry], open_places[slot] = slot, place
+            num_open += 1
         if 0 < kinds[run] <= num_classes:
             votes[slot, kinds[run] - 1] += lengths[run]
-    for slot in range(num_ends):
-        best, most = 0, 0
-        for c in range(num_classes):
-            if votes[slot, c] > most:
-                best, most = c + 2, votes[slot, c]
-        end_marks[slot] = np.uint8(best)
-    return num_ends
-
-
-@kernel
-def weigh_ends(
-    keys, kinds, sums, low, edges, num_classes, table, votes, vote_sums, end_cells, end_marks, end_strengths
-):
-    """Choose the class with the largest sum of confidences in each cell, after distinct_ends.
-
-    - ``keys``, ``kinds``: runs, as for distinct_ends.
-    - ``sums`` (>= m,) int32: confidences summed over each run.
-    - ``low``, ``edges``, ``num_classes``, ``table``, ``votes``: as left by distinct_ends.
-    - ``vote_sums`` (n, C) int64: output from 0, confidences summed by cell and class.
-    - ``end_cells``: as left by distinct_ends.
-    - ``end_marks`` (n,) uint8: output, 1 + class_id; not set where no point has a class.
-    - ``end_strengths`` (n,) uint8: output, mean confidence of the class's points in 1 / 255, rounded half up; not set
-      where no point has a class.
-    """
-    last_cell, slot = np.int64(-1), np.int64(0)
-    for run in range(keys.shape[0]):
-        x, y, z = keys[run, 0] - low[0], keys[run, 1] - low[1], keys[run, 2] - low[2]
-        cell = (z * edges[1] + y) * edges[0] + x
-        if cell != last_cell:
-            last_cell = cell
-            slot = np.int64(table[_slot_of(cell, table, end_cells)])
-        if 0 < kinds[run] <= num_classes:
-            vote_sums[slot, kinds[run] - 1] += sums[run]
-    for slot in range(end_marks.size):
+            sums[slot, kinds[run] - 1] += weights[run]
+    for slot in range(num_open):
         best, most = -1, 0
         for c in range(num_classes):
-            if vote_sums[slot, c] > most:
-                best, most = c, vote_sums[slot, c]
-        if best >= 0:
+            if sums[slot, c] > most:
+                best, most = c, sums[slot, c]
+        marks[open_places[slot]] = np.uint8(best + 2) if best >= 0 else np.uint8(0)
+        if strengths.size > 0 and best >= 0:
             num_points = np.int64(votes[slot, best])
-            end_marks[slot] = np.uint8(best + 2)
-            end_strengths[slot] = np.uint8((2 * most + num_points) // (2 * num_points))
+            strengths[open_places[slot]] = np.uint8((2 * most + num_points) // (2 * num_points))

@@ -1,6 +1,6 @@
 """Evidence of one scan added to an octree: one update for each cell that the scan touches.
 
-A *mark* is one byte for each cell of the scan's scratch grid: 0 untouched, 1 free, c + 2 a hit of class c (from 0).
+A *mark* is one byte for each cell of a brick: 0 untouched, 1 free, c + 2 a hit of class c (from 0).
 Eight marks, those of an octet, are one uint64 word. In shapes, n is the number of bricks, C of classes, and
 W = ceil(C / 8) of mask words.
 """
@@ -37,15 +37,14 @@ def _marked_cells(marks):
 
 
 @kernel
-def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
+def wanted_rows(bricks, indices, marks, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
     """Find the class rows that the hits of a scan need.
 
     A map of one class has no class rows; all hits go to the shared rows.
 
     - ``bricks``: Bricks of the octree.
     - ``indices`` (n,) int64: brick indices.
-    - ``touched`` (n,) int64: brick of the scratch grid with the marks.
-    - ``words`` uint64: marks of the scratch grid.
+    - ``marks`` (n, 8) uint64: marks of the bricks.
     - ``num_classes``: C.
     - ``miss``, ``clamp_min``, ``clamp_max``: float32, log-odds increment of a free cell and limits.
     - ``wanted`` (n, W) uint64: output from 0, class rows of the octets and classes that are hit.
@@ -56,16 +55,16 @@ def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, c
         any_hit = np.uint64(0)
         known[t] = 0
         for e in range(OCTETS):
-            marks = words[touched[t] * OCTETS + e]
-            known[t] |= _marked_cells(marks) << np.uint64(8 * e)
+            octet = marks[t, e]
+            known[t] |= _marked_cells(octet) << np.uint64(8 * e)
             # A mark above 1 is a hit.
-            hits = marks & ~EVERY_BYTE
+            hits = octet & ~EVERY_BYTE
             any_hit |= hits
             if num_classes == 1:
                 continue
             while hits:
                 shift = np.uint64(lowest_one(hits)) & np.uint64(0x38)
-                c = ((marks >> shift) & np.uint64(0xFF)) - np.uint64(2)
+                c = ((octet >> shift) & np.uint64(0xFF)) - np.uint64(2)
                 wanted[t, c >> np.uint64(3)] |= np.uint64(1) << (np.uint64(8 * e) + (c & np.uint64(7)))
                 hits &= ~(np.uint64(0xFF) << shift)
         index = indices[t]
@@ -85,7 +84,7 @@ def _prefetch_block(bricks, rows_at, index):
 
 @kernel
 def apply_marks(
-    bricks, indices, touched, words, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
+    bricks, indices, changes, marks, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
     own_steps,
 ):  # fmt: skip
     """Add one scan's log-odds to bricks that were expanded by the rows of ``wanted_rows``.
@@ -95,8 +94,9 @@ def apply_marks(
 
     - ``bricks``: Bricks, in place.
     - ``indices`` (n,) int64: brick indices.
-    - ``touched`` (n,) int64, ``words`` uint64, ``num_classes``: as for wanted_rows.
-    - ``strengths`` uint8: strength of each hit, parallel to the marks; size 0 for the strength 255 everywhere.
+    - ``changes`` (n,) bool: as left by wanted_rows; the other bricks are skipped.
+    - ``marks`` (n, 8) uint64, ``num_classes``: as for wanted_rows.
+    - ``strengths`` (n, 64) uint8: strength of each hit; size 0 for the strength 255 everywhere.
     - ``hits`` (256,) float32: log-odds increment of the hit class for each strength.
     - ``miss``, ``hit_other``: float32 log-odds increments.
     - ``clamp_min``, ``clamp_max``: float32 limits of the log-odds.
@@ -111,18 +111,20 @@ def apply_marks(
         shared_from, shared_to = np.uint8(2), np.uint8(255)
     steps_at, rows_at = np.int64(own_steps.ctypes.data), np.int64(bricks.rows.ctypes.data)
     for t in range(indices.size):
-        index, first = indices[t], touched[t] * OCTETS
+        index = indices[t]
         _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
+        if not changes[t]:
+            continue
         if strengths.size > 0:
             for k in range(BRICK_CELLS):
-                own_steps[k] = hits[strengths[touched[t] * BRICK_CELLS + k]]
+                own_steps[k] = hits[strengths[t, k]]
         block = np.int64(bricks.blocks[index])
         place = rows_at + block * ROW_BYTES
         octets = octets_of(bricks.known[index])
         while octets:
             e = lowest_one(octets) >> 3
             add_marked_octet(
-                place, words[first + e], shared_from, shared_to, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min,
+                place, marks[t, e], shared_from, shared_to, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min,
                 clamp_max,
             )  # fmt: skip
             place += ROW_BYTES
@@ -135,7 +137,7 @@ def apply_marks(
                 bit = lowest_one(bits)
                 e, own = bit >> 3, np.uint8(8 * w + (bit & 7) + 2)
                 add_marked_octet(
-                    place, words[first + e], own, own, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min, clamp_max
+                    place, marks[t, e], own, own, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min, clamp_max
                 )
                 place += ROW_BYTES
                 bits &= bits - np.uint64(1)
