@@ -110,6 +110,8 @@ class ScanCaster:
         self._strengths = np.zeros(0, np.uint8)
         self._flags = np.zeros(0, np.uint8)
         self._bricks = _BrickMemory(0, has_strengths=False)
+        self._scratch = np.empty((0, 0), np.float32), np.empty((0, 0)), np.empty((0, 0), np.int32)
+        self._scratch_rows(ends.BLOCK)
         self._runs = _Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
@@ -173,12 +175,21 @@ class ScanCaster:
         """Find the runs of a depth image without lens distortion."""
         camera = frame.camera
         depth, *values = self._depths(frame)
-        classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
+        # A scan without labels has class 1 everywhere.
+        classes = np.ones(depth.shape, np.uint8) if frame.class_image is None else frame.class_image
         ends.depth_to_runs(
             depth, frame.depth_unit, np.ascontiguousarray(classes),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._runs.outputs,
+            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._scratch_rows(depth.shape[1]),
+            *self._runs.outputs,
         )  # fmt: skip
+
+    def _scratch_rows(self, size: int) -> tuple[Float32Array, Float64Array, Int32Array]:
+        """Return the scratch memory of the kernels that process ``size`` points at once."""
+        if size + 1 > self._scratch[0].shape[1]:
+            shape = (ends.NUM_SCRATCH_ROWS, size + 1)
+            self._scratch = np.empty(shape, np.float32), np.empty(shape), np.empty(shape, np.int32)
+        return self._scratch
 
     def _lens_points(self, frame: DepthFrame, slopes: Float32Array) -> Float64Array:
         """Return the points (P, 3) of a depth image in the sensor's frame [m], at most 2 x max_range deep."""
@@ -203,10 +214,11 @@ class ScanCaster:
     ) -> None:
         """Find the runs of points (P, 3) with the classes (P,)."""
         kind = np.float32 if points.dtype == np.float32 else np.float64
-        classes = np.empty(0, np.uint8) if class_ids is None else class_ids
+        classes = np.ones(len(points), np.uint8) if class_ids is None else class_ids
         ends.points_to_runs(
             np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame), *self._runs.outputs,
+            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame),
+            *self._scratch_rows(ends.BLOCK), *self._runs.outputs,
         )  # fmt: skip
 
     def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:

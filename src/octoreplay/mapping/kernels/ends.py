@@ -17,8 +17,8 @@ _CUT = np.int32(255)
 _UNUSABLE = np.int32(0)
 """Kind of a point that frees its ray and hits nothing, such as one with an ignored label."""
 
-_UNLABELLED = np.int32(1)
-"""Kind of a point in a scan without labels: class 1."""
+NUM_SCRATCH_ROWS = 8
+"""Number of rows of each scratch array of the kernels that find runs."""
 
 NUM_RUNS, NUM_POINTS = 0, 1
 """Counters: number of runs, and number of stored end points."""
@@ -38,7 +38,7 @@ _FARTHEST_KEY = float(1 << 20)
 _CLOSE = 1e-8
 """Quotients farther than this from an integer have the same floor when rounded twice as when rounded once."""
 
-_BLOCK = 1024
+BLOCK = 1024
 """Number of points of a cloud that are processed together."""
 
 _SEGMENT = 64
@@ -58,11 +58,14 @@ error below 2^-33 cells, too."""
 _TINY = np.float32(1e-18)
 """Depth [m] in float32 of smaller ones, with a square that does not underflow."""
 
+_SQUARE_OF_TINY = np.float32(1e-37)
+"""Squared distance below that of every measured point."""
 
-@allocating_kernel
+
+@kernel
 def depth_to_runs(
     depth_image, depth_unit, class_image, camera, pose, resolution, min_range, max_range, largest, special, meanings,
-    confidences, boxes, keys, kinds, lengths, sums, ends, end_keys, counters,
+    confidences, boxes, floats, doubles, integers, keys, kinds, lengths, sums, ends, end_keys, counters,
 ):  # fmt: skip
     """Find the runs of a depth image's end cells.
 
@@ -70,7 +73,7 @@ def depth_to_runs(
     m and n.
 
     - ``depth_image`` (H, W) uint16 or float32, ``depth_unit``: depth along z = value x ``depth_unit`` [m].
-    - ``class_image`` (H, W) uint8: class ids; size 0 for class 1 everywhere.
+    - ``class_image`` (H, W) uint8: class ids.
     - ``camera`` (4,) float64: fx, fy, cx, cy [pixel].
     - ``pose`` (4, 4) float64: T_team_sensor.
     - ``resolution``: edge of a cell [m].
@@ -82,6 +85,7 @@ def depth_to_runs(
     - ``boxes`` (b, 4, 6) float64: a row (r_x, r_y, r_z, t, low, high) for each axis. A box holds the points p in the
       team's frame with low <= r p + t <= high. Its points carry no information where the number at (IS_OWN, 0) is not
       0; otherwise they free their rays and hit nothing.
+    - ``floats`` float32, ``doubles`` float64, ``integers`` int32, each (NUM_SCRATCH_ROWS, >= max(W + 1, 3)): scratch.
     - ``keys`` (3, >= m + 1) int32, ``kinds`` (>= m + 1,) uint8, ``lengths`` (>= m + 1,) int32: output, runs.
     - ``sums`` (>= m + 1,) int32: output, confidences summed over each run.
     - ``ends`` (>= n + 1, 3) float64: output, end point of each ray in the team's frame [m]; size 0 for none.
@@ -89,11 +93,13 @@ def depth_to_runs(
     - ``counters`` (2,) int64: m at NUM_RUNS and n at NUM_POINTS, in place.
     """
     height, width = depth_image.shape
-    ratios = np.empty(width)
+    # A view of several shortened rows has no unit stride for the compiler, so these views are of whole rows or of one.
+    slopes, squares, near, downs, rest = floats, floats[3, :width], floats[4, :width], floats[5], floats[6]
+    world, ratios, z = doubles, doubles[3, :width], doubles[4]
+    row_keys, row_kinds, is_unsure, base = integers, integers[3], integers[4, :width], integers[5]
     for u in range(width):
         ratios[u] = (u - camera[2]) / camera[0]
-    slopes, squares = np.empty((3, width), np.float32), np.empty(width, np.float32)
-    downs, rest, base = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.int32)
+        is_unsure[u] = 1
     farthest = 0.0
     for axis in range(keys.shape[0]):
         base[axis] = np.int32(np.floor(pose[axis, 3] / resolution))
@@ -108,20 +114,12 @@ def depth_to_runs(
     tolerance = _ROUNDING * np.float32(farthest + 1.0)
     # Boxes and rays to points need points in float64; a tolerance of half a cell decides no key.
     is_rough = boxes.size + ends.size == 0 and tolerance < 0.5
-    z, near = np.empty(_SEGMENT), np.empty(width, np.float32)
-    world = np.empty((3, width))
-    row_kinds, row_keys = np.empty(width, np.int32), np.empty((3, width), np.int32)
-    is_unsure = np.ones(width, np.int32)
-    starts = np.empty(width + 1, np.int32)
-    labels = np.empty(0, np.uint8)
     for v in range(height):
         ratio = (v - camera[3]) / camera[1]
         plus = ratio * ratio + 1.0
-        if class_image.size > 0:
-            labels = class_image[v]
         if is_rough:
             _depths_of_row(depth_image[v], np.float32(depth_unit), np.float32(largest), special, meanings, _TINY, near)
-            _kinds_of_row(near, squares, np.float32(plus), min_range, max_range, labels, row_kinds, is_unsure)
+            _kinds_of_row(near, squares, np.float32(plus), min_range, max_range, class_image[v], row_kinds, is_unsure)
             for axis in range(keys.shape[0]):
                 downs[axis] = pose[axis, 1] * ratio / resolution
             _keys_of_row(near, slopes, downs, rest, base, tolerance, row_keys, is_unsure)
@@ -132,15 +130,15 @@ def depth_to_runs(
                     depths = z[: part.stop - first]
                     _depths_of_row(depth_image[v, part], depth_unit, largest, special, meanings, 0.0, depths)
                     _exact_pixels(
-                        depths, ratios[part], ratio, plus, pose, resolution, min_range, max_range, labels[first:],
-                        world[:, part], row_kinds[part], row_keys[:, part],
+                        depths, ratios[part], ratio, plus, pose, resolution, min_range, max_range,
+                        class_image[v, part], world, row_kinds[part], row_keys, first,
                     )  # fmt: skip
         if boxes.size + confidences.size > 0:
             _filter_points(world, width, v * width, confidences, boxes, row_kinds)
-        num_runs = counters[NUM_RUNS]
-        _add_runs(world, row_kinds, width, row_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
-        if confidences.size > 0:
-            _sum_over_runs(confidences, v * width, starts, width, row_kinds, sums, num_runs)
+        _add_runs(
+            world, row_kinds, width, row_keys, integers[6:], confidences, v * width, keys, kinds, lengths, sums, ends,
+            end_keys, counters,
+        )  # fmt: skip
 
 
 @inline_kernel
@@ -159,24 +157,25 @@ def _kinds_of_row(near, squares, plus, min_range, max_range, labels, kinds, is_u
     - ``near`` (W,) float32: depths [m], 0 without information; in place.
     - ``squares`` (W,) float32, ``plus`` float32: squared length of a pixel's ray at depth 1 is squares + plus.
     - ``min_range``, ``max_range``: as for depth_to_runs.
-    - ``labels`` (W,) uint8: class ids; size 0 for class 1 everywhere.
+    - ``labels`` (W,) uint8: class ids.
     - ``kinds`` (W,) int32: output.
     - ``is_unsure`` (W,) int32: output, 1 where float32 does not decide on which side of a limit the point is.
     """
     least, most = np.float32(min_range * min_range), np.float32(max_range * max_range)
-    least_margin, most_margin = _ROUNDING * least + _TINY, _ROUNDING * most
+    # A pixel without information has distance 0, below all limits.
+    least_from = max(least - _ROUNDING * least - _TINY, _SQUARE_OF_TINY)
+    least_to = least + _ROUNDING * least + _TINY
+    most_from, most_to = most - _ROUNDING * most, most + _ROUNDING * most
+    least = max(least, _SQUARE_OF_TINY)
     num_cut = np.int32(0)
     for u in range(near.size):
         distance = near[u] * near[u] * (squares[u] + plus)
-        is_sure = (abs(distance - least) > least_margin) & (abs(distance - most) > most_margin)
-        is_measured = near[u] > 0
-        kind = _UNLABELLED if is_measured & (distance >= least) else _NONE
+        is_near_least = (distance >= least_from) & (distance <= least_to)
+        is_near_most = (distance >= most_from) & (distance <= most_to)
+        kind = np.int32(labels[u]) if distance >= least else _NONE
         kinds[u] = _CUT if distance > most else kind
-        is_unsure[u] = np.int32(is_measured & ~is_sure)
+        is_unsure[u] = np.int32(is_near_least | is_near_most)
         num_cut = np.int32(num_cut + (distance > most))
-    if labels.size > 0:
-        for u in range(near.size):
-            kinds[u] = np.int32(labels[u]) if kinds[u] == _UNLABELLED else kinds[u]
     if num_cut > 0:
         for u in range(near.size):
             near[u] = np.float32(max_range) / np.sqrt(squares[u] + plus) if kinds[u] == _CUT else near[u]
@@ -213,26 +212,24 @@ def _keys_of_row(near, slopes, downs, rest, base, tolerance, keys, is_unsure):
 
 
 @inline_kernel
-def _exact_pixels(z, ratios, ratio, plus, pose, resolution, min_range, max_range, labels, world, kinds, keys):
+def _exact_pixels(z, ratios, ratio, plus, pose, resolution, min_range, max_range, labels, world, kinds, keys, first):
     """Compute pixels of one row in float64: kinds, points in the team's frame and keys. The other outputs follow these.
 
     - ``z`` (n,) float64: depths [m], 0 without information; those of rays that are cut become depths at ``max_range``.
     - ``ratios`` (n,) float64: x / z of each pixel; ``ratio``: y / z of the row, ``plus`` = ``ratio`` squared + 1.
     - ``pose``, ``resolution``, ``min_range``, ``max_range``: as for depth_to_runs.
-    - ``labels`` (>= n,) uint8: class ids; size 0 for class 1 everywhere.
-    - ``world`` (3, n) float64: output, points [m].
-    - ``kinds`` (n,) int32, ``keys`` (3, n) int32: output.
+    - ``labels`` (n,) uint8: class ids.
+    - ``world`` (3, >= ``first`` + n) float64: output from position ``first`` on, points [m].
+    - ``kinds`` (n,) int32: output.
+    - ``keys`` (3, >= ``first`` + n) int32: output from position ``first`` on.
     """
     least, most = min_range * min_range, max_range * max_range
     num_cut = 0
     for u in range(z.size):
         distance = z[u] * z[u] * (ratios[u] * ratios[u] + plus)
-        kind = _UNLABELLED if (z[u] > 0.0) & (distance >= least) else _NONE
+        kind = np.int32(labels[u]) if (z[u] > 0.0) & (distance >= least) else _NONE
         kinds[u] = _CUT if distance > most else kind
         num_cut += distance > most
-    if labels.size > 0:
-        for u in range(z.size):
-            kinds[u] = labels[u] if kinds[u] == _UNLABELLED else kinds[u]
     if num_cut > 0:
         for u in range(z.size):
             square = ratios[u] * ratios[u] + plus
@@ -241,9 +238,10 @@ def _exact_pixels(z, ratios, ratio, plus, pose, resolution, min_range, max_range
     for axis in range(pose.shape[0] - 1):
         along, down = pose[axis, 0], pose[axis, 1] * ratio
         ahead, shift = pose[axis, 2], pose[axis, 3]
+        coords = world[axis, first : first + z.size]
         for u in range(z.size):
-            world[axis, u] = z[u] * (along * ratios[u] + ahead + down) + shift
-    _coords_to_keys(world, z.size, resolution, keys)
+            coords[u] = z[u] * (along * ratios[u] + ahead + down) + shift
+        _coords_to_keys(coords, resolution, keys[axis, first : first + z.size])
 
 
 @inline_kernel
@@ -286,38 +284,34 @@ def depth_to_points(depth_image, depth_unit, slopes, farthest, largest, special,
             points[place, 2] = depth
 
 
-@allocating_kernel
+@kernel
 def points_to_runs(
-    points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, keys, kinds, lengths, sums, ends,
-    end_keys, counters,
+    points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, floats, doubles, integers, keys,
+    kinds, lengths, sums, ends, end_keys, counters,
 ):  # fmt: skip
     """Find the runs of a point cloud's end cells. Points that are not finite, or are 0, carry no information.
 
     Loop invariant: the outputs hold the runs and end points of the points before ``first``.
 
     - ``points`` (p, 3) float32 or float64: in the sensor's frame [m].
-    - ``class_ids`` (p,) uint8: size 0 for class 1 everywhere.
+    - ``class_ids`` (p,) uint8.
     - ``pose``, ``resolution``, ``min_range``, ``max_range``: as for depth_to_runs.
     - ``confidences`` (p,) uint8: label confidences in 1 / 255; size 0 for full confidence.
     - ``boxes``, ``keys``, ``kinds``, ``lengths``, ``sums``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
+    - ``floats``, ``doubles``, ``integers``, each (NUM_SCRATCH_ROWS, > BLOCK): scratch; ``floats`` is not used.
     """
-    labelled = class_ids.size > 0
     least, most = min_range * min_range, max_range * max_range
-    sensor = np.empty((3, _BLOCK))
-    squares = np.empty(_BLOCK)
-    world = np.empty((3, _BLOCK))
-    block_kinds = np.empty(_BLOCK, np.int32)
-    block_keys = np.empty((3, _BLOCK), np.int32)
-    starts = np.empty(_BLOCK + 1, np.int32)
-    for first in range(0, points.shape[0], _BLOCK):
-        size = min(_BLOCK, points.shape[0] - first)
+    sensor, squares, world = doubles[:3], doubles[3], doubles[4:7]
+    block_keys, block_kinds = integers[:3], integers[3]
+    for first in range(0, points.shape[0], BLOCK):
+        size = min(BLOCK, points.shape[0] - first)
         num_cut = 0
         for i in range(size):
             x, y = np.float64(points[first + i, 0]), np.float64(points[first + i, 1])
             z = np.float64(points[first + i, 2])
             distance = x * x + y * y + z * z
             valid = (distance > 0.0) & (distance < np.inf) & (distance >= least)
-            kind = _UNLABELLED if valid else _NONE
+            kind = np.int32(class_ids[first + i]) if valid else _NONE
             is_cut = valid & (distance > most)
             sensor[0, i] = x if valid else 0.0
             sensor[1, i] = y if valid else 0.0
@@ -325,9 +319,6 @@ def points_to_runs(
             squares[i] = distance
             block_kinds[i] = _CUT if is_cut else kind
             num_cut += is_cut
-        if labelled:
-            for i in range(size):
-                block_kinds[i] = class_ids[first + i] if block_kinds[i] == _UNLABELLED else block_kinds[i]
         if num_cut > 0:
             for i in range(size):
                 scale = max_range / np.sqrt(squares[i]) if block_kinds[i] == _CUT else 1.0
@@ -336,29 +327,35 @@ def points_to_runs(
                 sensor[2, i] *= scale
         for axis in range(keys.shape[0]):
             along_x, along_y, along_z, shift = pose[axis, 0], pose[axis, 1], pose[axis, 2], pose[axis, 3]
+            coords = world[axis, :size]
             for i in range(size):
-                world[axis, i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
+                coords[i] = along_x * sensor[0, i] + along_y * sensor[1, i] + along_z * sensor[2, i] + shift
+            _coords_to_keys(coords, resolution, block_keys[axis])
         if boxes.size + confidences.size > 0:
             _filter_points(world, size, first, confidences, boxes, block_kinds)
-        num_runs = counters[NUM_RUNS]
-        _coords_to_keys(world, size, resolution, block_keys)
-        _add_runs(world, block_kinds, size, block_keys, starts, keys, kinds, lengths, ends, end_keys, counters)
-        if confidences.size > 0:
-            _sum_over_runs(confidences, first, starts, size, block_kinds, sums, num_runs)
+        _add_runs(
+            world, block_kinds, size, block_keys, integers[4:], confidences, first, keys, kinds, lengths, sums, ends,
+            end_keys, counters,
+        )  # fmt: skip
 
 
-@allocating_kernel
-def _add_runs(world, point_kinds, size, point_keys, starts, keys, kinds, lengths, ends, end_keys, counters):
+@kernel
+def _add_runs(
+    world, point_kinds, size, point_keys, scratch, confidences, first, keys, kinds, lengths, sums, ends, end_keys,
+    counters,
+):  # fmt: skip
     """Append the runs of points to the outputs of depth_to_runs.
 
     - ``world`` (3, >= size) float64: points in the team's frame [m]; not used where ``ends`` is empty.
     - ``point_kinds`` (>= size,) int32: kinds of the points.
     - ``size``: number of points.
     - ``point_keys`` (3, >= size) int32: keys of the points.
-    - ``starts`` (>= size + 1,) int32: output, first point of each run, then ``size``.
-    - ``keys``, ``kinds``, ``lengths``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
+    - ``scratch`` (>= 2, > size) int32.
+    - ``confidences`` (p,) uint8: of the scan's points; size 0 for full confidence.
+    - ``first``: position of the first point in the scan.
+    - ``keys``, ``kinds``, ``lengths``, ``sums``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
     """
-    is_start = np.empty(size + 1, np.int32)
+    starts, is_start = scratch[0], scratch[1]
     is_start[0] = 1
     x, y, z = point_keys[0], point_keys[1], point_keys[2]
     for i in range(1, size):
@@ -373,11 +370,16 @@ def _add_runs(world, point_kinds, size, point_keys, starts, keys, kinds, lengths
     starts[num_starts] = size
     place = np.uint64(counters[NUM_RUNS])
     for run in range(np.int64(num_starts)):
-        i = np.uint64(starts[run])
-        keys[0, place], keys[1, place], keys[2, place] = x[i], y[i], z[i]
-        kinds[place] = np.uint8(point_kinds[i])
+        start = np.uint64(starts[run])
+        keys[0, place], keys[1, place], keys[2, place] = x[start], y[start], z[start]
+        kinds[place] = np.uint8(point_kinds[start])
         lengths[place] = starts[run + 1] - starts[run]
-        place += np.uint64(point_kinds[i] != _NONE)
+        if confidences.size > 0:
+            total = 0
+            for i in range(starts[run], starts[run + 1]):
+                total += confidences[first + i]
+            sums[place] = total
+        place += np.uint64(point_kinds[start] != _NONE)
     counters[NUM_RUNS] = place
     if ends.size > 0:
         place = np.uint64(counters[NUM_POINTS])
@@ -416,40 +418,19 @@ def _filter_points(world, size, first, confidences, boxes, point_kinds):
             point_kinds[i] = kind if is_within else point_kinds[i]
 
 
-@kernel
-def _sum_over_runs(confidences, first, starts, size, point_kinds, sums, place):
-    """Sum the confidences over each run.
-
-    - ``confidences`` (p,) uint8: of the scan.
-    - ``first``: position of the first point in the scan.
-    - ``starts`` int32, ``size``, ``point_kinds`` int32: as for _add_runs.
-    - ``sums`` int32: output, from position ``place`` on.
-    - ``place``: number of runs before these.
-    """
-    run = 0
-    while starts[run] < size:
-        total = 0
-        for i in range(starts[run], starts[run + 1]):
-            total += confidences[first + i]
-        sums[place] = total
-        place += point_kinds[starts[run]] != _NONE
-        run += 1
-
-
 @inline_kernel
-def _coords_to_keys(coords, size, resolution, keys):
-    """Write floor(coords / resolution) into ``keys`` (3, >= size) int32; multiplies where the floor is the same."""
+def _coords_to_keys(coords, resolution, keys):
+    """Write floor(coords / resolution) into ``keys`` (n,) int32; multiplies where the floor is the same."""
     inverse = 1.0 / resolution
-    for axis in range(keys.shape[0]):
-        num_close = 0
-        for i in range(size):
-            quotient = min(max(coords[axis, i] * inverse, -_FARTHEST_KEY), _FARTHEST_KEY)
-            keys[axis, i] = np.int32(np.floor(quotient))
-            num_close += abs(quotient - np.rint(quotient)) < _CLOSE
-        if num_close > 0:
-            for i in range(size):
-                quotient = min(max(coords[axis, i] / resolution, -_FARTHEST_KEY), _FARTHEST_KEY)
-                keys[axis, i] = np.int32(np.floor(quotient))
+    num_close = 0
+    for i in range(coords.size):
+        quotient = min(max(coords[i] * inverse, -_FARTHEST_KEY), _FARTHEST_KEY)
+        keys[i] = np.int32(np.floor(quotient))
+        num_close += abs(quotient - np.rint(quotient)) < _CLOSE
+    if num_close > 0:
+        for i in range(coords.size):
+            quotient = min(max(coords[i] / resolution, -_FARTHEST_KEY), _FARTHEST_KEY)
+            keys[i] = np.int32(np.floor(quotient))
 
 
 @kernel
