@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,17 +122,19 @@ class ScanCaster:
         weighted by their confidences; points in robots' bodies hit nothing. Raises InputError where the scan leaves the
         key space, and ConfigError where max_range is too long for the resolution.
         """
-        origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
-        if not np.all(np.abs(np.floor(origin / self._resolution)) < storage.KEY_OFFSET):
+        # numpy takes longer than Python for three numbers.
+        origin = [float(coord) / self._resolution for coord in frame.T_team_sensor[:3, 3]]
+        if not all(1 - storage.KEY_OFFSET <= coord < storage.KEY_OFFSET for coord in origin):
             raise self._outside(frame)
+        origin_key = [math.floor(coord) for coord in origin]
         self._find_runs(frame)
         runs = self._runs
-        corner, num_blocks, marks, flags = self._grid(*self._box(frame, origin))
+        corner, num_blocks, marks, flags = self._grid(*self._box(frame, origin_key))
         tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
         casting.fill_tables(num_blocks, tables)
         strengths = self._strength_plane(0 if _confidences(frame).size == 0 else marks.size)
         num_ends, end_marks = runs.reduce(corner, tables, marks, strengths)
-        start = self._start(origin, corner)
+        start = np.array([self._start(*coords) for coords in zip(origin, origin_key, corner.tolist(), strict=True)])
         casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
         casting.mark_hits(runs.end_places[:num_ends], end_marks, marks, flags)
         if self._is_bounded:
@@ -143,7 +146,7 @@ class ScanCaster:
     ) -> TouchedCells:
         """Return the touched cells of the scratch grid, and empty it."""
         # One more than the bricks: the kernel writes bricks without a mark too, and overwrites them with the next.
-        places, has_strengths = np.count_nonzero(flags) * casting.BRICKS_PER_BLOCK + 1, strengths.size > 0
+        places, has_strengths = int(np.count_nonzero(flags)) * casting.BRICKS_PER_BLOCK + 1, strengths.size > 0
         if places > self._bricks.codes.size or has_strengths > (self._bricks.strengths.size > 0):
             self._bricks = _BrickMemory(2 * places, has_strengths=has_strengths)
         bricks = self._bricks
@@ -176,7 +179,7 @@ class ScanCaster:
         camera = frame.camera
         depth, *values = self._depths(frame)
         # A scan without labels has class 1 everywhere.
-        classes = np.ones(depth.shape, np.uint8) if frame.class_image is None else frame.class_image
+        classes = read_only(np.ones(depth.shape, np.uint8)) if frame.class_image is None else frame.class_image
         ends.depth_to_runs(
             depth, frame.depth_unit, np.ascontiguousarray(classes),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
@@ -214,21 +217,24 @@ class ScanCaster:
     ) -> None:
         """Find the runs of points (P, 3) with the classes (P,)."""
         kind = np.float32 if points.dtype == np.float32 else np.float64
-        classes = np.ones(len(points), np.uint8) if class_ids is None else class_ids
+        classes = read_only(np.ones(len(points), np.uint8)) if class_ids is None else class_ids
         ends.points_to_runs(
             np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
             self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame),
-            *self._scratch_rows(ends.BLOCK), *self._runs.outputs,
+            *self._scratch_rows(ends.BLOCK)[1:], *self._runs.outputs,
         )  # fmt: skip
 
-    def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
-        """Return the lowest and highest key (3,) of the origin and all ends."""
-        start = np.floor(origin / self._resolution)
-        low, high = start.astype(np.int64), start.astype(np.int64)
-        ends.extend_bounds(self._runs.keys, self._runs.num_runs, low, high)
-        if np.any(low <= -storage.KEY_OFFSET) or np.any(high >= storage.KEY_OFFSET):
+    def _box(self, frame: Frame, origin_key: list[int]) -> tuple[list[int], list[int]]:
+        """Return the lowest and highest key of the origin and all ends."""
+        bounds = np.array([origin_key, origin_key], np.int64)
+        ends.extend_bounds(self._runs.keys, self._runs.num_runs, bounds[0], bounds[1])
+        low, high = bounds.tolist()
+        if min(low) <= -storage.KEY_OFFSET or max(high) >= storage.KEY_OFFSET:
             raise self._outside(frame)
-        if float(np.prod(high - low + 2.0 * casting.BLOCK_EDGE)) > MAX_GRID_CELLS:
+        if (
+            math.prod(most - least + 2 * casting.BLOCK_EDGE for least, most in zip(low, high, strict=True))
+            > MAX_GRID_CELLS
+        ):
             raise ConfigError(
                 f"resolution: {self._resolution:g} m is too fine for max_range {self._sensor.max_range:g} m: one scan "
                 f"would span more than {MAX_GRID_CELLS:.1e} cells"
@@ -244,17 +250,17 @@ class ScanCaster:
             "T_team_map or a coarser resolution"
         )
 
-    def _grid(self, low: Int64Array, high: Int64Array) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
+    def _grid(self, low: list[int], high: list[int]) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
         """Return an empty scratch grid around the cells low..high: lowest cell, size in blocks, marks, flags."""
-        first = low >> casting.BLOCK_BITS
-        num_blocks = (high >> casting.BLOCK_BITS) - first + 1
-        size = int(np.prod(num_blocks))
+        first = [key >> casting.BLOCK_BITS for key in low]
+        num_blocks = [(key >> casting.BLOCK_BITS) - block + 1 for key, block in zip(high, first, strict=True)]
+        size = math.prod(num_blocks)
         if size > self._flags.size:
             # np.zeros maps fresh memory, which takes no physical memory until it is written.
             self._marks = np.zeros(size * casting.BLOCK_CELLS, np.uint8)
             self._flags = np.zeros(size, np.uint8)
         marks = self._marks[: size * casting.BLOCK_CELLS]
-        return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
+        return np.array(first) << casting.BLOCK_BITS, np.array(num_blocks), marks, self._flags[:size]
 
     def _strength_plane(self, size: int) -> UInt8Array:
         """Return memory for the strengths in a scratch grid of ``size`` cells; only those of hit cells are read."""
@@ -262,12 +268,11 @@ class ScanCaster:
             self._strengths = np.zeros(size, np.uint8)
         return self._strengths[:size]
 
-    def _start(self, origin: Float64Array, corner: Int64Array) -> Float64Array:
-        """Return the start of the rays in cells of the scratch grid, rounded to a multiple of casting.FRACTION."""
-        coords = origin / self._resolution
-        keys = np.floor(coords)
-        inside = np.minimum(np.rint((coords - keys) / casting.FRACTION) * casting.FRACTION, 1.0 - casting.FRACTION)
-        return np.asarray(keys - corner + inside)
+    @staticmethod
+    def _start(coord: float, key: int, corner: int) -> float:
+        """Return a coordinate [cell] in the scratch grid, rounded to a multiple of casting.FRACTION within its cell."""
+        inside = round((coord - key) / casting.FRACTION) * casting.FRACTION
+        return key - corner + min(inside, 1.0 - casting.FRACTION)
 
     def _mapped(self, corner: Int64Array, num_blocks: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Return the box [low, high) (3,) of the scratch grid's cells with centres within the configured bounds."""
@@ -332,13 +337,14 @@ class _Runs:
             self.keys, *runs, corner, tables, num_classes, is_weighted, marks, self._places, self.end_places,
             self.end_keys,
         )  # fmt: skip
-        ends.vote_in_open_cells(
+        end_marks = np.empty(num_ends, np.uint8)
+        ends.settle_ends(
             self._places, self.kinds, self.lengths, self._sums if is_weighted else self.lengths,
             self.num_runs if num_open else 0, num_classes, np.full(2 << (2 * num_open).bit_length(), -1, np.int32),
             np.empty(num_open, np.uint32), np.zeros((num_open, num_classes), np.int32),
-            np.zeros((num_open, num_classes), np.int64), marks, strengths,
+            np.zeros((num_open, num_classes), np.int64), marks, strengths, self.end_places[:num_ends], end_marks,
         )  # fmt: skip
-        return num_ends, marks[self.end_places[:num_ends]]
+        return num_ends, end_marks
 
     def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
         """Return end points (n, 3) [m] and end cells (n, 3) of the rays; no end points if rays go to cell centres."""

@@ -205,7 +205,11 @@ def _keys_of_row(near, slopes, downs, rest, base, tolerance, keys, is_unsure):
         y = near[u] * (slopes_y[u] + down_y) + rest_y
         z = near[u] * (slopes_z[u] + down_z) + rest_z
         cell_x, cell_y, cell_z = np.floor(x), np.floor(y), np.floor(z)
-        keys_x[u], keys_y[u], keys_z[u] = np.int32(cell_x) + base_x, np.int32(cell_y) + base_y, np.int32(cell_z) + base_z
+        keys_x[u], keys_y[u], keys_z[u] = (
+            np.int32(cell_x) + base_x,
+            np.int32(cell_y) + base_y,
+            np.int32(cell_z) + base_z,
+        )
         off_x, off_y, off_z = abs(x - cell_x - half), abs(y - cell_y - half), abs(z - cell_z - half)
         is_sure = max(max(off_x, off_y), off_z) < from_middle
         is_unsure[u] |= np.int32((near[u] > 0) & ~is_sure)
@@ -286,8 +290,8 @@ def depth_to_points(depth_image, depth_unit, slopes, farthest, largest, special,
 
 @kernel
 def points_to_runs(
-    points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, floats, doubles, integers, keys,
-    kinds, lengths, sums, ends, end_keys, counters,
+    points, class_ids, pose, resolution, min_range, max_range, confidences, boxes, doubles, integers, keys, kinds,
+    lengths, sums, ends, end_keys, counters,
 ):  # fmt: skip
     """Find the runs of a point cloud's end cells. Points that are not finite, or are 0, carry no information.
 
@@ -298,7 +302,7 @@ def points_to_runs(
     - ``pose``, ``resolution``, ``min_range``, ``max_range``: as for depth_to_runs.
     - ``confidences`` (p,) uint8: label confidences in 1 / 255; size 0 for full confidence.
     - ``boxes``, ``keys``, ``kinds``, ``lengths``, ``sums``, ``ends``, ``end_keys``, ``counters``: as for depth_to_runs.
-    - ``floats``, ``doubles``, ``integers``, each (NUM_SCRATCH_ROWS, > BLOCK): scratch; ``floats`` is not used.
+    - ``doubles`` float64, ``integers`` int32, each (NUM_SCRATCH_ROWS, > BLOCK): scratch.
     """
     least, most = min_range * min_range, max_range * max_range
     sensor, squares, world = doubles[:3], doubles[3], doubles[4:7]
@@ -435,7 +439,7 @@ def _coords_to_keys(coords, resolution, keys):
 
 @kernel
 def extend_bounds(keys, num_runs, low, high):
-    """Extend the box from ``low`` to ``high`` (3,) int64, in place, by the first ``num_runs`` of ``keys`` (3, m) int32."""
+    """Extend the box from ``low`` to ``high`` (3,) int64, in place, by ``num_runs`` of the ``keys`` (3, m) int32."""
     for axis in range(keys.shape[0]):
         least, most = np.int32(low[axis]), np.int32(high[axis])
         for i in range(num_runs):
@@ -469,10 +473,10 @@ def mark_ends(
             tables[0, np.uint32(x - low_x)] + tables[1, np.uint32(y - low_y)] + tables[2, np.uint32(z - low_z)]
         )
         places[run] = place
-        has_class = (0 < kinds[run]) & (kinds[run] <= num_classes) & (not is_weighted)
+        has_class = (kinds[run] > 0) & (kinds[run] <= num_classes) & (not is_weighted)
         mark = np.uint8(kinds[run] + 1) if has_class else _OPEN
         old = marks[place]
-        if old == mark or old == _OPEN:
+        if (old == mark) | (old == _OPEN):
             continue
         if old == 0:
             end_places[num_ends] = place
@@ -486,15 +490,17 @@ def mark_ends(
 
 
 @kernel
-def vote_in_open_cells(
-    places, kinds, lengths, weights, num_runs, num_classes, table, open_places, votes, sums, marks, strengths
-):
-    """Mark each open cell with the class that has the largest weight there, after mark_ends.
+def settle_ends(
+    places, kinds, lengths, weights, num_runs, num_classes, table, open_places, votes, sums, marks, strengths,
+    end_places, end_marks,
+):  # fmt: skip
+    """Mark each open cell with the class that has the largest weight, after mark_ends; copy the marks of all end cells.
 
     Ties go to the lower class_id. The mark becomes 0 where no point has a class.
 
     - ``places`` (>= m,) uint32: as left by mark_ends.
-    - ``kinds``, ``lengths``, ``num_runs``: as for mark_ends; number of points of each run.
+    - ``kinds``, ``lengths``: as for mark_ends; number of points of each run.
+    - ``num_runs``: m; 0 where no cell is open.
     - ``weights`` (>= m,) int32: weight of each run, the sum over its points.
     - ``num_classes``: C.
     - ``table`` int32: hash table of -1, its size a power of two above that of ``open_places``; overwritten.
@@ -503,6 +509,8 @@ def vote_in_open_cells(
     - ``marks`` uint8: in place.
     - ``strengths`` uint8: output, mean weight of the class's points, rounded half up, parallel to the marks; size 0 for
       none.
+    - ``end_places`` (k,) uint32: as left by mark_ends.
+    - ``end_marks`` (k,) uint8: output, marks of the end cells.
     """
     mask, num_open = np.uint64(table.size - 1), 0
     for run in range(num_runs):
@@ -529,3 +537,5 @@ def vote_in_open_cells(
         if strengths.size > 0 and best >= 0:
             num_points = np.int64(votes[slot, best])
             strengths[open_places[slot]] = np.uint8((2 * most + num_points) // (2 * num_points))
+    for i in range(end_marks.size):
+        end_marks[i] = marks[end_places[i]]

@@ -164,9 +164,7 @@ def add_marked_octet(
         target, own_steps = _octets(builder, (arguments[0], arguments[4]))
         marks = builder.bitcast(arguments[1], octet)
         own_from, own_to, miss, other, least, most = (repeat(arguments[n]) for n in (2, 3, 5, 6, 7, 8))
-        is_own = builder.and_(
-            builder.icmp_unsigned(">=", marks, own_from), builder.icmp_unsigned("<=", marks, own_to)
-        )
+        is_own = builder.and_(builder.icmp_unsigned(">=", marks, own_from), builder.icmp_unsigned("<=", marks, own_to))
         is_miss = builder.icmp_unsigned("==", marks, ir.Constant(octet, [1] * 8))
         is_marked = builder.icmp_unsigned("!=", marks, ir.Constant(octet, [0] * 8))
         step = builder.select(is_own, builder.load(own_steps, align=4), other)
