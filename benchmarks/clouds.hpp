@@ -1,9 +1,11 @@
-// Point clouds as the benchmarks write them for the peers' drivers (peers.py, write_clouds).
+// Point clouds as the benchmarks write them for the peers' drivers (peers.py, write_clouds), and the drivers' clock.
 //
 // The file is little-endian: int64 clouds; for each int64 points, 3 float32 origin, 3 float32 per point, uint8 class per
 // point; all coordinates in the world's frame [m].
 
 #pragma once
+
+#include <time.h>
 
 #include <cstdint>
 #include <fstream>
@@ -34,4 +36,11 @@ inline std::vector<RawCloud> readClouds(const char* path) {
     cloud.classes = readValues<uint8_t>(file, count);
   }
   return clouds;
+}
+
+// Processor time of this thread [ns]: other programs on the core do not count.
+inline long long processorTime() {
+  timespec time;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time);
+  return time.tv_sec * 1000000000LL + time.tv_nsec;
 }

@@ -1,6 +1,6 @@
 """Insertion: how long one scan takes, next to native OctoMap, Bonxai and pyoctomap, and which cells differ.
 
-Our time includes unprojection from the depth image; the peers are given ready-made points.
+All times are processor times of one thread. Our time includes unprojection from the depth image; the peers are given ready-made points.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def main() -> None:
             title = f"{name} {resolution:g} m"
             _add_workload(report, title, scene, resolution)
             with pinned():
-                _compare(report, title, scene, resolution, clouds, path, peers, options.rounds)
+                _compare(report, title, scene, resolution, clouds, path, peers, options)
         for resolution in options.resolution or [0.2, 0.1]:
             if peers.octomap is not None:
                 _add_exactness(report, f"{name} {resolution:g} m", scene, resolution, clouds, peers.octomap)
@@ -82,6 +82,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resolution", action="append", type=float, help="default: 0.2 and 0.1")
     parser.add_argument("--frames", type=int, help="default: 100, LiDAR 30")
     parser.add_argument("--folder", type=Path, help="a 7-Scenes sequence, for --scene seven-scenes")
+    parser.add_argument(
+        "--skip-all-rays",
+        action="store_true",
+        help="leave out OctoMap's discretize=false, which takes most of the time",
+    )
     parser.add_argument(
         "--bonxai", type=Path, metavar="FOLDER", help="root of Bonxai's source; default: without Bonxai"
     )
@@ -154,11 +159,11 @@ class _Ours:
         increments = clamped_increments(self._scene.sensor())
         casting = applying = 0.0
         for index, frame in enumerate(self._scene.frames):
-            started = time.perf_counter()
+            started = time.thread_time()
             cells = self._caster.cast(frame)
-            cast = time.perf_counter()
+            cast = time.thread_time()
             add_scan(octree, cells, increments, index)
-            applying += time.perf_counter() - cast
+            applying += time.thread_time() - cast
             casting += cast - started
         scale = 1e3 / len(self._scene.frames)
         return casting * scale, applying * scale
@@ -166,7 +171,7 @@ class _Ours:
 
 def _compare(
     report: Report, title: str, scene: Scene, resolution: float, clouds: Sequence[PointCloud], path: Path,
-    peers: _Peers, rounds: int,
+    peers: _Peers, options: argparse.Namespace,
 ) -> None:  # fmt: skip
     """Interleaved rounds of all programs over the same frames."""
     ours = _Ours(scene, resolution)
@@ -175,12 +180,13 @@ def _compare(
     reach = scene.max_range
     if octomap is not None:
         contenders["OctoMap discretize=true"] = lambda: octomap.insert(path, resolution, reach, discretize=True)
+    if octomap is not None and not options.skip_all_rays:
         contenders["OctoMap discretize=false"] = lambda: octomap.insert(path, resolution, reach, discretize=False)
     if bonxai is not None:
         contenders["Bonxai"] = lambda: bonxai.insert(path, resolution, reach)
     if pyoctomap is not None:
         contenders["pyoctomap discretize=True"] = lambda: pyoctomap.insert(clouds, resolution, reach)
-    times = interleave(contenders, rounds)
+    times = interleave(contenders, options.rounds)
     for name, values in times.items():
         report.add(measured(f"{title}: {name}", values, "ms"))
         if name == "octoreplay":

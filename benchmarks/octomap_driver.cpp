@@ -1,6 +1,6 @@
 // Times native OctoMap, shows which cells it touches, and what its colour tree allocates.
 //
-//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   nanoseconds of each insertPointCloud, one a line
+//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   processor time of each insertPointCloud [ns], one a line
 //   octomap_driver keys CLOUDS RESOLUTION DISCRETIZE MAX_RANGE     cells of each cloud, to standard output as int32:
 //                                                                  free count, keys, occupied count, keys
 //   octomap_driver memory CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   of one ColorOcTree with all clouds: allocated bytes,
@@ -10,7 +10,6 @@
 
 #include <malloc.h>
 
-#include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -77,11 +76,9 @@ int main(int argc, char** argv) {
   if (mode == "insert") {
     octomap::OcTree tree(resolution);
     for (const Cloud& cloud : clouds) {
-      const auto start = std::chrono::steady_clock::now();
+      const long long start = processorTime();
       tree.insertPointCloud(cloud.points, cloud.origin, maxRange, false, discretize);
-      const auto end = std::chrono::steady_clock::now();
-      std::printf("%lld\n",
-                  static_cast<long long>(std::chrono::duration_cast<std::chrono::nanoseconds>(end - start).count()));
+      std::printf("%lld\n", processorTime() - start);
     }
   } else if (mode == "keys") {
     octomap::OcTree tree(resolution);
