@@ -1,6 +1,7 @@
 """Insertion: how long one scan takes, next to native OctoMap, Bonxai and pyoctomap, and which cells differ.
 
-All times are processor times of one thread. Our time includes unprojection from the depth image; the peers are given ready-made points.
+All times are processor times of one thread. Our time includes unprojection from the depth image; the peers are given
+ready-made points.
 """
 
 from __future__ import annotations
