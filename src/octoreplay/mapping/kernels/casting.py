@@ -293,17 +293,19 @@ def take_bricks(words, strengths, flags, corner, num_blocks, codes, brick_words,
         flags[block] = 0
         code = np.int64(-1)
         for part in range(BRICKS_PER_BLOCK):
-            first = (block * BRICKS_PER_BLOCK + part) * words_per_brick
+            # numba tests signed indices for being negative.
+            first = np.uint64((block * BRICKS_PER_BLOCK + part) * words_per_brick)
             found = np.uint64(0)
             for word in range(words_per_brick):
-                found |= words[first + word]
-                brick_words[num_bricks, word] = words[first + word]
-                words[first + word] = 0
+                place = first + np.uint64(word)
+                found |= words[place]
+                brick_words[num_bricks, word] = words[place]
+                words[place] = 0
             if found == 0:
                 continue
             if strengths.size > 0:
                 for word in range(words_per_brick):
-                    brick_strengths[num_bricks, word] = strengths[first + word]
+                    brick_strengths[num_bricks, word] = strengths[first + np.uint64(word)]
             if code < 0:
                 x = block % num_blocks[0] + low_x + offset
                 y = (block // num_blocks[0]) % num_blocks[1] + low_y + offset

@@ -309,13 +309,14 @@ def points_to_runs(
     block_keys, block_kinds = integers[:3], integers[3]
     for first in range(0, points.shape[0], BLOCK):
         size = min(BLOCK, points.shape[0] - first)
+        # numba tests the index first + i for being negative, which keeps the loop from becoming vector instructions.
+        block, labels = points[first : first + size], class_ids[first : first + size]
         num_cut = 0
         for i in range(size):
-            x, y = np.float64(points[first + i, 0]), np.float64(points[first + i, 1])
-            z = np.float64(points[first + i, 2])
+            x, y, z = np.float64(block[i, 0]), np.float64(block[i, 1]), np.float64(block[i, 2])
             distance = x * x + y * y + z * z
             valid = (distance > 0.0) & (distance < np.inf) & (distance >= least)
-            kind = np.int32(class_ids[first + i]) if valid else _NONE
+            kind = np.int32(labels[i]) if valid else _NONE
             is_cut = valid & (distance > most)
             sensor[0, i] = x if valid else 0.0
             sensor[1, i] = y if valid else 0.0

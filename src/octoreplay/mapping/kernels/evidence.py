@@ -52,11 +52,10 @@ def wanted_rows(bricks, indices, marks, num_classes, miss, clamp_min, clamp_max,
     - ``changes`` (n,) bool: output, False where a brick does not change because it is free and at the limit.
     """
     for t in range(indices.size):
-        any_hit = np.uint64(0)
-        known[t] = 0
+        any_hit, cells = np.uint64(0), np.uint64(0)
         for e in range(OCTETS):
             octet = marks[t, e]
-            known[t] |= _marked_cells(octet) << np.uint64(8 * e)
+            cells |= _marked_cells(octet) << np.uint64(8 * e)
             # A mark above 1 is a hit.
             hits = octet & ~EVERY_BYTE
             any_hit |= hits
@@ -67,6 +66,7 @@ def wanted_rows(bricks, indices, marks, num_classes, miss, clamp_min, clamp_max,
                 c = ((octet >> shift) & np.uint64(0xFF)) - np.uint64(2)
                 wanted[t, c >> np.uint64(3)] |= np.uint64(1) << (np.uint64(8 * e) + (c & np.uint64(7)))
                 hits &= ~(np.uint64(0xFF) << shift)
+        known[t] = cells
         index = indices[t]
         changes[t] = True
         if not any_hit and bricks.blocks[index] < 0 and bricks.known[index] == ALL_CELLS:

@@ -51,7 +51,7 @@ class Topology:
         return links
 
 
-def _fixed_links(network: NetworkConfig, robot_ids: Sequence[str]) -> Iterable[tuple[int, int]]:
+def _fixed_links(network: NetworkConfig, robot_ids: Sequence[str]) -> list[tuple[int, int]]:
     """Links of a fixed topology over all robots, as pairs of robot indices; a ring of one robot links it to itself."""
     num_robots, pairs = len(robot_ids), list(combinations(range(len(robot_ids)), 2))
     if network.topology == "edges":
@@ -61,7 +61,7 @@ def _fixed_links(network: NetworkConfig, robot_ids: Sequence[str]) -> Iterable[t
         # Only this topology needs networkx, which takes a tenth of a second to import.
         import networkx as nx
 
-        return nx.gnp_random_graph(num_robots, network.prob_link, seed=network.network_seed).edges
+        return list(nx.gnp_random_graph(num_robots, network.prob_link, seed=network.network_seed).edges)
     if network.topology == "grid":
         num_columns = math.isqrt(num_robots - 1) + 1  # the square root, rounded up
         return [(i, j) for i, j in pairs if j - i == num_columns or (j - i == 1 and j % num_columns > 0)]
