@@ -17,7 +17,7 @@ import logging, sys, time
 from pathlib import Path
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s: %(message)s")
 started = time.perf_counter()
-from octoreplay.team_file import load_team_file
+from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.run import replay_team
 imported = time.perf_counter()
 replay_team(load_team_file(sys.argv[1]), Path(sys.argv[2]))

@@ -1,18 +1,21 @@
-"""Insertion: how long one scan takes, next to native OctoMap and pyoctomap, and which cells differ from OctoMap's.
+"""Insertion: how long one scan takes, next to native OctoMap, Bonxai and pyoctomap, and which cells differ.
 
-Our time includes unprojection from the depth image; the peers are given ready-made points.
+All times are processor times of one thread. Our time includes unprojection from the depth image; the peers are given
+ready-made points.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import scenes
-from peers import MissingPeerError, NativeOctomap, PyOctomap, write_clouds
+from peers import Bonxai, MissingPeerError, NativeOctomap, PyOctomap, write_clouds
 from rounds import Report, Row, arguments, interleave, measured, pinned, speedup
 from scenes import NUM_CLASSES, PointCloud, Scene
 
@@ -28,6 +31,13 @@ FASTER_THAN_OCTOMAP = {
     ("lidar", 0.1): (19.0, 36.0),
 }
 """Speed relative to native OctoMap with discretize=true: target and goal."""
+FASTER_THAN_BONXAI = {
+    ("camera", 0.2): (1.8, 2.5),
+    ("camera", 0.1): (2.0, 2.5),
+    ("lidar", 0.2): (2.0, 2.5),
+    ("lidar", 0.1): (1.8, 2.5),
+}
+"""Speed relative to Bonxai: target and goal."""
 FASTER_THAN_PYOCTOMAP = (10.0, 20.0)
 FASTER_THAN_SEMANTIC_TREE = (25.0, 50.0)
 SEMANTIC_TREE_IN_OCTOMAPS = {
@@ -42,12 +52,14 @@ DEFAULT_FRAMES = {"camera": 100, "lidar": 30, "seven-scenes": 100}
 EXACTNESS_FRAMES = 5
 MICROMETRE = 1e-6
 
+_Peer = TypeVar("_Peer")
+
 
 def main() -> None:
     """Measure every asked scene at every asked resolution."""
     options = arguments(__doc__ or "", rounds=3, add=_add_options)
     report = Report("insertion", vars(options))
-    octomap, pyoctomap = _peers(report)
+    peers = _find_peers(report, options.bonxai)
     for name in options.scene or ["camera", "lidar"]:
         scene = scenes.load(name, options.frames or DEFAULT_FRAMES[name], options.folder)
         clouds = [scenes.point_cloud(frame) for frame in scene.frames]
@@ -56,10 +68,12 @@ def main() -> None:
             title = f"{name} {resolution:g} m"
             _add_workload(report, title, scene, resolution)
             with pinned():
-                _compare(report, title, scene, resolution, clouds, path, octomap, pyoctomap, options.rounds)
+                _compare(report, title, scene, resolution, clouds, path, peers, options)
         for resolution in options.resolution or [0.2, 0.1]:
-            if octomap is not None:
-                _add_exactness(report, f"{name} {resolution:g} m", scene, resolution, clouds, octomap)
+            if peers.octomap is not None:
+                _add_exactness(report, f"{name} {resolution:g} m", scene, resolution, clouds, peers.octomap)
+            if peers.bonxai is not None:
+                _add_bonxai_cells(report, f"{name} {resolution:g} m", scene, resolution, clouds, peers.bonxai)
         path.unlink()
     report.save(options.json)
 
@@ -69,20 +83,39 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resolution", action="append", type=float, help="default: 0.2 and 0.1")
     parser.add_argument("--frames", type=int, help="default: 100, LiDAR 30")
     parser.add_argument("--folder", type=Path, help="a 7-Scenes sequence, for --scene seven-scenes")
+    parser.add_argument(
+        "--skip-all-rays",
+        action="store_true",
+        help="leave out OctoMap's discretize=false, which takes most of the time",
+    )
+    parser.add_argument(
+        "--bonxai", type=Path, metavar="FOLDER", help="root of Bonxai's source; default: without Bonxai"
+    )
 
 
-def _peers(report: Report) -> tuple[NativeOctomap | None, PyOctomap | None]:
-    """The peers that this machine has; a sentence for each that it lacks."""
-    octomap, pyoctomap = None, None
+@dataclass(frozen=True)
+class _Peers:
+    """The peers that this machine has."""
+
+    octomap: NativeOctomap | None
+    pyoctomap: PyOctomap | None
+    bonxai: Bonxai | None
+
+
+def _find_peers(report: Report, bonxai_folder: Path | None) -> _Peers:
+    """The peers that this machine has; the report gets a sentence for each that is missing."""
+    return _Peers(
+        _found(report, NativeOctomap), _found(report, PyOctomap), _found(report, lambda: Bonxai(bonxai_folder))
+    )
+
+
+def _found(report: Report, make: Callable[[], _Peer]) -> _Peer | None:
+    """The peer; None and a sentence in the report where this machine lacks it."""
     try:
-        octomap = NativeOctomap()
+        return make()
     except MissingPeerError as error:
         report.remark(str(error))
-    try:
-        pyoctomap = PyOctomap()
-    except MissingPeerError as error:
-        report.remark(str(error))
-    return octomap, pyoctomap
+        return None
 
 
 def _add_workload(report: Report, title: str, scene: Scene, resolution: float) -> None:
@@ -127,11 +160,11 @@ class _Ours:
         increments = clamped_increments(self._scene.sensor())
         casting = applying = 0.0
         for index, frame in enumerate(self._scene.frames):
-            started = time.perf_counter()
+            started = time.thread_time()
             cells = self._caster.cast(frame)
-            cast = time.perf_counter()
+            cast = time.thread_time()
             add_scan(octree, cells, increments, index)
-            applying += time.perf_counter() - cast
+            applying += time.thread_time() - cast
             casting += cast - started
         scale = 1e3 / len(self._scene.frames)
         return casting * scale, applying * scale
@@ -139,18 +172,22 @@ class _Ours:
 
 def _compare(
     report: Report, title: str, scene: Scene, resolution: float, clouds: Sequence[PointCloud], path: Path,
-    octomap: NativeOctomap | None, pyoctomap: PyOctomap | None, rounds: int,
+    peers: _Peers, options: argparse.Namespace,
 ) -> None:  # fmt: skip
-    """Interleaved rounds of everybody over the same frames."""
+    """Interleaved rounds of all programs over the same frames."""
     ours = _Ours(scene, resolution)
+    octomap, pyoctomap, bonxai = peers.octomap, peers.pyoctomap, peers.bonxai
     contenders = {"octoreplay": ours.__call__}
     reach = scene.max_range
     if octomap is not None:
         contenders["OctoMap discretize=true"] = lambda: octomap.insert(path, resolution, reach, discretize=True)
+    if octomap is not None and not options.skip_all_rays:
         contenders["OctoMap discretize=false"] = lambda: octomap.insert(path, resolution, reach, discretize=False)
+    if bonxai is not None:
+        contenders["Bonxai"] = lambda: bonxai.insert(path, resolution, reach)
     if pyoctomap is not None:
         contenders["pyoctomap discretize=True"] = lambda: pyoctomap.insert(clouds, resolution, reach)
-    times = interleave(contenders, rounds)
+    times = interleave(contenders, options.rounds)
     for name, values in times.items():
         report.add(measured(f"{title}: {name}", values, "ms"))
         if name == "octoreplay":
@@ -169,6 +206,9 @@ def _compare(
                 speedup(f"{title}: against the SSMI tree", mine, derived, must=must, goal=goal,
                         note=f"derived: {SEMANTIC_TREE_IN_OCTOMAPS[case]:.1f} x OctoMap's time")
             )  # fmt: skip
+    if bonxai is not None:
+        must, goal = FASTER_THAN_BONXAI.get(case, (None, None))
+        report.add(speedup(f"{title}: against Bonxai", mine, times["Bonxai"], must=must, goal=goal))
     if pyoctomap is not None:
         must, goal = FASTER_THAN_PYOCTOMAP
         theirs = times["pyoctomap discretize=True"]
@@ -186,7 +226,7 @@ def _add_exactness(
     OctoMap's two ray options are compared with ours; a cell that is hit counts as not freed on both sides, as OctoMap's
     own update does it. Where the free sets differ, the longest way of a ray through such a cell says who is right.
     """
-    chosen = [_near(cloud, scene.max_range - 0.01) for cloud in clouds[:: max(1, len(clouds) // EXACTNESS_FRAMES)]]
+    chosen = _exactness_clouds(scene, clouds)
     path = write_clouds(scenes.cache_folder() / "exactness.clouds", chosen)
     for rays, discretize in (("all", False), ("cells", True)):
         theirs = octomap.touched(path, resolution, -1.0, discretize=discretize)
@@ -209,6 +249,29 @@ def _add_exactness(
         note = f"{_chords('only ours', our_chords)}; {_chords('only OctoMap', their_chords)}"
         report.add(Row(f"{option}: free cells that differ", float(counts[3]), f"of {counts[2]:,}", note=note))
     path.unlink()
+
+
+def _add_bonxai_cells(
+    report: Report, title: str, scene: Scene, resolution: float, clouds: Sequence[PointCloud], bonxai: Bonxai
+) -> None:
+    """Cells of a few frames that only we or only Bonxai hit, and cells that only we or only Bonxai free."""
+    chosen = _exactness_clouds(scene, clouds)
+    path = write_clouds(scenes.cache_folder() / "exactness.clouds", chosen)
+    caster = ScanCaster(scene.sensor(), MapConfig(resolution=resolution), 1)
+    hit_counts, free_counts = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for cloud, (their_free, their_hits) in zip(chosen, bonxai.touched(path, resolution, scene.max_range), strict=True):
+        hits, free = _touched(caster, scene, cloud, resolution)
+        for counts, mine, theirs in ((hit_counts, hits, _packed(their_hits)), (free_counts, free, _packed(their_free))):
+            counts += len(mine), len(np.setdiff1d(mine, theirs)), len(np.setdiff1d(theirs, mine))
+    path.unlink()
+    for kind, (total, only_ours, only_theirs) in (("hit", hit_counts), ("free", free_counts)):
+        note = f"only Bonxai: {only_theirs:,}"
+        report.add(Row(f"{title}: {kind} cells that Bonxai misses", 100 * only_ours / total, "%", note=note))
+
+
+def _exactness_clouds(scene: Scene, clouds: Sequence[PointCloud]) -> list[PointCloud]:
+    """The points within the range of a few frames."""
+    return [_near(cloud, scene.max_range - 0.01) for cloud in clouds[:: max(1, len(clouds) // EXACTNESS_FRAMES)]]
 
 
 def _near(cloud: PointCloud, reach: float) -> PointCloud:

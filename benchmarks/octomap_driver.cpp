@@ -1,27 +1,25 @@
 // Times native OctoMap, shows which cells it touches, and what its colour tree allocates.
 //
-//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   nanoseconds of each insertPointCloud, one a line
+//   octomap_driver insert CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   processor time of each insertPointCloud [ns], one a line
 //   octomap_driver keys CLOUDS RESOLUTION DISCRETIZE MAX_RANGE     cells of each cloud, to standard output as int32:
 //                                                                  free count, keys, occupied count, keys
 //   octomap_driver memory CLOUDS RESOLUTION DISCRETIZE MAX_RANGE   of one ColorOcTree with all clouds: allocated bytes,
 //                                                                  memoryUsage(), nodes, finest cells
 //
-// CLOUDS is little-endian: int64 clouds; for each int64 points, 3 float32 origin, 3 float32 per point, uint8 class per
-// point; all coordinates in the world's frame. The caller pins the process to a core.
+// clouds.hpp describes CLOUDS. The caller pins the process to a core.
 
 #include <malloc.h>
 
-#include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
-#include <fstream>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include <octomap/ColorOcTree.h>
 #include <octomap/OcTree.h>
+
+#include "clouds.hpp"
 
 struct Cloud {
   octomap::point3d origin;
@@ -29,27 +27,16 @@ struct Cloud {
   std::vector<uint8_t> classes;
 };
 
-template <class T>
-std::vector<T> read(std::ifstream& file, std::size_t count) {
-  std::vector<T> values(count);
-  file.read(reinterpret_cast<char*>(values.data()), static_cast<std::streamsize>(count * sizeof(T)));
-  if (!file) throw std::runtime_error("the file of clouds is cut");
-  return values;
-}
-
-std::vector<Cloud> readClouds(const char* path) {
-  std::ifstream file(path, std::ios::binary);
-  std::vector<Cloud> clouds(read<int64_t>(file, 1)[0]);
-  for (Cloud& cloud : clouds) {
-    const std::size_t count = read<int64_t>(file, 1)[0];
-    const auto origin = read<float>(file, 3);
-    const auto points = read<float>(file, 3 * count);
-    cloud.origin = octomap::point3d(origin[0], origin[1], origin[2]);
-    cloud.points.reserve(count);
-    for (std::size_t i = 0; i < count; ++i) {
-      cloud.points.push_back(points[3 * i], points[3 * i + 1], points[3 * i + 2]);
+std::vector<Cloud> octomapClouds(const char* path) {
+  std::vector<Cloud> clouds;
+  for (const RawCloud& raw : readClouds(path)) {
+    Cloud& cloud = clouds.emplace_back();
+    cloud.origin = octomap::point3d(raw.origin[0], raw.origin[1], raw.origin[2]);
+    cloud.points.reserve(raw.points.size() / 3);
+    for (std::size_t i = 0; i < raw.points.size(); i += 3) {
+      cloud.points.push_back(raw.points[i], raw.points[i + 1], raw.points[i + 2]);
     }
-    cloud.classes = read<uint8_t>(file, count);
+    cloud.classes = raw.classes;
   }
   return clouds;
 }
@@ -82,18 +69,16 @@ int main(int argc, char** argv) {
     return 2;
   }
   const std::string mode = argv[1];
-  const std::vector<Cloud> clouds = readClouds(argv[2]);
+  const std::vector<Cloud> clouds = octomapClouds(argv[2]);
   const double resolution = std::atof(argv[3]);
   const bool discretize = std::atoi(argv[4]) != 0;
   const double maxRange = std::atof(argv[5]);
   if (mode == "insert") {
     octomap::OcTree tree(resolution);
     for (const Cloud& cloud : clouds) {
-      const auto start = std::chrono::steady_clock::now();
+      const long long start = processorTime();
       tree.insertPointCloud(cloud.points, cloud.origin, maxRange, false, discretize);
-      const auto end = std::chrono::steady_clock::now();
-      std::printf("%lld\n",
-                  static_cast<long long>(std::chrono::duration_cast<std::chrono::nanoseconds>(end - start).count()));
+      std::printf("%lld\n", processorTime() - start);
     }
   } else if (mode == "keys") {
     octomap::OcTree tree(resolution);

@@ -161,14 +161,26 @@ def test_sums_of_confidences_beyond_int32():
     lengths = np.full(4, 8_000_000, np.int32)
     sums = 255 * lengths
     lengths[3], sums[3] = lengths[3] + 1, sums[3] + 1
-    keys, kinds = np.zeros((4, 3), np.int32), np.array([1, 2, 1, 2], np.uint8)
-    low, edges, table = np.zeros(3, np.int64), np.ones(3, np.int64), np.full(8, -1, np.int32)
-    votes, end_cells = np.zeros((1, 2), np.int32), np.zeros(1, np.int64)
-    end_keys, marks, strengths = np.zeros((1, 3), np.int32), np.zeros(1, np.uint8), np.zeros(1, np.uint8)
-    ends.distinct_ends(keys, kinds, lengths, low, edges, 2, table, votes, end_cells, end_keys, marks)
-    vote_sums = np.zeros((1, 2), np.int64)
-    ends.weigh_ends(keys, kinds, sums, low, edges, 2, table, votes, vote_sums, end_cells, marks, strengths)
-    assert (marks[0], strengths[0]) == (3, 255)
+    kinds, places, table = np.array([1, 2, 1, 2], np.uint8), np.zeros(4, np.uint32), np.full(8, -1, np.int32)
+    open_places, votes, vote_sums = np.zeros(1, np.uint32), np.zeros((1, 2), np.int32), np.zeros((1, 2), np.int64)
+    marks, strengths, end_marks = np.array([1, 0], np.uint8), np.zeros(2, np.uint8), np.zeros(1, np.uint8)
+    ends.settle_ends(
+        places,
+        kinds,
+        lengths,
+        sums,
+        4,
+        2,
+        table,
+        open_places,
+        votes,
+        vote_sums,
+        marks,
+        strengths,
+        places[:1],
+        end_marks,
+    )
+    assert (marks[0], strengths[0], end_marks[0]) == (3, 255, 3)
     assert vote_sums.tolist() == [[4_080_000_000, 4_080_000_001]]
 
 

@@ -31,14 +31,14 @@ def weighted_cells(frame, sensor=SENSOR, region=MAP, num_classes=NUM_CLASSES, ca
     """(freed keys, {hit key: (class_id, strength)}) of a scan, from the caster."""
     touched = (caster or ScanCaster(sensor, region, num_classes)).cast(frame)
     assert len(set(touched.codes.tolist())) == len(touched.codes)
-    marks = touched.marks.reshape(-1, storage.BRICK_CELLS)[touched.touched]
+    marks = touched.marks.view(np.uint8)
     rows, cells = np.nonzero(marks)
     keys = np.empty((len(rows), 3), np.int64)
     storage.codes_to_keys((touched.codes[rows] << storage.CELL_BITS) + cells, keys)
     kinds = marks[rows, cells].tolist()
     strengths = np.full(len(kinds), 255)
     if touched.strengths.size:
-        strengths = touched.strengths.reshape(-1, storage.BRICK_CELLS)[touched.touched][rows, cells]
+        strengths = touched.strengths.view(np.uint8)[rows, cells]
     content = dict(zip(map(tuple, keys.tolist()), zip(kinds, strengths.tolist(), strict=True), strict=True))
     freed = {key for key, (kind, _) in content.items() if kind == 1}
     return freed, {key: (kind - 1, strength) for key, (kind, strength) in content.items() if kind > 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,8 @@ from octoreplay.records import (
     Int32Array,
     Int64Array,
     UInt8Array,
+    UInt32Array,
+    UInt64Array,
     read_only,
 )
 
@@ -70,19 +73,18 @@ COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf, is_count=True)
 
 @dataclass(frozen=True, eq=False)
 class TouchedCells:
-    """Cells that one scan touches. ``marks`` and ``strengths`` are the caster's memory, valid until its next cast.
+    """Cells that one scan touches. The arrays are the caster's memory, valid until its next cast.
 
     - ``codes`` (n,): Morton codes of the bricks with a touched cell.
-    - ``marks``: one byte for each cell of the scratch grid, 64 for each brick in Morton order: 0 untouched, 1 passed,
-      1 + class_id hit.
-    - ``touched`` (n,): position of each brick in the scratch grid.
-    - ``strengths``: label confidence of each hit in 1 / 255, parallel to ``marks``; size 0 for full confidence.
+    - ``marks`` (n, 8) uint64: one byte for each cell of the bricks in Morton order: 0 untouched, 1 passed, 1 + class_id
+      hit.
+    - ``strengths`` (n, 8) uint64: label confidence of each hit in 1 / 255, parallel to ``marks``; size 0 for full
+      confidence.
     """
 
     codes: Int64Array
-    marks: UInt8Array
-    touched: Int64Array
-    strengths: UInt8Array
+    marks: UInt64Array
+    strengths: UInt64Array
 
 
 def sensor_reach(sensor: SensorConfig, map_config: MapConfig) -> float:
@@ -105,9 +107,13 @@ class ScanCaster:
         self._is_bounded = bool(np.isfinite(map_config.box).any())
         self._special = np.array(sensor.invalid_depth + sensor.no_return_depth, np.float64)
         self._meanings = np.repeat([0.0, np.inf], [len(sensor.invalid_depth), len(sensor.no_return_depth)])
+        # The scratch grid is empty between casts.
         self._marks = np.zeros(0, np.uint8)
         self._strengths = np.zeros(0, np.uint8)
         self._flags = np.zeros(0, np.uint8)
+        self._bricks = _BrickMemory(0, has_strengths=False)
+        self._scratch = np.empty((0, 0), np.float32), np.empty((0, 0)), np.empty((0, 0), np.int32)
+        self._scratch_rows(ends.BLOCK)
         self._runs = _Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
@@ -117,27 +123,40 @@ class ScanCaster:
         weighted by their confidences; points in robots' bodies hit nothing. Raises InputError where the scan leaves the
         key space, and ConfigError where max_range is too long for the resolution.
         """
-        origin = np.ascontiguousarray(frame.T_team_sensor[:3, 3], np.float64)
+        # numpy takes longer than Python for three numbers.
+        origin = [float(coord) / self._resolution for coord in frame.T_team_sensor[:3, 3]]
+        if not all(1 - storage.KEY_OFFSET <= coord < storage.KEY_OFFSET for coord in origin):
+            raise self._outside(frame)
+        origin_key = [math.floor(coord) for coord in origin]
         self._find_runs(frame)
         runs = self._runs
-        low, high = self._box(frame, origin)
-        has_full_confidence = _confidences(frame).size == 0
-        num_ends = runs.reduce(low, high, self._num_classes, has_full_confidence=has_full_confidence)
-        end_keys, end_marks = runs.end_keys[:num_ends], runs.end_marks[:num_ends]
-        corner, num_blocks, marks, flags = self._grid(low, high)
-        strengths = self._strength_plane(0 if has_full_confidence else marks.size)
-        start = self._start(origin, corner)
+        corner, num_blocks, marks, flags = self._grid(*self._box(frame, origin_key))
         tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
+        casting.fill_tables(num_blocks, tables)
+        strengths = self._strength_plane(0 if _confidences(frame).size == 0 else marks.size)
+        num_ends, end_marks = runs.reduce(corner, tables, marks, strengths)
+        start = np.array([self._start(*coords) for coords in zip(origin, origin_key, corner.tolist(), strict=True)])
         casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
-        casting.mark_hits(end_keys, end_marks, corner, tables, marks, flags)
-        if not has_full_confidence:
-            casting.mark_strengths(end_keys, end_marks, runs.end_strengths, corner, tables, strengths)
+        casting.mark_hits(runs.end_places[:num_ends], end_marks, marks, flags)
         if self._is_bounded:
             casting.clear_outside(*self._mapped(corner, num_blocks), num_blocks, marks, flags)
-        most = np.count_nonzero(flags) * casting.BRICKS_PER_BLOCK
-        touched, codes = np.empty(most, np.int64), np.empty(most, np.int64)
-        count = casting.touched_bricks(marks.view(np.uint64), flags, corner, num_blocks, touched, codes)
-        return TouchedCells(codes[:count], marks, touched[:count], strengths)
+        return self._take_bricks(corner, num_blocks, marks, strengths, flags)
+
+    def _take_bricks(
+        self, corner: Int64Array, num_blocks: Int64Array, marks: UInt8Array, strengths: UInt8Array, flags: UInt8Array
+    ) -> TouchedCells:
+        """Return the touched cells of the scratch grid, and empty it."""
+        # One more than the bricks: the kernel writes bricks without a mark too, and overwrites them with the next.
+        places, has_strengths = int(np.count_nonzero(flags)) * casting.BRICKS_PER_BLOCK + 1, strengths.size > 0
+        if places > self._bricks.codes.size or has_strengths > (self._bricks.strengths.size > 0):
+            self._bricks = _BrickMemory(2 * places, has_strengths=has_strengths)
+        bricks = self._bricks
+        brick_strengths = bricks.strengths if has_strengths else bricks.strengths[:0]
+        num_bricks = casting.take_bricks(
+            marks.view(np.uint64), strengths.view(np.uint64), flags, corner, num_blocks, bricks.codes, bricks.marks,
+            brick_strengths,
+        )  # fmt: skip
+        return TouchedCells(bricks.codes[:num_bricks], bricks.marks[:num_bricks], brick_strengths[:num_bricks])
 
     def _find_runs(self, frame: Frame) -> None:
         """Write the ends of the scan's rays into the runs."""
@@ -160,12 +179,21 @@ class ScanCaster:
         """Find the runs of a depth image without lens distortion."""
         camera = frame.camera
         depth, *values = self._depths(frame)
-        classes = np.empty((0, 0), np.uint8) if frame.class_image is None else frame.class_image
+        # A scan without labels has class 1 everywhere.
+        classes = read_only(np.ones(depth.shape, np.uint8)) if frame.class_image is None else frame.class_image
         ends.depth_to_runs(
             depth, frame.depth_unit, np.ascontiguousarray(classes),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._runs.outputs,
+            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._scratch_rows(depth.shape[1]),
+            *self._runs.outputs,
         )  # fmt: skip
+
+    def _scratch_rows(self, size: int) -> tuple[Float32Array, Float64Array, Int32Array]:
+        """Return the scratch memory of the kernels that process ``size`` points at once."""
+        if size + 1 > self._scratch[0].shape[1]:
+            shape = (ends.NUM_SCRATCH_ROWS, size + 1)
+            self._scratch = np.empty(shape, np.float32), np.empty(shape), np.empty(shape, np.int32)
+        return self._scratch
 
     def _lens_points(self, frame: DepthFrame, slopes: Float32Array) -> Float64Array:
         """Return the points (P, 3) of a depth image in the sensor's frame [m], at most 2 x max_range deep."""
@@ -190,22 +218,24 @@ class ScanCaster:
     ) -> None:
         """Find the runs of points (P, 3) with the classes (P,)."""
         kind = np.float32 if points.dtype == np.float32 else np.float64
-        classes = np.empty(0, np.uint8) if class_ids is None else class_ids
+        classes = read_only(np.ones(len(points), np.uint8)) if class_ids is None else class_ids
         ends.points_to_runs(
             np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame), *self._runs.outputs,
+            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame),
+            *self._scratch_rows(ends.BLOCK)[1:], *self._runs.outputs,
         )  # fmt: skip
 
-    def _box(self, frame: Frame, origin: Float64Array) -> tuple[Int64Array, Int64Array]:
-        """Return the lowest and highest key (3,) of the origin and all ends."""
-        start = np.floor(origin / self._resolution)
-        if np.any(np.abs(start) >= storage.KEY_OFFSET):
+    def _box(self, frame: Frame, origin_key: list[int]) -> tuple[list[int], list[int]]:
+        """Return the lowest and highest key of the origin and all ends."""
+        bounds = np.array([origin_key, origin_key], np.int64)
+        ends.extend_bounds(self._runs.keys, self._runs.num_runs, bounds[0], bounds[1])
+        low, high = bounds.tolist()
+        if min(low) <= -storage.KEY_OFFSET or max(high) >= storage.KEY_OFFSET:
             raise self._outside(frame)
-        low, high = start.astype(np.int64), start.astype(np.int64)
-        ends.extend_bounds(self._runs.keys[: self._runs.num_runs], low, high)
-        if np.any(low <= -storage.KEY_OFFSET) or np.any(high >= storage.KEY_OFFSET):
-            raise self._outside(frame)
-        if float(np.prod(high - low + 2.0 * casting.BLOCK_EDGE)) > MAX_GRID_CELLS:
+        if (
+            math.prod(most - least + 2 * casting.BLOCK_EDGE for least, most in zip(low, high, strict=True))
+            > MAX_GRID_CELLS
+        ):
             raise ConfigError(
                 f"resolution: {self._resolution:g} m is too fine for max_range {self._sensor.max_range:g} m: one scan "
                 f"would span more than {MAX_GRID_CELLS:.1e} cells"
@@ -221,18 +251,17 @@ class ScanCaster:
             "T_team_map or a coarser resolution"
         )
 
-    def _grid(self, low: Int64Array, high: Int64Array) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
+    def _grid(self, low: list[int], high: list[int]) -> tuple[Int64Array, Int64Array, UInt8Array, UInt8Array]:
         """Return an empty scratch grid around the cells low..high: lowest cell, size in blocks, marks, flags."""
-        casting.clear_marks(self._marks, self._flags)
-        first = low >> casting.BLOCK_BITS
-        num_blocks = (high >> casting.BLOCK_BITS) - first + 1
-        size = int(np.prod(num_blocks))
+        first = [key >> casting.BLOCK_BITS for key in low]
+        num_blocks = [(key >> casting.BLOCK_BITS) - block + 1 for key, block in zip(high, first, strict=True)]
+        size = math.prod(num_blocks)
         if size > self._flags.size:
             # np.zeros maps fresh memory, which takes no physical memory until it is written.
             self._marks = np.zeros(size * casting.BLOCK_CELLS, np.uint8)
             self._flags = np.zeros(size, np.uint8)
         marks = self._marks[: size * casting.BLOCK_CELLS]
-        return first << casting.BLOCK_BITS, num_blocks, marks, self._flags[:size]
+        return np.array(first) << casting.BLOCK_BITS, np.array(num_blocks), marks, self._flags[:size]
 
     def _strength_plane(self, size: int) -> UInt8Array:
         """Return memory for the strengths in a scratch grid of ``size`` cells; only those of hit cells are read."""
@@ -240,12 +269,11 @@ class ScanCaster:
             self._strengths = np.zeros(size, np.uint8)
         return self._strengths[:size]
 
-    def _start(self, origin: Float64Array, corner: Int64Array) -> Float64Array:
-        """Return the start of the rays in cells of the scratch grid, rounded to a multiple of casting.FRACTION."""
-        coords = origin / self._resolution
-        keys = np.floor(coords)
-        inside = np.minimum(np.rint((coords - keys) / casting.FRACTION) * casting.FRACTION, 1.0 - casting.FRACTION)
-        return np.asarray(keys - corner + inside)
+    @staticmethod
+    def _start(coord: float, key: int, corner: int) -> float:
+        """Return a coordinate [cell] in the scratch grid, rounded to a multiple of casting.FRACTION within its cell."""
+        inside = round((coord - key) / casting.FRACTION) * casting.FRACTION
+        return key - corner + min(inside, 1.0 - casting.FRACTION)
 
     def _mapped(self, corner: Int64Array, num_blocks: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Return the box [low, high) (3,) of the scratch grid's cells with centres within the configured bounds."""
@@ -258,6 +286,15 @@ class ScanCaster:
         return low, high
 
 
+class _BrickMemory:
+    """Memory for the bricks that a scan touches."""
+
+    def __init__(self, capacity: int, *, has_strengths: bool) -> None:
+        self.codes = np.empty(capacity, np.int64)
+        self.marks = np.empty((capacity, storage.OCTETS), np.uint64)
+        self.strengths = np.empty((capacity if has_strengths else 0, storage.OCTETS), np.uint64)
+
+
 class _Runs:
     """Memory for the ends of a scan's rays: first as runs of neighbouring points, then as distinct end cells."""
 
@@ -266,14 +303,13 @@ class _Runs:
         self.counters = np.zeros(2, np.int64)
         # One more than the points: kernels write points without information too, and overwrite them with the next.
         places = capacity + 1
-        self.keys = np.empty((places, 3), np.int32)
+        self.keys = np.empty((3, places), np.int32)
         self.kinds = np.empty(places, np.uint8)
         self.lengths = np.empty(places, np.int32)
         self.end_keys = np.empty((capacity, 3), np.int32)
-        self.end_marks = np.empty(capacity, np.uint8)
-        self.end_strengths = np.empty(0, np.uint8)
-        self._end_cells = np.empty(capacity, np.int64)
-        self._votes = np.empty((capacity, num_classes), np.int32)
+        self.end_places = np.empty(capacity, np.uint32)
+        self._num_classes = num_classes
+        self._places = np.empty(capacity, np.uint32)
         self._sums = np.empty(places, np.int32)
         self._every = rays == "all"
         self._points = np.empty((places if self._every else 0, 3))
@@ -289,26 +325,27 @@ class _Runs:
         """Output arrays of the kernels that find runs."""
         return self.keys, self.kinds, self.lengths, self._sums, self._points, self._point_keys, self.counters
 
-    def reduce(self, low: Int64Array, high: Int64Array, num_classes: int, *, has_full_confidence: bool) -> int:
-        """Reduce the runs, all within low..high, to distinct end cells; return their number.
+    def reduce(
+        self, corner: Int64Array, tables: UInt32Array, marks: UInt8Array, strengths: UInt8Array
+    ) -> tuple[int, UInt8Array]:
+        """Mark the distinct end cells in the scratch grid; return their number n and their marks (n,).
 
-        Without ``has_full_confidence``, the cells get strengths from the points' confidences.
+        With ``strengths``, labels are weighted by the points' confidences, and the cells get their strengths.
         """
-        num_runs = self.num_runs
-        keys, edges = self.keys[:num_runs], high - low + 1
-        table = np.full(1 << max(2 * num_runs, 2).bit_length(), -1, np.int32)
-        num_ends = ends.distinct_ends(
-            keys, self.kinds, self.lengths, low, edges, num_classes, table, self._votes, self._end_cells, self.end_keys,
-            self.end_marks,
+        is_weighted = strengths.size > 0
+        runs, num_classes = (self.kinds, self.num_runs), self._num_classes
+        num_ends, num_open = ends.mark_ends(
+            self.keys, *runs, corner, tables, num_classes, is_weighted, marks, self._places, self.end_places,
+            self.end_keys,
         )  # fmt: skip
-        if not has_full_confidence:
-            self.end_strengths = np.empty(num_ends, np.uint8)
-            ends.weigh_ends(
-                keys, self.kinds, self._sums, low, edges, num_classes, table, self._votes,
-                np.zeros((num_ends, num_classes), np.int64), self._end_cells, self.end_marks[:num_ends],
-                self.end_strengths,
-            )  # fmt: skip
-        return int(num_ends)
+        end_marks = np.empty(num_ends, np.uint8)
+        ends.settle_ends(
+            self._places, self.kinds, self.lengths, self._sums if is_weighted else self.lengths,
+            self.num_runs if num_open else 0, num_classes, np.full(2 << (2 * num_open).bit_length(), -1, np.int32),
+            np.empty(num_open, np.uint32), np.zeros((num_open, num_classes), np.int32),
+            np.zeros((num_open, num_classes), np.int64), marks, strengths, self.end_places[:num_ends], end_marks,
+        )  # fmt: skip
+        return num_ends, end_marks
 
     def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
         """Return end points (n, 3) [m] and end cells (n, 3) of the rays; no end points if rays go to cell centres."""
@@ -342,23 +379,19 @@ def add_scan(
     ``before`` is a snapshot of the octree from before its first scan with this revision.
     """
     indices = octree.find_or_add(cells.codes)
-    words = cells.marks.view(np.uint64)
     miss, least, most = np.float32(increments.miss), np.float32(increments.least), np.float32(increments.most)
     wanted = np.zeros((indices.size, octree.bricks.masks.shape[1]), np.uint64)
     known, changes = np.empty(indices.size, np.uint64), np.empty(indices.size, np.bool_)
     evidence.wanted_rows(
-        octree.bricks, indices, cells.touched, words, octree.num_classes, miss, least, most, wanted, known, changes
+        octree.bricks, indices, cells.marks, octree.num_classes, miss, least, most, wanted, known, changes
     )
     if before is not None:
         before.save(octree.codes[indices[changes & (octree.revisions[indices] < revision)]])
     octree.expand_bricks(indices, wanted, known, changes)
-    brick_marks = octree.bricks, indices[changes], cells.touched[changes], words
-    others = miss, np.float32(increments.hit_other), least, most
-    num_words = storage.OCTETS * (octree.num_classes + 1) + 1
-    if increments.is_count or cells.strengths.size == 0:
-        scratch = np.empty((2, num_words), np.uint64)
-        evidence.apply_marks(*brick_marks, octree.num_classes, np.float32(increments.hit), *others, revision, scratch)
-    else:
-        strengths, scratch = cells.strengths.view(np.uint64), np.empty((3, num_words), np.uint64)
-        hits = increments.weighted_hits()
-        evidence.apply_weighted_marks(*brick_marks, strengths, octree.num_classes, hits, *others, revision, scratch)
+    is_weighted = not increments.is_count and cells.strengths.size > 0
+    hits = increments.weighted_hits() if is_weighted else np.full(256, increments.hit, np.float32)
+    strengths = cells.strengths if is_weighted else cells.strengths[:0]
+    evidence.apply_marks(
+        octree.bricks, indices, changes, cells.marks, strengths.view(np.uint8), octree.num_classes, hits, miss,
+        np.float32(increments.hit_other), least, most, revision, np.empty(storage.BRICK_CELLS, np.float32),
+    )  # fmt: skip

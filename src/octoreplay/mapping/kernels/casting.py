@@ -40,6 +40,22 @@ def _offset(coordinate, unit, stride):
     return np.uint32((coordinate >> BLOCK_BITS) * stride) + np.uint32(within * unit)
 
 
+@kernel
+def fill_tables(num_blocks, tables):
+    """Write the terms of a cell's place along x, y and z, in rising order and then in falling order.
+
+    - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
+    - ``tables`` (6, longest edge of the grid + VECTOR) uint32: output.
+    """
+    longest, stride = tables.shape[1] - VECTOR, BLOCK_CELLS
+    for axis in range(num_blocks.size):
+        for k in range(longest):
+            place = _offset(np.uint32(k), np.uint32(1 << axis), np.uint32(stride))
+            tables[axis, k] = place
+            tables[3 + axis, longest - 1 - k] = place
+        stride *= num_blocks[axis]
+
+
 @allocating_kernel
 def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, marks, flags):
     """Mark with 1 every cell that a ray passes before its end cell, and flag the blocks that rays pass.
@@ -57,18 +73,13 @@ def mark_free(start, ends, end_keys, resolution, corner, num_blocks, tables, mar
     - ``resolution``: edge of a cell [m].
     - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
     - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
-    - ``tables`` (6, longest edge of the grid + VECTOR) uint32: output, terms of a cell's place along x, y and z in
-      rising order, then in falling order.
+    - ``tables`` uint32: as filled by fill_tables.
     - ``marks`` uint8, ``flags`` uint8: of the scratch grid, in place.
     """
     longest, stride = tables.shape[1] - VECTOR, BLOCK_CELLS
     strides = np.empty(3, np.uint32)
     for axis in range(3):
         strides[axis] = stride
-        for k in range(longest):
-            place = _offset(np.uint32(k), np.uint32(1 << axis), np.uint32(stride))
-            tables[axis, k] = place
-            tables[3 + axis, longest - 1 - k] = place
         stride *= num_blocks[axis]
     lengths = np.empty(3)
     places_b, places_c = np.empty(_PIECE + VECTOR, np.uint32), np.empty(_PIECE + VECTOR, np.uint32)
@@ -222,35 +233,18 @@ def _mark_end_slabs(marks, flags, table_a, table_b, table_c, firsts, walls, last
 
 
 @kernel
-def mark_hits(end_keys, end_marks, corner, tables, marks, flags):
+def mark_hits(end_places, end_marks, marks, flags):
     """Write the marks of hit end cells over those of passed cells.
 
-    - ``end_keys`` (n, 3) int32: keys of the end cells.
+    - ``end_places`` (n,) uint32: places of the end cells.
     - ``end_marks`` (n,) uint8: marks; 0 is skipped.
-    - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
-    - ``tables`` uint32: as filled by mark_free.
-    - ``marks`` uint8, ``flags`` uint8: in place.
+    - ``marks`` uint8, ``flags`` uint8: of the scratch grid, in place.
     """
     for i in range(end_marks.size):
         if end_marks[i] > 0:
-            x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
-            cell = np.int64(tables[0, x] + tables[1, y] + tables[2, z])
-            marks[cell] = end_marks[i]
-            flags[cell >> (3 * BLOCK_BITS)] = 1
-
-
-@kernel
-def mark_strengths(end_keys, end_marks, end_strengths, corner, tables, strengths):
-    """Write the strengths of hit end cells.
-
-    - ``end_keys``, ``end_marks``, ``corner``, ``tables``: as for mark_hits.
-    - ``end_strengths`` (n,) uint8: label confidence in 1 / 255.
-    - ``strengths`` uint8: parallel to the marks, in place.
-    """
-    for i in range(end_marks.size):
-        if end_marks[i] > 0:
-            x, y, z = end_keys[i, 0] - corner[0], end_keys[i, 1] - corner[1], end_keys[i, 2] - corner[2]
-            strengths[np.int64(tables[0, x] + tables[1, y] + tables[2, z])] = end_strengths[i]
+            place = end_places[i]
+            marks[place] = end_marks[i]
+            flags[place >> np.uint32(3 * BLOCK_BITS)] = 1
 
 
 @kernel
@@ -277,46 +271,46 @@ def clear_outside(low, high, num_blocks, marks, flags):
 
 
 @kernel
-def touched_bricks(words, flags, corner, num_blocks, touched, codes):
-    """Find the bricks that hold a mark; returns their number m.
+def take_bricks(words, strengths, flags, corner, num_blocks, codes, brick_words, brick_strengths):
+    """Move the bricks that hold a mark out of the scratch grid, which is empty afterwards; returns their number m.
 
-    - ``words`` uint64: marks of the scratch grid, eight to a word.
-    - ``flags`` uint8: flagged blocks.
+    - ``words`` uint64: marks of the scratch grid, eight to a word; 0 afterwards.
+    - ``strengths`` uint64: strengths, parallel to ``words``; size 0 for none.
+    - ``flags`` uint8: flagged blocks; 0 afterwards.
     - ``corner`` (3,) int64: key of the scratch grid's lowest cell.
     - ``num_blocks`` (3,) int64: size of the scratch grid in blocks.
-    - ``touched`` (>= m,) int64: output, positions of the bricks in the scratch grid.
     - ``codes`` (>= m,) int64: output, Morton codes of the bricks.
+    - ``brick_words`` (>= m, 8) uint64: output, marks of the bricks.
+    - ``brick_strengths`` (>= m, 8) uint64: output, strengths of the bricks; size 0 for none.
     """
     offset = KEY_OFFSET >> BLOCK_BITS
     low_x, low_y, low_z = corner[0] >> BLOCK_BITS, corner[1] >> BLOCK_BITS, corner[2] >> BLOCK_BITS
-    words_per_brick = BRICK_CELLS // 8
-    num_touched = 0
+    words_per_brick = brick_words.shape[1]
+    num_bricks = 0
     for block in range(flags.size):
         if flags[block] == 0:
             continue
+        flags[block] = 0
         code = np.int64(-1)
-        for brick in range(block * BRICKS_PER_BLOCK, (block + 1) * BRICKS_PER_BLOCK):
+        for part in range(BRICKS_PER_BLOCK):
+            # numba tests signed indices for being negative.
+            first = np.uint64((block * BRICKS_PER_BLOCK + part) * words_per_brick)
             found = np.uint64(0)
-            for word in range(brick * words_per_brick, (brick + 1) * words_per_brick):
-                found |= words[word]
+            for word in range(words_per_brick):
+                place = first + np.uint64(word)
+                found |= words[place]
+                brick_words[num_bricks, word] = words[place]
+                words[place] = 0
             if found == 0:
                 continue
+            if strengths.size > 0:
+                for word in range(words_per_brick):
+                    brick_strengths[num_bricks, word] = strengths[first + np.uint64(word)]
             if code < 0:
                 x = block % num_blocks[0] + low_x + offset
                 y = (block // num_blocks[0]) % num_blocks[1] + low_y + offset
                 z = block // (num_blocks[0] * num_blocks[1]) + low_z + offset
                 code = (spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2) * BRICKS_PER_BLOCK
-            touched[num_touched] = brick
-            codes[num_touched] = code + brick - block * BRICKS_PER_BLOCK
-            num_touched += 1
-    return num_touched
-
-
-@kernel
-def clear_marks(marks, flags):
-    """Set ``marks`` uint8 to 0 in the flagged blocks of the scratch grid, and ``flags`` uint8 to 0."""
-    for block in range(flags.size):
-        if flags[block] != 0:
-            flags[block] = 0
-            for cell in range(block * BLOCK_CELLS, (block + 1) * BLOCK_CELLS):
-                marks[cell] = 0
+            codes[num_bricks] = code + part
+            num_bricks += 1
+    return num_bricks

@@ -1,6 +1,6 @@
 """Evidence of one scan added to an octree: one update for each cell that the scan touches.
 
-A *mark* is one byte for each cell of the scan's scratch grid: 0 untouched, 1 free, c + 2 a hit of class c (from 0).
+A *mark* is one byte for each cell of a brick: 0 untouched, 1 free, c + 2 a hit of class c (from 0).
 Eight marks, those of an octet, are one uint64 word. In shapes, n is the number of bricks, C of classes, and
 W = ceil(C / 8) of mask words.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from octoreplay.mapping.kernels.compiler import inline_kernel, kernel
-from octoreplay.mapping.kernels.intrinsics import lowest_one, prefetch_line
+from octoreplay.mapping.kernels.intrinsics import add_marked_octet, count_ones, lowest_one, prefetch_line
 from octoreplay.mapping.kernels.storage import (
     ALL_CELLS,
     BRICK_CELLS,
@@ -37,15 +37,14 @@ def _marked_cells(marks):
 
 
 @kernel
-def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
+def wanted_rows(bricks, indices, marks, num_classes, miss, clamp_min, clamp_max, wanted, known, changes):
     """Find the class rows that the hits of a scan need.
 
     A map of one class has no class rows; all hits go to the shared rows.
 
     - ``bricks``: Bricks of the octree.
     - ``indices`` (n,) int64: brick indices.
-    - ``touched`` (n,) int64: brick of the scratch grid with the marks.
-    - ``words`` uint64: marks of the scratch grid.
+    - ``marks`` (n, 8) uint64: marks of the bricks.
     - ``num_classes``: C.
     - ``miss``, ``clamp_min``, ``clamp_max``: float32, log-odds increment of a free cell and limits.
     - ``wanted`` (n, W) uint64: output from 0, class rows of the octets and classes that are hit.
@@ -53,21 +52,21 @@ def wanted_rows(bricks, indices, touched, words, num_classes, miss, clamp_min, c
     - ``changes`` (n,) bool: output, False where a brick does not change because it is free and at the limit.
     """
     for t in range(indices.size):
-        any_hit = np.uint64(0)
-        known[t] = 0
+        any_hit, cells = np.uint64(0), np.uint64(0)
         for e in range(OCTETS):
-            marks = words[touched[t] * OCTETS + e]
-            known[t] |= _marked_cells(marks) << np.uint64(8 * e)
+            octet = marks[t, e]
+            cells |= _marked_cells(octet) << np.uint64(8 * e)
             # A mark above 1 is a hit.
-            hits = marks & ~EVERY_BYTE
+            hits = octet & ~EVERY_BYTE
             any_hit |= hits
             if num_classes == 1:
                 continue
             while hits:
                 shift = np.uint64(lowest_one(hits)) & np.uint64(0x38)
-                c = ((marks >> shift) & np.uint64(0xFF)) - np.uint64(2)
+                c = ((octet >> shift) & np.uint64(0xFF)) - np.uint64(2)
                 wanted[t, c >> np.uint64(3)] |= np.uint64(1) << (np.uint64(8 * e) + (c & np.uint64(7)))
                 hits &= ~(np.uint64(0xFF) << shift)
+        known[t] = cells
         index = indices[t]
         changes[t] = True
         if not any_hit and bricks.blocks[index] < 0 and bricks.known[index] == ALL_CELLS:
@@ -83,111 +82,67 @@ def _prefetch_block(bricks, rows_at, index):
         prefetch_line(rows_at + ahead * ROW_BYTES + offset)
 
 
-@inline_kernel
-def _gather_rows(words, touched, bricks, index, row_words, row_hits):
-    """Copy the words of a scratch brick into the order of a block's rows; returns the numbers of shared and all rows.
-
-    - ``words`` uint64: marks of the scratch grid.
-    - ``touched``: brick of the scratch grid.
-    - ``bricks``, ``index``: brick of the octree.
-    - ``row_words`` (rows,) uint64: output, word of each row's octet.
-    - ``row_hits`` (rows,) uint64: output, mark of a hit of the row's class in each byte, 0 for shared rows.
-    """
-    octets = octets_of(bricks.known[index])
-    rows = 0
-    for e in range(OCTETS):
-        row_words[rows] = words[touched * OCTETS + e]
-        row_hits[rows] = 0
-        rows += np.int64(octets >> np.uint64(8 * e) & np.uint64(1))
-    num_shared = rows
-    for w in range(bricks.masks.shape[1]):
-        bits = bricks.masks[index, w]
-        while bits:
-            bit = lowest_one(bits)
-            row_words[rows] = words[touched * OCTETS + (bit >> 3)]
-            row_hits[rows] = np.uint64(8 * w + (bit & 7) + 2) * EVERY_BYTE
-            rows += 1
-            bits &= bits - np.uint64(1)
-    return num_shared, rows
-
-
-@inline_kernel
-def _finish_brick(bricks, index, block, has_own_rows, revision, num_classes):
-    """Set the revision of a changed brick, fill its shared rows or prune it."""
-    bricks.revisions[index] = revision
-    if has_own_rows:
-        share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
-    elif bricks.known[index] == ALL_CELLS:
-        prune_brick(bricks, index)
-
-
 @kernel
 def apply_marks(
-    bricks, indices, touched, words, num_classes, hit, miss, hit_other, clamp_min, clamp_max, revision, scratch
-):
+    bricks, indices, changes, marks, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
+    own_steps,
+):  # fmt: skip
     """Add one scan's log-odds to bricks that were expanded by the rows of ``wanted_rows``.
 
-    A free cell gets ``miss`` in all classes, a hit cell ``hit`` in its class and ``hit_other`` in the others; the sums
-    are clamped.
+    A free cell gets ``miss`` in all classes. A hit cell gets a hit in its class and ``hit_other`` in the others; in a
+    map of one class, every hit is one of this class. The sums are clamped.
 
     - ``bricks``: Bricks, in place.
     - ``indices`` (n,) int64: brick indices.
-    - ``touched`` (n,) int64, ``words`` uint64, ``num_classes``: as for wanted_rows.
-    - ``hit``, ``miss``, ``hit_other``: float32 log-odds increments.
+    - ``changes`` (n,) bool: as left by wanted_rows; the other bricks are skipped.
+    - ``marks`` (n, 8) uint64, ``num_classes``: as for wanted_rows.
+    - ``strengths`` (n, 64) uint8: strength of each hit; size 0 for the strength 255 everywhere.
+    - ``hits`` (256,) float32: log-odds increment of the hit class for each strength.
+    - ``miss``, ``hit_other``: float32 log-odds increments.
     - ``clamp_min``, ``clamp_max``: float32 limits of the log-odds.
     - ``revision``: revision of the bricks.
-    - ``scratch`` (2, 9 + 8 C) uint64.
+    - ``own_steps`` (64,) float32: scratch, increment of each cell's hit.
     """
-    # For every value of a block: the cell's mark, and the mark of a hit of the row's class.
-    row_marks, row_hits = scratch[0], scratch[1]
-    all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)
-    flat = bricks.rows.reshape(bricks.rows.size)
+    for k in range(BRICK_CELLS):
+        own_steps[k] = hits[255]
+    # Marks of the hits that the shared rows get with the strength; a mark of 0 changes nothing.
+    shared_from, shared_to = np.uint8(0), np.uint8(0)
     if num_classes == 1:
-        hit_other = hit
-    rows_at = np.int64(bricks.rows.ctypes.data)
+        shared_from, shared_to = np.uint8(2), np.uint8(255)
+    steps_at, rows_at = np.int64(own_steps.ctypes.data), np.int64(bricks.rows.ctypes.data)
     for t in range(indices.size):
         index = indices[t]
         _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
-        num_shared, rows = _gather_rows(words, touched[t], bricks, index, row_marks, row_hits)
+        if not changes[t]:
+            continue
+        if strengths.size > 0:
+            for k in range(BRICK_CELLS):
+                own_steps[k] = hits[strengths[t, k]]
         block = np.int64(bricks.blocks[index])
-        first = block * OCTETS
-        for i in range(rows * OCTETS):
-            mark = all_marks[i]
-            step = miss if mark == 1 else (hit if mark == all_hits[i] else hit_other)
-            changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
-            flat[first + i] = changed if mark > 0 else flat[first + i]
-        _finish_brick(bricks, index, block, rows > num_shared, revision, num_classes)
-
-
-@kernel
-def apply_weighted_marks(
-    bricks, indices, touched, words, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
-    scratch,
-):  # fmt: skip
-    """Add one scan's log-odds like apply_marks, with a hit for each strength.
-
-    - ``bricks``, ``indices``, ``touched``, ``words``: as for apply_marks.
-    - ``strengths`` uint64: one byte for each cell of the scratch grid, parallel to ``words``.
-    - ``hits`` (256,) float32: log-odds increment of the hit class for each strength.
-    - ``num_classes``, ``miss``, ``hit_other``, ``clamp_min``, ``clamp_max``, ``revision``: as for apply_marks.
-    - ``scratch`` (3, 9 + 8 C) uint64.
-    """
-    row_marks, row_hits, row_strengths = scratch[0], scratch[1], scratch[2]
-    all_marks, all_hits = row_marks.view(np.uint8), row_hits.view(np.uint8)
-    all_strengths = row_strengths.view(np.uint8)
-    flat = bricks.rows.reshape(bricks.rows.size)
-    rows_at = np.int64(bricks.rows.ctypes.data)
-    for t in range(indices.size):
-        index = indices[t]
-        _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
-        _gather_rows(strengths, touched[t], bricks, index, row_strengths, row_hits)
-        num_shared, rows = _gather_rows(words, touched[t], bricks, index, row_marks, row_hits)
-        block = np.int64(bricks.blocks[index])
-        first = block * OCTETS
-        for i in range(rows * OCTETS):
-            mark = all_marks[i]
-            is_own = (mark == all_hits[i]) | (num_classes == 1)
-            step = miss if mark == 1 else (hits[all_strengths[i]] if is_own else hit_other)
-            changed = min(max(flat[first + i] + step, clamp_min), clamp_max)
-            flat[first + i] = changed if mark > 0 else flat[first + i]
-        _finish_brick(bricks, index, block, rows > num_shared, revision, num_classes)
+        place = rows_at + block * ROW_BYTES
+        octets = octets_of(bricks.known[index])
+        while octets:
+            e = lowest_one(octets) >> 3
+            add_marked_octet(
+                place, marks[t, e], shared_from, shared_to, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min,
+                clamp_max,
+            )  # fmt: skip
+            place += ROW_BYTES
+            octets &= octets - np.uint64(1)
+        num_own = 0
+        for w in range(bricks.masks.shape[1]):
+            bits = bricks.masks[index, w]
+            num_own += count_ones(bits)
+            while bits:
+                bit = lowest_one(bits)
+                e, own = bit >> 3, np.uint8(8 * w + (bit & 7) + 2)
+                add_marked_octet(
+                    place, marks[t, e], own, own, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min, clamp_max
+                )
+                place += ROW_BYTES
+                bits &= bits - np.uint64(1)
+        bricks.revisions[index] = revision
+        if num_own > 0:
+            share_first_class(bricks.rows, block, bricks.known[index], bricks.masks, index, num_classes)
+        elif bricks.known[index] == ALL_CELLS:
+            prune_brick(bricks, index)

@@ -136,6 +136,53 @@ def add_octet(typing_context: Any, target: Any, source: Any) -> Any:
 
 
 @intrinsic
+def add_marked_octet(
+    typing_context: Any, target: Any, marks: Any, own_from: Any, own_to: Any, own_steps: Any, miss: Any, other: Any,
+    least: Any, most: Any,
+) -> Any:  # fmt: skip
+    """Add the log-odds of eight marks (kernels/evidence.py) to eight float32, clamped to [``least``, ``most``].
+
+    A cell without a mark keeps its value. A mark of 1 adds ``miss``, one in ``own_from`` to ``own_to`` the cell's own
+    step, and every other mark ``other``.
+
+    - ``target``: integer address of the values, changed in place.
+    - ``marks`` uint64: a mark in each byte.
+    - ``own_from``, ``own_to`` uint8.
+    - ``own_steps``: integer address of eight float32.
+    - ``miss``, ``other``, ``least``, ``most``: float32.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        octet = ir.VectorType(ir.IntType(8), 8)
+
+        def repeat(number: Any) -> Any:
+            """Return a vector of eight equal numbers."""
+            empty = ir.Constant(ir.VectorType(number.type, 8), ir.Undefined)
+            first = builder.insert_element(empty, number, ir.IntType(32)(0))
+            return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), 8), [0] * 8))
+
+        target, own_steps = _octets(builder, (arguments[0], arguments[4]))
+        marks = builder.bitcast(arguments[1], octet)
+        own_from, own_to, miss, other, least, most = (repeat(arguments[n]) for n in (2, 3, 5, 6, 7, 8))
+        is_own = builder.and_(builder.icmp_unsigned(">=", marks, own_from), builder.icmp_unsigned("<=", marks, own_to))
+        is_miss = builder.icmp_unsigned("==", marks, ir.Constant(octet, [1] * 8))
+        is_marked = builder.icmp_unsigned("!=", marks, ir.Constant(octet, [0] * 8))
+        step = builder.select(is_own, builder.load(own_steps, align=4), other)
+        old = builder.load(target, align=4)
+        new = builder.fadd(old, builder.select(is_miss, miss, step))
+        new = builder.select(builder.fcmp_ordered(">", least, new), least, new)
+        new = builder.select(builder.fcmp_ordered("<", most, new), most, new)
+        builder.store(builder.select(is_marked, new, old), target, align=4)
+        return context.get_dummy_value()
+
+    number = types.float32
+    signature = types.void(
+        types.int64, types.uint64, types.uint8, types.uint8, types.int64, number, number, number, number
+    )
+    return signature, generate
+
+
+@intrinsic
 def prefetch_line(typing_context: Any, address: Any) -> Any:
     """Prefetch the cache line at an integer address."""
 

@@ -367,14 +367,15 @@ def prune_brick(bricks, index):
     if block < 0 or bricks.known[index] != ALL_CELLS or num_rows(ALL_CELLS, bricks.masks, index) > OCTETS:
         return
     first = bricks.rows[block, 0]
-    different = 0
     for e in range(OCTETS):
+        different = 0
         for k in range(OCTETS):
             different += bricks.rows[block + e, k] != first
-    if different == 0:
-        _free_block(bricks, block, OCTETS)
-        bricks.blocks[index] = -1
-        bricks.values[index] = first
+        if different > 0:
+            return
+    _free_block(bricks, block, OCTETS)
+    bricks.blocks[index] = -1
+    bricks.values[index] = first
 
 
 @kernel

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from octoreplay.config.network import POSITION_TOPOLOGIES, NetworkConfig
 from octoreplay.records import BoolArray, Float64Array
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 
 class Topology:
@@ -27,7 +24,7 @@ class Topology:
         self._network = network
         self._fixed: BoolArray | None = None
         if network.topology not in POSITION_TOPOLOGIES:
-            self._fixed = _adjacency(_fixed_graph(network, robot_ids).edges, len(robot_ids))
+            self._fixed = _adjacency(_fixed_links(network, robot_ids), len(robot_ids))
         self._in_range = np.zeros((len(robot_ids), len(robot_ids)), dtype=bool)
 
     def links(self, present: BoolArray, positions: Float64Array) -> BoolArray:
@@ -54,24 +51,27 @@ class Topology:
         return links
 
 
-def _fixed_graph(network: NetworkConfig, robot_ids: Sequence[str]) -> nx.Graph:
-    """Graph of a fixed topology over all robots; nodes are robot indices."""
-    import networkx as nx
-
-    num_robots = len(robot_ids)
+def _fixed_links(network: NetworkConfig, robot_ids: Sequence[str]) -> list[tuple[int, int]]:
+    """Links of a fixed topology over all robots, as pairs of robot indices; a ring of one robot links it to itself."""
+    num_robots, pairs = len(robot_ids), list(combinations(range(len(robot_ids)), 2))
     if network.topology == "edges":
         index_of = {robot_id: index for index, robot_id in enumerate(robot_ids)}
-        return nx.Graph((index_of[a], index_of[b]) for a, b, _ in network.edges)
+        return [(index_of[a], index_of[b]) for a, b, _ in network.edges]
     if network.topology == "random":
-        return nx.gnp_random_graph(num_robots, network.prob_link, seed=network.network_seed)
-    if network.topology == "star":
-        return nx.star_graph(num_robots - 1)  # counts the leaves
+        # Only this topology needs networkx, which takes a tenth of a second to import.
+        import networkx as nx
+
+        return list(nx.gnp_random_graph(num_robots, network.prob_link, seed=network.network_seed).edges)
     if network.topology == "grid":
         num_columns = math.isqrt(num_robots - 1) + 1  # the square root, rounded up
-        grid = nx.grid_2d_graph(-(-num_robots // num_columns), num_columns)
-        return nx.relabel_nodes(grid, {(y, x): y * num_columns + x for y, x in grid}).subgraph(range(num_robots))
-    make = {"complete": nx.complete_graph, "ring": nx.cycle_graph, "line": nx.path_graph}[network.topology]
-    return make(num_robots)
+        return [(i, j) for i, j in pairs if j - i == num_columns or (j - i == 1 and j % num_columns > 0)]
+    if network.topology == "ring":
+        return [(i, (i + 1) % num_robots) for i in range(num_robots)]
+    if network.topology == "line":
+        return list(pairwise(range(num_robots)))
+    if network.topology == "star":
+        return [(0, i) for i in range(1, num_robots)]
+    return pairs  # complete
 
 
 def _adjacency(links: Iterable[tuple[int, int]], num_robots: int) -> BoolArray:
@@ -79,7 +79,7 @@ def _adjacency(links: Iterable[tuple[int, int]], num_robots: int) -> BoolArray:
     matrix = np.zeros((num_robots, num_robots), dtype=bool)
     for i, j in links:
         matrix[i, j] = matrix[j, i] = True
-    np.fill_diagonal(matrix, False)  # networkx gives a ring of one robot a self-loop
+    np.fill_diagonal(matrix, False)
     return matrix
 
 
