@@ -47,20 +47,21 @@ def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: 
 def is_held_back(own: Float64Array, other: Float64Array, blocks: Int64Array, gate: float) -> BoolArray:
     """Return for each cell whether the gate makes the flow of its block 0, (M, 1).
 
-    A block flows where in one of its cells no class has the largest value of both maps, or a class differs, by at least
-    gate m, m the largest |log-odds| of both. ``blocks`` (M,) are the cells' blocks. The product is float32.
+    A block flows where in one of its cells the classes with the largest value are not the same in both maps, or a class
+    differs, by at least gate m, m the largest |log-odds| of both. ``blocks`` (M,) are the cells' blocks. The product is
+    float32.
     """
     largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1)
     change = np.abs(other - own).max(axis=-1)
     differs = (change > 0.0) & (change.astype(np.float32) >= np.float32(gate) * largest.astype(np.float32))
-    is_open = np.isin(blocks, blocks[differs | ~have_common_label(own, other)])
+    is_open = np.isin(blocks, blocks[differs | ~have_equal_labels(own, other)])
     return ~is_open[:, np.newaxis]
 
 
-def have_common_label(own: Float64Array, other: Float64Array) -> BoolArray:
-    """Return for each cell whether a class, free space among them, has the largest value of both maps, (M,)."""
+def have_equal_labels(own: Float64Array, other: Float64Array) -> BoolArray:
+    """Return for each cell whether the same classes, free space among them, have the largest value, (M,)."""
     is_largest = [values == values.max(axis=-1, keepdims=True) for values in (own, other)]
-    return (is_largest[0] & is_largest[1]).any(axis=-1)
+    return (is_largest[0] == is_largest[1]).all(axis=-1)
 
 
 def flow(own: Float64Array, other: Float64Array, weight: float, steps: Float64Array) -> Float64Array:

@@ -201,7 +201,7 @@ def _gate_at_one_end(monkeypatch):
 
 def _labels_do_not_open_the_gate(monkeypatch):
     """Compare values alone in the twin."""
-    monkeypatch.setattr(flows, "have_common_label", lambda own, other: np.ones(len(own), np.bool_))
+    monkeypatch.setattr(flows, "have_equal_labels", lambda own, other: np.ones(len(own), np.bool_))
 
 
 def _evidence_comes_after_publishing(monkeypatch):

@@ -193,8 +193,8 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, gate):
     """Return True where the gate holds a link's flow back in all cells of a brick.
 
-    A cell is at rest where the same class has the largest log-odds in both maps, counting free space with 0, and no
-    class differs by ``gate`` x m or more.
+    A cell is at rest where the same classes, all that tie, have the largest log-odds in both maps, counting free space
+    with 0, and no class differs by ``gate`` x m or more.
 
     - ``base_at``, ``map_at``: addresses of the maps of both ends, as published (rows, 8).
     - ``scratch_at``: address of three blocks of ``room`` bytes; the first holds m of the cells, and is kept.
@@ -231,17 +231,12 @@ def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_sha
     for r in range(num_shared, rows):
         copy_octet(base_best_at + r * ROW_BYTES, base_best_at + octets[r] * ROW_BYTES)
         copy_octet(other_best_at + r * ROW_BYTES, other_best_at + octets[r] * ROW_BYTES)
-    # 0 where a class is the best of both maps, and below 0 elsewhere.
-    common_at, common = change_at, change
-    for i in range(size):
-        common[i] = min(base[i] - base_best[i], other[i] - other_best[i])
     for i in range(shared_size):
-        of_free = min(-base_best[i], -other_best[i])
-        common[i] = max(common[i], of_free) if terms[i] > zero else of_free
-    for r in range(num_shared, rows):
-        max_octet(common_at + octets[r] * ROW_BYTES, common_at + r * ROW_BYTES)
-    for i in range(shared_size):
-        is_open |= np.int32(common[i] < zero)
+        differs = np.int32(base[i] == base_best[i]) ^ np.int32(other[i] == other_best[i])
+        of_free = np.int32(base_best[i] == zero) ^ np.int32(other_best[i] == zero)
+        is_open |= of_free | (differs if terms[i] > zero else np.int32(0))
+    for i in range(shared_size, size):
+        is_open |= np.int32(base[i] == base_best[i]) ^ np.int32(other[i] == other_best[i])
     return is_open == 0
 
 
