@@ -130,7 +130,7 @@ def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(seed, num_
 @examples(24)
 @given(seed=st.integers(0, 2**32), num_robots=st.integers(2, 5))
 def test_a_team_at_rest_with_a_gate_has_the_labels_of_its_evidence(seed, num_robots):
-    """Where all maps have the same largest classes, so has their sum, which is that of the evidence."""
+    """Classes that are the largest in all maps are the largest in their sum, which is that of the evidence."""
     config, recording = random_team(
         seed, num_robots, 400, last_evidence=10, has_failures=False, flow_bits=20, flow_gate=1.0
     )

@@ -98,7 +98,7 @@ def test_the_same_seed_gives_the_same_run_in_any_number_of_threads(rule, packets
 
 @pytest.mark.parametrize(("radio", "keeps"), [({}, False), ({"latency": 1.5}, True)], ids=["at once", "late"])
 def test_versions_are_kept_only_for_receivers_that_need_them(monkeypatch, radio, keeps):
-    """Where receivers share the sender's state instead of decoding packets."""
+    """Receivers share the sender's state here; those that decode packets keep what they hold."""
     monkeypatch.setattr(PacketCodec, "always_decodes", False)
     saved = []
     right = PublicMap._save

@@ -48,7 +48,7 @@ def copy_octet(target: int, source: int) -> None:
     float_array(target, OCTET)[:] = float_array(source, OCTET)
 
 
-def raise_octet(target: int, source: int) -> None:
+def max_octet(target: int, source: int) -> None:
     found = float_array(target, OCTET)
     np.maximum(found, float_array(source, OCTET), out=found)
 
@@ -58,6 +58,16 @@ def add_octet(target: int, source: int) -> None:
     found += float_array(source, OCTET)
 
 
+def add_marked_octet(
+    target: int, marks: np.uint64, own_from: int, own_to: int, own_steps: int, miss: np.float32, other: np.float32,
+    least: np.float32, most: np.float32,
+) -> None:  # fmt: skip
+    values, of_cells = float_array(target, OCTET), np.array([marks], "<u8").view(np.uint8)
+    steps = np.where((of_cells >= own_from) & (of_cells <= own_to), float_array(own_steps, OCTET), other)
+    new = np.clip(values + np.where(of_cells == 1, miss, steps), least, most)
+    values[:] = np.where(of_cells != 0, new, values)
+
+
 def prefetch_line(address: int) -> None:
     """Do nothing: prefetching has no result."""
 
@@ -65,7 +75,7 @@ def prefetch_line(address: int) -> None:
 def install() -> None:
     """Replace the intrinsics; to be called before any kernel is imported."""
     for function in (
-        float_array, same_bits, fma, count_ones, lowest_one, highest_one, copy_octet, raise_octet, add_octet,
-        prefetch_line,
+        float_array, same_bits, fma, count_ones, lowest_one, highest_one, copy_octet, max_octet, add_octet,
+        add_marked_octet, prefetch_line,
     ):  # fmt: skip
         setattr(intrinsics, function.__name__, function)

@@ -18,6 +18,9 @@ from octoreplay.mapping.kernels.storage import BrickTable
 from octoreplay.mapping.octree import Run, SemanticOctree, brick_table, cache_aligned, parts_of
 from octoreplay.records import BoolArray, Float32Array, Int64Array, UInt64Array
 
+MOST_BRICKS = 1 << 14
+"""Largest number of bricks that are located at once: the table takes about 30 bytes for each octree and brick."""
+
 
 class Update(IntEnum):
     """Update of a map from the mixed map h~ and the evidence log q; ``team_step`` gives the equations."""
@@ -129,10 +132,6 @@ def team_step(
         team.update(update, clamp, quantum, threads)
         np.maximum(largest, team.finish(revision), out=largest)
     return [float(change) for change in largest]
-
-
-MOST_BRICKS = 1 << 14
-"""Largest number of bricks that are located at once: the table takes about 30 bytes for each octree and brick."""
 
 
 class _TeamBricks:

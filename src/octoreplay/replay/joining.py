@@ -87,8 +87,7 @@ class Joining:
             public = self._public[robot.index] = PublicMap(self._config, self._packet_codec, robot.source)
         evidence, exchange = robot.evidence.octree, self._exchanges[robot.index]
         # The scans of a tick precede its publication.
-        mine = exchange.held.get(robot.source)
-        exchange.hold(robot.source, public.advance(evidence, 0 if mine is None else mine.version + 1, tick))
+        exchange.hold(robot.source, public.advance(evidence, (public.version or 0) + 1, tick))
         return exchange.outbox(strangers, [robot.source], keep_alive=False)
 
     # --- search and joins ---------------------------------------------------------------------------------------------

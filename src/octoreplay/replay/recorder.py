@@ -10,14 +10,15 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import OutputError
-from octoreplay.io.results.result_writer import ResultWriter
+from octoreplay.io.results.result_writer import ResultWriter, view_points
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import CENTRAL, FrameCounts, LeafTable, MapState
+from octoreplay.records import CENTRAL, FrameCounts, MapState
 from octoreplay.replay.joining import Joining
 from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick import Tick, falls_due
@@ -145,7 +146,7 @@ class Recorder:
         """Record one tick."""
         if self.last is None:
             self.start_ns = tick.stamp_ns
-        # The messages hold versions of maps.
+        # Without the messages, which keep versions of maps.
         self.last = dataclasses.replace(tick, published=())
         self._add_up(tick.metrics)
         self._count_averaged(tick.graph)
@@ -262,9 +263,10 @@ class Recorder:
     def _write_views(self, tick: Tick, writer: ResultWriter) -> None:
         """Store every robot's map for viewing."""
 
-        def occupied(octree: SemanticOctree) -> LeafTable:
-            return octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True)
+        def points_of(octree: SemanticOctree) -> npt.NDArray[Any]:
+            return view_points(octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True), classes)
 
-        for robot_id, leaves in zip(tick.graph.robot_ids, self._threads.map(occupied, tick.maps), strict=True):
-            self._queue.add(writer.write_view, robot_id, tick.stamp_ns, leaves, tick.metrics.frame_of(robot_id))
+        classes = self._config.classes
+        for robot_id, points in zip(tick.graph.robot_ids, self._threads.map(points_of, tick.maps), strict=True):
+            self._queue.add(writer.write_view, robot_id, tick.stamp_ns, points, tick.metrics.frame_of(robot_id))
         self._view_tick = tick.number

@@ -79,7 +79,7 @@ def replay_team(
                     if progress is not None:
                         log_ns = tick.stamp_ns - recorder.start_ns
                         progress(Progress(log_ns, total_ns, tick.number, tick.metrics.total_distance, tick.settling))
-                    # Its messages hold versions of maps.
+                    # Frees the versions of maps in its messages.
                     del tick
                     deliver_interrupts()
             except InputError as error:

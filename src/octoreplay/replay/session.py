@@ -135,7 +135,7 @@ class Session:
             tick = self._exchange(number, start_ns + number * self._period_ns, phase)
             settling.note(tick.metrics.max_change)
             yield tick
-            # Its messages hold versions of maps.
+            # Frees the versions of maps in its messages.
             del tick
             number += 1
         self.stop_reason = settling.stop_reason

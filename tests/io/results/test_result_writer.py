@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.results.geometry_messages import quaternion
-from octoreplay.io.results.result_writer import ResultWriter, partial_path
+from octoreplay.io.results.result_writer import ResultWriter, partial_path, view_points
 from support.result_factory import (
+    CLASSES,
     SECOND,
     START,
     leaf_table,
@@ -29,7 +30,7 @@ def fill(writer: ResultWriter) -> None:
     writer.write_state(state("alpha", 0, 1, b"key frame", key=True))
     writer.write_state(state("alpha", 1, 3, b""))
     writer.write_evidence(state("beta", 0, 3, b"evidence", key=True))
-    writer.write_view("alpha", START + 3 * SECOND, leaf_table())
+    writer.write_view("alpha", START + 3 * SECOND, view_points(leaf_table(), CLASSES))
     writer.write_packet("beta", START + 3 * SECOND, 3, b"\x00\xffpacket")
 
 

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay._version import __version__
 from octoreplay.config.resolved import ResolvedRun
@@ -32,7 +33,7 @@ from octoreplay.io.results.geometry_messages import (
     vector,
 )
 from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import TEAM, LeafTable, MapState, RobotPose
+from octoreplay.records import TEAM, ClassTable, LeafTable, MapState, RobotPose
 from octoreplay.run_metrics import PAIR_SHARES, RunSummary, TickMetrics
 from octoreplay.transforms import transform_of
 
@@ -196,10 +197,9 @@ class ResultWriter:
         if transforms:
             self._write_transforms(TF_TOPIC, metrics.stamp_ns, transforms)
 
-    def write_view(self, robot_id: str, stamp_ns: int, leaves: LeafTable, frame_id: str = TEAM) -> None:
-        """Write the occupied leaves of one robot's map as a point cloud for viewers to ``/<robot>/map``."""
+    def write_view(self, robot_id: str, stamp_ns: int, points: npt.NDArray[Any], frame_id: str = TEAM) -> None:
+        """Write the ``view_points`` of one robot's map as a point cloud for viewers to ``/<robot>/map``."""
         self._start(stamp_ns)
-        points = self._view_points(leaves)
         type_name = "sensor_msgs/msg/PointCloud2"
         fields = [
             message("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=1)
@@ -357,20 +357,21 @@ class ResultWriter:
         type_name = "tf2_msgs/msg/TFMessage"
         self._writer.write(topic, type_name, message(type_name, transforms=transforms), stamp_ns)
 
-    def _view_points(self, leaves: LeafTable) -> Any:
-        """Return the occupied leaves as an array of ``VIEW_DTYPE``."""
-        label = best_labels(leaves.log_odds)
-        occupied = np.flatnonzero(label)
-        label = label[occupied]
-        points = np.zeros(len(occupied), dtype=VIEW_DTYPE)
-        for axis, name in enumerate("xyz"):
-            points[name] = leaves.centers[occupied, axis]
-        color = self._class_table.colors.astype(np.uint32)[label.astype(np.intp) - 1]
-        points["rgb"] = (color[:, 0] << 16) | (color[:, 1] << 8) | color[:, 2]
-        points["label"] = label
-        points["size"] = leaves.sizes[occupied]
-        points["probability"] = label_probabilities(leaves.log_odds[occupied])
-        return points
+
+def view_points(leaves: LeafTable, classes: ClassTable) -> npt.NDArray[Any]:
+    """Return the occupied leaves of a map as an array of ``VIEW_DTYPE``, with the colours of the classes."""
+    label = best_labels(leaves.log_odds)
+    occupied = np.flatnonzero(label)
+    label = label[occupied]
+    points = np.zeros(len(occupied), dtype=VIEW_DTYPE)
+    for axis, name in enumerate("xyz"):
+        points[name] = leaves.centers[occupied, axis]
+    color = classes.colors.astype(np.uint32)[label.astype(np.intp) - 1]
+    points["rgb"] = (color[:, 0] << 16) | (color[:, 1] << 8) | color[:, 2]
+    points["label"] = label
+    points["size"] = leaves.sizes[occupied]
+    points["probability"] = label_probabilities(leaves.log_odds[occupied])
+    return points
 
 
 def _relative(path: str, folder: Path) -> str:

@@ -67,14 +67,13 @@ class PublicMap:
         self.version: int | None = None
         self._snapshots: WeakSet[Snapshot] = WeakSet()
         self._comparer = MapComparer(2, 0.0)
-        self._filled = 0
         self._bytes_per_brick = 100.0
 
     def advance(self, octree: SemanticOctree, since: int, version: int, *, num_shares: int = 1) -> HeldMap:
         """Next version of the map. Bricks that change get the revision ``version`` - 1.
 
-        Bricks of ``octree`` with revisions below ``since`` are as in the last version. ``num_shares`` maps share the
-        budget.
+        Bricks of ``octree`` with revisions below ``since`` are as in the last version; the first version has all
+        bricks. ``num_shares`` maps share the budget.
         """
         since = 0 if self.version is None else since
         if self._packet.budget is not None:
@@ -120,8 +119,7 @@ class PublicMap:
     def _fill(self, target: SemanticOctree, version: int, budget: int) -> None:
         """Update as many bricks as fit into a packet, those with the largest change first."""
         public = self.octree
-        self._comparer.compare([public, target], target, [(0, 1)], self._filled - 1)
-        self._filled = version
+        self._comparer.compare([public, target], target, [(0, 1)], (self.version or 0) - 1)
         codes, distances = self._comparer.brick_distances
         # Cells can become known without a change of distance, and a brick can be missing in either map.
         here, there = target.find(codes), public.find(codes)

@@ -31,7 +31,6 @@ class FloodRobot(Robot):
     def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
         super().__init__(index, config, packet_codec, epoch)
         self._public = PublicMap(config, packet_codec, self.source)
-        self._published_tick = -1
         self._summed: dict[Source, int] = {}
 
     def advance_map(self, tick: int) -> None:
@@ -42,9 +41,8 @@ class FloodRobot(Robot):
             return
         # The scans of a tick precede its publication.
         new = self._public.advance(
-            self._log_likelihood, self._published_tick + 1, tick, num_shares=max(len(self.exchange.held), 1)
+            self._log_likelihood, (self._public.version or 0) + 1, tick, num_shares=max(len(self.exchange.held), 1)
         )
-        self._published_tick = tick
         if mine is None or (new.octree.revisions >= mine.version).any():
             self.exchange.hold(self.source, new)
 

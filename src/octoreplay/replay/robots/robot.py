@@ -184,9 +184,9 @@ class Robot(ABC):
 
     def integrate(self, frames: Iterable[Frame], caster: ScanCaster, tick: int) -> None:
         """Add the scans of one tick to the evidence."""
+        before = self._last_evidence if self._keeps_last and not self._is_average else None
         for frame in frames:
             cells = caster.cast(frame)
-            before = self._last_evidence if self._keeps_last and not self._is_average else None
             add_scan(self._own_sum, cells, self._increments, tick, before)
             if self._scan_counts is not None:
                 add_scan(self._scan_counts, cells, COUNT_SCANS, tick)
