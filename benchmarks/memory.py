@@ -57,6 +57,9 @@ def _compare(report: Report, title: str, scene: Scene, clouds: list[PointCloud],
     received = decode_packet(encode_packet(team_map))
     report.add(Row(f"{title}: known cells", float(evidence.num_cells), ""))
     report.add(Row(f"{title}: s + h", ours / MEBIBYTE, "MiB"))
+    num_leaves = evidence.streams().num_leaves
+    report.add(Row(f"{title}: leaves", float(num_leaves), ""))
+    report.add(Row(f"{title}: s + h, for each million leaves", ours / num_leaves, "MB"))
     report.add(Row(f"{title}: s + h with room to grow", 2 * reserved / MEBIBYTE, "MiB"))
     report.add(Row(f"{title}: a received map, for each neighbour", received.memory_bytes / MEBIBYTE, "MiB"))
     try:

@@ -28,6 +28,11 @@ settings.load_profile("fixed")
 SharedFile = Callable[[str, Callable[[Path], object]], Path]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--campaign", type=float, metavar="SECONDS", help="time of each test of tests/reliability")
+    parser.addoption("--seed", type=int, help="seed of tests/reliability; default: fixed, with --campaign a new one")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     from octoreplay.replay.exchange.packet_codec import PacketCodec
 
@@ -70,7 +75,7 @@ def shared_file(tmp_path_factory: pytest.TempPathFactory) -> SharedFile:
         with (folder / f"{name}.lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             # The lock file stays empty where ``make`` fails.
-            if not lock.tell():
+            if not os.fstat(lock.fileno()).st_size:
                 make(path)
                 lock.write("made")
         return path

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib.util
 import math
 import re
 from pathlib import Path
@@ -15,7 +16,7 @@ from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
-from octoreplay.io.results.result_writer import VIEW_DTYPE
+from octoreplay.io.results.map_views import VIEW_DTYPE
 from octoreplay.report.experiment_tables import answer_tables
 from octoreplay.run_metrics import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
@@ -57,6 +58,9 @@ def test_every_column_of_a_sweep_is_explained() -> None:
 
 def test_every_command_and_option_is_explained() -> None:
     text = (DOCS / "cli.md").read_text(encoding="utf-8")
+    outputs = text.split("## Output\n")[1].split("\n## ")[0]
+    assert all(f"`{option}`" in outputs for option in ("--json", "-q", "--quiet", "-v", "--verbose"))
+    common = ("output", "inputs", "result", "folder", "logs", "teams", "is_json", "is_quiet", "is_verbose")
     for name, command in cli.cli.commands.items():
         assert f"## octoreplay {name}" in text
         section = text.split(f"## octoreplay {name}")[1].split("\n## ")[0]
@@ -65,7 +69,7 @@ def test_every_command_and_option_is_explained() -> None:
         parts = command.commands if isinstance(command, click.Group) else {}
         assert all(f"octoreplay {name} {part}" in section for part in parts)
         for parameter in (*command.params, *(option for part in parts.values() for option in part.params)):
-            if parameter.name not in ("output", "inputs", "result", "folder", "logs", "teams", *PARAMETERS):
+            if parameter.name not in (*common, *PARAMETERS):
                 assert any(option in section for option in (*parameter.opts, *parameter.secondary_opts)), parameter.name
 
 
@@ -130,3 +134,14 @@ def traits_table() -> str:
 def test_the_page_on_the_algorithm_has_the_traits_of_every_rule() -> None:
     page = (DOCS / "algorithm.md").read_text(encoding="utf-8")
     assert page.partition("<!-- traits -->\n")[2].partition("<!-- end -->")[0] == traits_table()
+
+
+def test_the_page_of_data_sets_has_the_descriptions_of_the_source() -> None:
+    spec = importlib.util.spec_from_file_location("data_sets", DOCS / "tools" / "data_sets.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = module.PAGE.read_text(encoding="utf-8")
+    assert text == module.page(text), "run python docs/tools/data_sets.py"
+    assert all(f"| `{name}` |" in text for name in module.DATA_SETS)

@@ -15,9 +15,16 @@ PAGE = ROOT / "docs" / "tutorial.md"
 LOGS = ROOT / "tests" / "fixtures" / "pair"
 
 
-def blocks(language: str) -> list[str]:
-    """The tutorial's code blocks of one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+COLOUR = "## From colour images to a map\n"
+"""Title of the section with logs of its own."""
+
+
+def blocks(language: str, *, colour: bool = False) -> list[str]:
+    """The code blocks of one language, of the section on colour images or of the rest of the tutorial."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(COLOUR)
+    section, _, after = rest.partition("\n## ")
+    text = section if colour else before + after
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def run(line: str, folder: Path) -> str:
@@ -45,10 +52,21 @@ def test_the_tutorial_works_as_printed(tmp_path: Path) -> None:
     (script,) = blocks("python")
     (tmp_path / "picture.py").write_text(script, encoding="utf-8")
     commands = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 10
+    assert len(commands) == 11
     output = "".join(run(line, tmp_path) for line in commands)
-    for name in ("team.yaml", "result.mcap", "map.ply", "map.png", "metrics.csv", "figures/disagreement.png",
-                 "figures/packet_size.png", "gradient.mcap"):  # fmt: skip
+    for name in ("team.yaml", "result.mcap", "report.html", "map.ply", "map.png", "metrics.csv",
+                 "figures/disagreement.png", "figures/packet_size.png", "gradient.mcap"):  # fmt: skip
         assert (tmp_path / name).stat().st_size > 0, name
     shown = set().union(*(printed_lines(block) for block in blocks("text")))
+    assert shown <= printed_lines(output), sorted(shown - printed_lines(output))
+
+
+@long
+def test_the_section_on_colour_images_works_as_printed(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "docs" / "tools" / "village_network.py", tmp_path)
+    commands = [line for block in blocks("sh", colour=True) for line in block.splitlines()]
+    assert len(commands) == 8
+    output = "".join(run(line, tmp_path) for line in commands)
+    shown = set().union(*(printed_lines(block) for block in blocks("text", colour=True)))
+    assert len(shown) == 12
     assert shown <= printed_lines(output), sorted(shown - printed_lines(output))

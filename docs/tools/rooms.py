@@ -36,6 +36,10 @@ SHORTCUTS = ((TICK[1], TICK[4]), (TICK[2], TICK[6]))
 """Evidence goes from the integration to the iteration; published packets go to the recorder."""
 
 
+UPWARDS = {("result", "report")}
+"""Imports that are made when a method is called, and that the import contracts name as exceptions."""
+
+
 @functools.cache
 def rooms() -> dict[str, set[str]]:
     """Return the rooms that each room imports, lowest rooms included with an empty set."""
@@ -44,6 +48,7 @@ def rooms() -> dict[str, set[str]]:
         room = _room(path.relative_to(PACKAGE).parts)
         if not room.startswith("_"):
             others = {other for other in _imported(ast.parse(path.read_text("utf-8"))) if not other.startswith("_")}
+            others -= {upper for lower, upper in UPWARDS if lower == room}
             found.setdefault(room, set()).update(others - {room})
     return found
 

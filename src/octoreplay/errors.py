@@ -7,18 +7,20 @@
     +-- OutputError           a file cannot be written                               (exit code 1)
     +-- ConfigError           an option, a team file or a parameter is wrong         (exit code 2)
     +-- PacketError           bytes are not a map packet that this version can read  (exit code 1)
+    +-- MemoryLimitError      a run takes more memory than it may                    (exit code 1)
 """
 
 import difflib
 import re
 from collections.abc import Iterable
+from typing import Final
 
 
 class OctoreplayError(Exception):
     """Base class of octoreplay's exceptions; the text is one sentence for the user."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(printable(text))
+        super().__init__(printable(shortened(text)))
 
 
 class InputError(OctoreplayError):
@@ -37,15 +39,42 @@ class PacketError(OctoreplayError):
     """Bytes are not a map packet, are damaged, or have another format version."""
 
 
+class MemoryLimitError(OctoreplayError):
+    """A run takes more memory than its limit."""
+
+
+EARLY: Final = {"is_early": True}
+"""``extra`` of a logged warning that a command prints at once, since it is useful only while the command runs."""
+
+LONGEST_ERROR = 4000
+"""Largest length of an exception's text; the middle of longer ones is left out [characters]."""
+
+
+def shortened(text: str) -> str:
+    """Return a text of at most about ``LONGEST_ERROR`` characters: wrong values of files may have any length."""
+    half = LONGEST_ERROR // 2
+    return text if len(text) <= LONGEST_ERROR else f"{text[:half]} ... {text[-half:]}"
+
+
 def printable(text: str) -> str:
-    """Return a text that is safe to print: names in logs may contain control characters, which are escaped.
+    """Return a sentence that is safe to print, with ``escaped`` characters.
 
     Line breaks before an indented line are kept, because messages list candidates in such lines.
     """
     if text.isprintable():
         return text
-    escaped = "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
-    return re.sub(r"\n(?!    )", r"\\n", escaped)
+    return re.sub(r"\n(?!    )", r"\\n", escaped(text))
+
+
+def escaped(text: str) -> str:
+    """Return a text with escapes in place of characters that control a terminal; line breaks are kept.
+
+    Names in logs and results may hold any character. Those with an escape are all that Unicode does not call printable:
+    control characters (C0, C1), bidirectional and other format characters, and halves of surrogate pairs.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

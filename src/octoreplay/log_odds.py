@@ -37,6 +37,12 @@ def label_probabilities(log_odds: FloatArray) -> FloatArray:
     return 1.0 / shifted_exp_sum(log_odds)
 
 
+def occupancy_log_odds(log_odds: FloatArray) -> FloatArray:
+    """Return log P(occupied) / P(free) (P,) from ``log_odds`` (P, C), same dtype; minus infinity without classes."""
+    total: FloatArray = np.logaddexp.reduce(log_odds, axis=1)
+    return total
+
+
 def shifted_exp_sum(log_odds: FloatArray, *, class_axis: int = 1) -> FloatArray:
     """Return the sum (P,) of exp(h_c - max h) over free and the classes: 1 / the probability of the most probable one.
 

@@ -5,11 +5,14 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
+
+from octoreplay.data_table import Table
 
 FloatArray: TypeAlias = npt.NDArray[np.floating[Any]]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
@@ -21,6 +24,8 @@ Float32Array: TypeAlias = npt.NDArray[np.float32]
 Float64Array: TypeAlias = npt.NDArray[np.float64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Color: TypeAlias = tuple[int, int, int]
+FilePath: TypeAlias = str | os.PathLike[str]
+"""Path of a file or folder, as text or as an object such as ``pathlib.Path``."""
 ArrayT = TypeVar("ArrayT", bound=npt.NDArray[Any])
 
 TEAM = "team"
@@ -89,7 +94,8 @@ class DepthFrame:
     ``depth_image`` is (H, W), uint16 or float32; metres along z = value x ``depth_unit``.
     ``class_image`` is (H, W) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels (all points class 1).
     ``confidence_image`` is (H, W) uint8: label confidences in 1 / 255; None for full confidence.
-    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots.
+    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots. ``min_range`` and ``max_range`` [m] take
+    the place of the sensor model's; None for those. ``sensor_index`` numbers the sensors of the robot.
     """
 
     robot_id: str
@@ -101,6 +107,9 @@ class DepthFrame:
     T_team_sensor: Float64Array
     confidence_image: UInt8Array | None = None
     boxes: tuple[BodyBox, ...] = ()
+    min_range: float | None = None
+    max_range: float | None = None
+    sensor_index: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +119,8 @@ class CloudFrame:
     ``points`` is (P, 3) float32 or float64 in the sensor's frame; NaN rows carry no information.
     ``class_ids`` is (P,) uint8: class_id 1..C, or NO_CLASS; None where the log has no labels.
     ``confidences`` is (P,) uint8: label confidences in 1 / 255; None for full confidence.
-    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots.
+    ``T_team_sensor`` is (4, 4) float64; ``boxes`` are the bodies of robots. ``min_range`` and ``max_range`` [m] take
+    the place of the sensor model's; None for those. ``sensor_index`` numbers the sensors of the robot.
     """
 
     robot_id: str
@@ -120,6 +130,9 @@ class CloudFrame:
     T_team_sensor: Float64Array
     confidences: UInt8Array | None = None
     boxes: tuple[BodyBox, ...] = ()
+    min_range: float | None = None
+    max_range: float | None = None
+    sensor_index: int = 0
 
 
 Frame: TypeAlias = DepthFrame | CloudFrame
@@ -183,13 +196,45 @@ class LeafTable:
     def __len__(self) -> int:
         return len(self.sizes)
 
+    def as_table(self) -> Table:
+        """Return the columns x, y, z, size [m] and log_odds_1 to log_odds_C, one row per leaf."""
+        columns = dict(zip("xyz", self.centers.T, strict=True)) | {"size": self.sizes}
+        return Table(columns | {f"log_odds_{c}": values for c, values in enumerate(self.log_odds.T, start=1)})
+
+    def taken(self, chosen: BoolArray) -> LeafTable:
+        """Return the leaves where ``chosen`` (L,) is True."""
+        return LeafTable(self.centers[chosen], self.sizes[chosen], self.log_odds[chosen])
+
+    def between(self, low: float, high: float) -> BoolArray:
+        """Return True (L,) for leaves that overlap the heights from ``low`` to ``high`` [m]."""
+        half, z = self.sizes / 2, self.centers[:, 2]
+        return np.asarray((z + half > low) & (z - half < high))
+
+
+def public_names(value: object) -> list[str]:
+    """Return the attributes of an object for ``dir``, without private ones."""
+    return sorted(name for name in object.__dir__(value) if not name.startswith("_"))
+
+
+MIN_GAP_NS = 10_000_000_000
+"""Least distance of two used sensor messages of a robot that is noted as a gap."""
+
 
 @dataclass
 class FrameCounts:
-    """Numbers of one robot's sensor messages by outcome of reading; every message is counted once.
+    """Numbers of one robot's messages by outcome of reading; every message is counted once.
 
+    - ``used`` to ``off``: numbers of sensor messages; ``off`` are those at times when the schedule has the robot off.
+    - ``sensor_topic``: topic of the sensor messages; '' where several sensors have one each.
+    - ``messages``: numbers of messages by topic and outcome. 'in_log' is the number in the logs, 'read' the number that
+      was read; all others are the outcomes, which add up to 'read' (docs/logs.md).
+    - ``spans``: first and last stamp [ns, team's clock] of the unused messages, by topic and outcome; log times where a
+      message has no usable stamp.
+    - ``used_span``: first and last stamp [ns, team's clock] of the used sensor messages; None without any.
+    - ``gaps``: the stamps on both sides of each gap of at least MIN_GAP_NS between used sensor messages.
     - ``first_missing``: description of the first late message and of the first without label or pose, by the name of
-      the count.
+      the count; 'late_pose' of the first pose that came after a frame without one, 'leading' of the frames before the
+      first used one.
     - ``unknown_label_pixels``, ``unknown_colors``: numbers of pixels or points with an unknown label, by raw label and
       by colour 0xRRGGBB.
     - ``truncated_files``: one sentence for each cut or damaged log, with the part that was skipped.
@@ -201,10 +246,66 @@ class FrameCounts:
     late: int = 0
     duplicate: int = 0
     undecodable: int = 0
+    off: int = 0
+    sensor_topic: str = field(default="", compare=False)
+    messages: dict[str, dict[str, int]] = field(default_factory=dict, compare=False)
+    spans: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict, compare=False)
+    used_span: tuple[int, int] | None = field(default=None, compare=False)
+    gaps: list[tuple[int, int]] = field(default_factory=list, compare=False)
     first_missing: dict[str, str] = field(default_factory=dict, compare=False)
     unknown_label_pixels: dict[int, int] = field(default_factory=dict)
     unknown_colors: dict[int, int] = field(default_factory=dict)
     truncated_files: list[str] = field(default_factory=list)
+
+    def settle(self, topic: str, outcome: str, stamp_ns: int | None = None, count: int = 1) -> None:
+        """Count messages of a topic by outcome; ``stamp_ns`` widens the span of the outcome."""
+        outcomes = self.messages[topic]
+        outcomes[outcome] = outcomes.get(outcome, 0) + count
+        if stamp_ns is not None:
+            spans = self.spans.setdefault(topic, {})
+            first, last = spans.get(outcome, (stamp_ns, stamp_ns))
+            spans[outcome] = min(first, stamp_ns), max(last, stamp_ns)
+
+    def use(self, stamp_ns: int) -> None:
+        """Count a used sensor message, which comes in stamp order, and note a gap before it."""
+        self.used += 1
+        first, last = self.used_span or (stamp_ns, stamp_ns)
+        if stamp_ns - last >= MIN_GAP_NS:
+            self.gaps.append((last, stamp_ns))
+        self.used_span = first, stamp_ns
+
+    @property
+    def outcomes(self) -> dict[str, dict[str, int]]:
+        """Numbers of messages by topic and outcome, which add up to those in the logs.
+
+        'not_read' are the messages outside the replayed part, in damaged parts of the logs, and of topics of which the
+        first message is enough. In results without ``messages`` the sensor messages are the only topic.
+        """
+        if not self.messages:
+            causes = {name: getattr(self, name) for name in ("used", "no_label", "no_pose", "late", "undecodable")}
+            return {"images or clouds": {name: number for name, number in causes.items() if number}}
+        found = {}
+        for topic, numbers in self.messages.items():
+            outcomes = {name: number for name, number in numbers.items() if number and name not in ("in_log", "read")}
+            not_read = numbers["in_log"] - numbers["read"]
+            found[topic] = {**outcomes, **({"not_read": not_read} if not_read > 0 else {})}
+        return found
+
+    def leave_out(self, num_off: int) -> None:
+        """Count sensor messages as left out because the robot was off, which were counted as used."""
+        if num_off:
+            self.used, self.off = self.used - num_off, self.off + num_off
+            self.settle(self.sensor_topic, "used", count=-num_off)
+            self.settle(self.sensor_topic, "off", count=num_off)
+
+    @property
+    def unaccounted(self) -> dict[str, int]:
+        """Number of messages that were read less those with an outcome, by topic; empty where the sums agree."""
+        differences = {
+            topic: 2 * numbers["read"] - sum(number for name, number in numbers.items() if name != "in_log")
+            for topic, numbers in self.messages.items()
+        }
+        return {topic: difference for topic, difference in differences.items() if difference}
 
     @property
     def skipped(self) -> int:
@@ -213,8 +314,8 @@ class FrameCounts:
 
     @property
     def lost_data(self) -> bool:
-        """True where part of the log could not be used; duplicates do not count."""
-        return bool(self.skipped or self.truncated_files)
+        """True where part of the log could not be used or is not accounted for; duplicates do not count."""
+        return bool(self.skipped or self.truncated_files or self.unaccounted)
 
 
 @dataclass(frozen=True)

@@ -10,24 +10,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
 
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
-from octoreplay.errors import InputError, PacketError
+from octoreplay.data_table import Table
+from octoreplay.errors import ConfigError, InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
-from octoreplay.log_odds import best_labels, class_probabilities
-from octoreplay.mapping.codec import apply_delta, decode_packet
+from octoreplay.log_odds import best_labels, class_probabilities, label_probabilities
+from octoreplay.mapping.codec import apply_delta, decode_packet, max_memory
 from octoreplay.mapping.consensus import scaled_map
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.metric_tables import METRIC_TABLES, POSES, metrics_table, pose_table
 from octoreplay.records import (
     CENTRAL,
     MAP_KINDS,
@@ -36,13 +41,20 @@ from octoreplay.records import (
     TEAM,
     BoolArray,
     ClassTable,
+    FilePath,
     Float32Array,
     Float64Array,
     LeafTable,
     MapState,
     UInt8Array,
+    public_names,
 )
 from octoreplay.run_metrics import FramePlace, RunSummary, TickMetrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +81,11 @@ class PointQuery:
     known: BoolArray
     sizes: Float64Array
 
+    def as_table(self) -> Table:
+        """Return the columns label, known, size [m] and probability_0 (free) to probability_C, one row per point."""
+        columns = {"label": self.labels, "known": self.known, "size": self.sizes}
+        return Table(columns | {f"probability_{c}": values for c, values in enumerate(self.probabilities.T)})
+
 
 class StoredMap:
     """Map of one robot after one tick, or the centralised map (``robot_id`` 'central').
@@ -92,6 +109,7 @@ class StoredMap:
         prior: float,
         num_robots: int,
         frame_id: str = TEAM,
+        most_bytes: int | None = None,
     ) -> None:
         self.robot_id = robot_id
         self.tick = tick
@@ -100,6 +118,10 @@ class StoredMap:
         self.num_robots = num_robots
         self.frame_id = frame_id
         self.octree = octree
+        self._most_bytes = most_bytes
+
+    def __dir__(self) -> list[str]:
+        return public_names(self)
 
     @property
     def resolution(self) -> float:
@@ -121,8 +143,26 @@ class StoredMap:
         return f"{'mean' if map_kind == MEAN else 'posterior'} of {self.num_robots} robots"
 
     def leaves(self, *, map_kind: str = POSTERIOR) -> LeafTable:
-        """Return all leaves, including free ones, in Morton order."""
-        return self.shown_octree(map_kind).leaves(prior=self.prior)
+        """Return all leaves, including free ones, in Morton order.
+
+        Raises InputError where they would take more memory than a map in a file of the result's size can.
+        """
+        octree = self.shown_octree(map_kind)
+        try:
+            return octree.leaves(prior=self.prior, most_bytes=self._most_bytes)
+        except ValueError as error:
+            raise InputError(f"map of robot '{self.robot_id}': {error}; the result is damaged") from error
+
+    def as_table(self, *, map_kind: str = POSTERIOR) -> Table:
+        """Return all leaves as a table, one row per leaf, in Morton order. Raises as ``leaves``.
+
+        The columns are x, y, z, size [m], label (0 for free), probability of that label, and log_odds_1 to log_odds_C.
+        """
+        leaves = self.leaves(map_kind=map_kind)
+        columns = dict(leaves.as_table().columns)
+        place = {name: columns.pop(name) for name in ("x", "y", "z", "size")}
+        labels = {"label": best_labels(leaves.log_odds), "probability": label_probabilities(leaves.log_odds)}
+        return Table({**place, **labels, **columns})
 
     def query(self, points: npt.ArrayLike, *, map_kind: str = POSTERIOR) -> PointQuery:
         """Return the state at points (P, 3), in metres in the team's frame. Raises ValueError for another shape."""
@@ -156,6 +196,8 @@ class Result:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = ResultReader(path)
+        self._most_bytes = max_memory(path.stat().st_size)
+        self._octrees: WeakSet[SemanticOctree] = WeakSet()
 
     def __enter__(self) -> Self:
         return self
@@ -165,9 +207,31 @@ class Result:
     ) -> None:
         self.close()
 
+    def __dir__(self) -> list[str]:
+        return public_names(self)
+
     def close(self) -> None:
         """Close the file."""
         self._reader.close()
+
+    def plot(
+        self, what: str, *, label: str | None = None, beside: Mapping[str, Result] | None = None, style: str = "screen",
+        robot: str | None = None, at: float | None = None, color: str | None = None,
+    ) -> Figure:  # fmt: skip
+        """Return a matplotlib figure of the run, as ``octoreplay plot`` draws it.
+
+        ``what`` is 'phi', 'packets', 'agreement', 'coverage', 'links', 'contradiction' or 'map'. ``label`` is the name
+        of this result in the figure, by default that of its file; ``beside`` are further results by label. ``style`` is
+        'screen', 'one-column', 'two-column' or 'talk'. Of a map, ``robot`` is its robot (default: the first one),
+        ``at`` its time since the run's start in seconds (default: the end), and ``color`` as in ``export_map``.
+
+        Raises ConfigError for an unknown name, and InputError for a result without what the figure shows.
+        """
+        # Figures are made in a room above this one, which only those who draw need.
+        from octoreplay.report.result_figures import result_figure
+
+        results = {label or self.path.stem: self, **(beside or {})}
+        return result_figure(what, results, style, robot=robot, at=at, color=color)
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -185,9 +249,19 @@ class Result:
         return self._reader.config
 
     @property
+    def topics(self) -> dict[str, str]:
+        """Message type of each topic of the file, by topic."""
+        return self._reader.topics
+
+    @property
     def is_complete(self) -> bool:
         """False for the result of an interrupted run."""
         return self._reader.is_complete
+
+    @property
+    def extent(self) -> str:
+        """Clause on the last tick of an incomplete result and its log time."""
+        return self._reader.extent
 
     @property
     def inputs(self) -> dict[str, tuple[int, str, str]]:
@@ -204,6 +278,34 @@ class Result:
         """Summary of the run; the wall time is not stored and is NaN."""
         return self._reader.summary(self.metrics)
 
+    def as_table(self, kind: str = "ticks") -> Table:
+        """Return numbers of the run as a table.
+
+        Parameters
+        ----------
+        kind : str
+            - 'ticks': metrics of the team, one row per tick
+            - 'robots', 'links', 'pairs': metrics of each robot, directed link and pair of robots, one row per tick and
+              robot, link or pair
+            - 'poses': pose of each robot's sensor in the frame ``frame_id``: x, y, z [m], qx, qy, qz, qw, one row per
+              tick and robot
+
+            All have the columns ``tick``, ``stamp_ns`` and ``seconds`` since the run's start.
+
+        Raises
+        ------
+        ConfigError
+            ``kind`` is unknown.
+        InputError
+            The result holds no tick.
+        """
+        if kind == POSES:
+            poses = {robot_id: self._reader.poses(robot_id) for robot_id in self.robots}
+            return pose_table(poses, self.metrics, self.start_ns)
+        if kind not in METRIC_TABLES:
+            raise ConfigError(f"table: '{kind}' is not one of {', '.join((*METRIC_TABLES, POSES))}")
+        return metrics_table(self.metrics, kind, self.start_ns)
+
     @cached_property
     def start_ns(self) -> int:
         """Time t_0 of tick 0. Raises InputError for a result without a tick."""
@@ -217,7 +319,9 @@ class Result:
         return (stamp_ns - self.start_ns) / 1e9
 
     def time_ns(self, seconds: float) -> int:
-        """Return the stamp at a time since the run's start in seconds."""
+        """Return the stamp at a time since the run's start in seconds. Raises ConfigError for NaN and infinity."""
+        if not math.isfinite(seconds):
+            raise ConfigError(f"at: {seconds} is no time; give the seconds since the run's start")
         return self.start_ns + round(seconds * 1e9)
 
     def stored_ticks(self, robot_id: str) -> list[int]:
@@ -227,6 +331,14 @@ class Result:
     def evidence_ticks(self, robot_id: str) -> list[int]:
         """Return the ticks at which a robot's evidence is stored. Raises InputError for an unknown robot."""
         return [tick for tick, _ in self._reader.state_times(robot_id, evidence=True)]
+
+    def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
+        """Return the poses of a robot's sensor at the ticks: stamps [ns], and (P, 7) x, y, z [m], qx, qy, qz, qw.
+
+        They are in the team's frame, or in the robot's present frame where robots find their frames during the run.
+        Raises InputError for an unknown robot.
+        """
+        return self._reader.poses(robot_id)
 
     def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
         """Return a robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
@@ -262,12 +374,9 @@ class Result:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
         states = self._reader.states(robot_id, until_ns, evidence=evidence)
-        try:
-            octree = decode_packet(states[0].data)
-            for state in states[1:]:
-                apply_delta(octree, state.data)
-        except PacketError as error:
-            raise PacketError(f"{self.path}: robot '{robot_id}': {error}; replay the logs again") from error
+        octree = self._updated(None, states[0])
+        for state in states[1:]:
+            octree = self._updated(octree, state)
         return self._stored_map(octree, states[-1], is_evidence=evidence)
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
@@ -282,18 +391,28 @@ class Result:
             if tick is not None and state.tick != tick:
                 yield maps
             tick = state.tick
-            try:
-                if state.is_key_frame:
-                    octrees[state.robot_id] = decode_packet(state.data)
-                elif state.robot_id in octrees:
-                    apply_delta(octrees[state.robot_id], state.data)
-                else:
-                    raise PacketError("the first stored state is a delta")
-            except PacketError as error:
-                raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; replay the logs again") from error
+            octrees[state.robot_id] = self._updated(octrees.get(state.robot_id), state)
             maps[state.robot_id] = self._stored_map(octrees[state.robot_id], state)
         if maps:
             yield maps
+
+    def _updated(self, octree: SemanticOctree | None, state: MapState) -> SemanticOctree:
+        """Octree after a stored state. All octrees in use have at most the memory that fits the size of the file."""
+        room = self._most_bytes - sum(held.memory_bytes for held in self._octrees)
+        try:
+            if state.is_key_frame:
+                octree = decode_packet(state.data, room)
+                cells = (self.config.map.resolution, self.class_table.num_classes)
+                if (octree.resolution, octree.num_classes) != cells:
+                    raise PacketError("damaged: the map has another resolution or number of classes than the run")
+                self._octrees.add(octree)
+            elif octree is None:
+                raise PacketError("damaged: the first stored state is a delta")
+            else:
+                apply_delta(octree, state.data, most_bytes=room)
+        except PacketError as error:
+            raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; replay the logs again") from error
+        return octree
 
     def _stored_map(self, octree: SemanticOctree, state: MapState, *, is_evidence: bool = False) -> StoredMap:
         """Map or evidence after a stored state."""
@@ -301,8 +420,9 @@ class Result:
         if num_robots is None:
             num_robots = 1 if is_evidence else self._num_averaged(state)
         return StoredMap(
-            octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots, state.frame_id
-        )
+            octree, state.robot_id, state.tick, state.stamp_ns, self._reader.prior, num_robots, state.frame_id,
+            self._most_bytes,
+        )  # fmt: skip
 
     def _num_averaged(self, state: MapState) -> int:
         """N of a state in a result without it: the robots in the map's frame, or all with rule 'flood'."""
@@ -342,6 +462,12 @@ class Result:
         return stamp_ns
 
 
-def open_result(path: str | Path) -> Result:
-    """Open a result file. Raises InputError for a file that is missing, damaged or not an octoreplay result."""
-    return Result(Path(path))
+def open_result(path: FilePath) -> Result:
+    """Open a result file; a warning says where an incomplete one ends.
+
+    Raises InputError for a file that is missing, damaged or not an octoreplay result.
+    """
+    result = Result(Path(path))
+    if not result.is_complete:
+        _log.warning("warning: %s: incomplete: the run did not finish, and its result %s", path, result.extent)
+    return result

@@ -10,6 +10,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
+
+from octoreplay.data_table import Table
 from octoreplay.records import CENTRAL, TEAM, FrameCounts
 
 
@@ -256,13 +259,19 @@ class Join:
     score: float
 
 
+def log_sent_bytes(metrics: Iterable[TickMetrics]) -> int:
+    """Return the bytes that all robots sent before settling."""
+    return sum(robot.sent_bytes for tick in metrics if not tick.settling for robot in tick.robots)
+
+
 @dataclass(frozen=True)
 class RunSummary:
     """Summary of a run.
 
     ``links`` are the directed links over all ticks. ``frame_origins`` are phrases on the origin of each robot's place
     in the team's frame, by robot_id; empty in results without them. ``joins`` are the events in which robots found a
-    common frame during the run. The wall time is not stored in the result.
+    common frame during the run. ``log_sent_bytes`` is the part of ``total_sent_bytes`` before settling. The wall time
+    is not stored in the result.
     """
 
     num_ticks: int
@@ -277,11 +286,26 @@ class RunSummary:
     mean_octree_bytes: float
     mean_grid_bytes: float
     total_sent_bytes: int
+    log_sent_bytes: int
     links: tuple[LinkMetrics, ...]
     frame_counts: Mapping[str, FrameCounts]
     warnings: tuple[str, ...]
     frame_origins: Mapping[str, str] = field(default_factory=dict)
     joins: tuple[Join, ...] = ()
+
+    @property
+    def sent_bytes_per_second(self) -> float:
+        """Bytes that a robot sent per second of the logs, mean over the robots; NaN for a run of no length."""
+        duration = self.log_seconds * len(self.last.robots)
+        return self.log_sent_bytes / duration if duration > 0 else math.nan
+
+    def as_table(self) -> Table:
+        """Return the numbers and texts of the summary as a table of one row, in the order of the fields.
+
+        The last column is sent_bytes_per_second.
+        """
+        table = Table.from_records(RunSummary, [self])
+        return Table({**table.columns, "sent_bytes_per_second": np.array([self.sent_bytes_per_second])})
 
     @property
     def lost_data(self) -> bool:

@@ -14,6 +14,7 @@ from octoreplay.errors import ConfigError
 from octoreplay.result import open_result
 from support.command_line import octoreplay
 from support.log_factory import robot_entries, write_mcap
+from support.long_suite import long
 
 
 @pytest.mark.parametrize(("given", "parsed"), [
@@ -51,6 +52,7 @@ def test_a_robot_without_memory_is_refused():
         RunConfig(robots, network=schedule).with_parameters({"align": "on-air"})
 
 
+@long
 def test_a_team_that_never_joins_ends_with_a_warning_and_exit_code_3(tmp_path: Path) -> None:
     logs, result, csv = [], tmp_path / "out.mcap", tmp_path / "out.csv"
     for name in ("a", "b"):
@@ -71,6 +73,6 @@ def test_a_team_that_never_joins_ends_with_a_warning_and_exit_code_3(tmp_path: P
     header, *rows = csv.read_text().splitlines()
     assert {"num_components", "a.frame", "b.frame"} <= set(header.split(","))
     assert "a/map" in rows[-1]
-    asked = octoreplay("query", result, "--robot", "b", "--at", 1, 0, 0)
+    asked = octoreplay("query", result, "--robot", "b", "--point", 1, 0, 0)
     assert "frame b/map" in asked.stdout
     assert octoreplay("evaluate", result).returncode == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -9,30 +10,42 @@ from pathlib import Path
 import pytest
 
 from octoreplay import evaluate_result
-from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json
+from octoreplay.io.text_files import json_text
+from octoreplay.report.evaluation_files import evaluation_content, evaluation_csv
 from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import TRIO
+from support.long_suite import long
 
 
+@long
 def test_tables_files_and_figures(trio_result: Path, tmp_path: Path) -> None:
     truth = TRIO / "world.npz"
-    files = ("--csv", tmp_path / "e.csv", "--json", tmp_path / "e.json", "--plot", tmp_path / "figures")
+    files = ("--csv", tmp_path / "e.csv", "--plot", tmp_path / "figures")
     done = octoreplay("evaluate", trio_result, "--truth", truth, *files)
     assert (done.returncode, done.stderr) == (0, "")
     expected = evaluate_result(trio_result, truth=truth)
     assert (tmp_path / "e.csv").read_text() == evaluation_csv(expected)
-    assert (tmp_path / "e.json").read_text() == evaluation_json(expected)
     for scores in expected.final.maps:
         assert re.search(
             rf"{scores.robot_id} +{scores.truth.mean_iou:.3f} +{scores.truth.mean_iou_known:.3f} ", done.stdout
         )
     for part in ("IoU of the classes", "Over time", "\nmean ", "\ncentral "):
         assert part in done.stdout
-    made = [tmp_path / "e.csv", tmp_path / "e.json", *(tmp_path / "figures").iterdir()]
-    assert len(made) == 7
+    made = [tmp_path / "e.csv", *(tmp_path / "figures").iterdir()]
+    assert len(made) == 6
     assert all(f"wrote {path}\n" in done.stdout for path in made)
 
 
+def test_the_document_is_the_evaluation(trio_result: Path) -> None:
+    done = octoreplay("evaluate", trio_result, "--truth", TRIO / "world.npz", "--last", "--json")
+    document = json.loads(done.stdout)
+    expected = evaluate_result(trio_result, truth=TRIO / "world.npz", over_time=False)
+    assert document == {
+        **json.loads(json_text(evaluation_content(expected))), "command": "evaluate", "written": [], "warnings": [],
+    }  # fmt: skip
+
+
+@long
 def test_the_truth_beside_the_logs_is_suggested_and_not_used(trio_result: Path, tmp_path: Path) -> None:
     done = octoreplay("evaluate", trio_result, "--last")
     assert done.returncode == 0
@@ -62,6 +75,7 @@ def test_a_truth_in_another_frame_is_named(trio_result: Path, tmp_path: Path) ->
         assert (named in done.stderr) == is_named
 
 
+@long
 def test_a_rule_against_the_centralised_map_of_another_run(trio_result: Path, tmp_path: Path) -> None:
     local = tmp_path / "local.mcap"
     assert octoreplay("run", "--config-from", trio_result, "-o", local, "--rule", "local").returncode == 0
@@ -85,7 +99,7 @@ def test_refused_inputs_and_outputs(trio_result: Path, tmp_path: Path) -> None:
         (1, r"world\.npz: not found", (trio_result, "--truth", tmp_path)),
         (1, r"none\.mcap: cannot be read", (trio_result, "--against", tmp_path / "none.mcap")),
         (2, r"must end in \.csv", (trio_result, "--csv", tmp_path / "a.txt")),
-        (1, r"the folder .* does not exist", (trio_result, "--json", tmp_path / "none" / "a.json")),
+        (1, r"the folder .* does not exist", (trio_result, "--csv", tmp_path / "none" / "a.csv")),
         (1, r"empty\.npz: is a file; name a folder", (trio_result, "--plot", tmp_path / "empty.npz")),
     ):
         assert_fails(code, f"^error: .*{sentence}", "evaluate", *arguments)

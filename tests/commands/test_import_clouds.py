@@ -43,9 +43,9 @@ def test_a_folder_of_clouds_becomes_a_log_that_can_be_mapped(walls: Path, tmp_pa
     done = octoreplay("run", log, "-o", out, "--resolution", "0.1")
     assert done.returncode == 0, done.stderr
     # The map does not depend on the viewpoints: a wall at x = 2 m, free space in front of it.
-    done = octoreplay("query", out, "--at", 2.05, 0.05, 0.55, "--at", 1.5, 0.05, 0.55)
-    assert re.search(r"2\.05, 0\.05, 0\.55 +wall", done.stdout), done.stdout
-    assert re.search(r"1\.5, 0\.05, 0\.55 +free", done.stdout), done.stdout
+    done = octoreplay("query", out, "--point", 2.05, 0.05, 0.55, "--point", 1.5, 0.05, 0.55)
+    assert re.search(r"2\.05, 0\.05, 0\.55 +[\d.]+ % +[\d.]+ % +wall", done.stdout), done.stdout
+    assert re.search(r"1\.5, 0\.05, 0\.55 +[\d.]+ % +[\d.]+ % +free", done.stdout), done.stdout
 
 
 def test_the_map_frame_is_named_and_a_log_is_never_overwritten_by_accident(walls: Path, tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_the_map_frame_is_named_and_a_log_is_never_overwritten_by_accident(walls
         assert octoreplay(*words, "odom", "-o", path).returncode == 0
     assert "nothing relates the map frames of a ('odom') and b ('odom')" in octoreplay("info", one, other).stderr
     before = one.read_bytes()
-    assert_fails(1, "a.mcap: already exists; name another file, or use --force", *words, "map", "-o", one)
+    assert_fails(1, "a.mcap: already exists; give another name, or use --force", *words, "map", "-o", one)
     assert one.read_bytes() == before
     for path in (one, other):
         assert octoreplay(*words, "map", "-o", path, "--force").returncode == 0

@@ -17,7 +17,7 @@ def test_the_written_team_file_gives_the_maps_of_the_logs(tmp_path: Path) -> Non
     assert (done.returncode, done.stdout, done.stderr) == (0, f"wrote {team_file} (2 robots)\n", "")
     assert load_team_file(team_file).robots[0].pose_topic == "/husky_1/odom"
     assert_fails(
-        1, f"error: {team_file}: already exists; name another file, or use --force", "init", *logs, "-o", team_file
+        1, f"error: {team_file}: already exists; give another name, or use --force", "init", *logs, "-o", team_file
     )
     assert octoreplay("init", *logs, "-o", team_file, "--force").returncode == 0
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"

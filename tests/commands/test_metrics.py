@@ -15,6 +15,6 @@ def test_table_csv_and_figures(pair_result: Path, tmp_path: Path) -> None:
     assert "wall time" not in done.stdout
     with open_result(pair_result) as opened:
         assert len((tmp_path / "m.csv").read_text().splitlines()) == len(opened.metrics) + 1
-    names = ["contradiction.png", "disagreement.png", "packet_size.png"]
+    names = ["agreement.png", "contradiction.png", "disagreement.png", "packet_size.png"]
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == names
-    assert "contradiction, worst pair" in done.stdout
+    assert "any contradiction" in done.stdout

@@ -21,6 +21,7 @@ from octoreplay.simulate.team import SimulationConfig, simulate_team
 from octoreplay.transforms import numbers_of, transform_of
 from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import PAIR, PAIR_TEAM
+from support.long_suite import long
 
 DRIFT = ("--drift", "2,1.5")
 
@@ -87,6 +88,7 @@ def recorded_poses(team: Path, folder: Path) -> Path:
     return folder
 
 
+@long
 def test_refine_reports_and_writes_what_evo_reads(team: Path, refined: Path, tmp_path: Path) -> None:
     code, shown = (refined.parent / "shown.txt").read_text().split("\n", 1)
     assert code == "0"
@@ -99,6 +101,7 @@ def test_refine_reports_and_writes_what_evo_reads(team: Path, refined: Path, tmp
     assert after < 0.8 * before
 
 
+@long
 def test_the_refined_team_gives_sensor_poses_of_the_corrected_trajectory(team: Path, refined: Path) -> None:
     before, after = resolve(load_team_file(team)), resolve(load_team_file(refined))
     for old, new in zip(before.robots, after.robots, strict=True):

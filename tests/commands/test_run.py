@@ -17,6 +17,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.result import open_result
 from support.command_line import assert_fails, octoreplay, octoreplay_process, started, wait_for
 from support.fixture_paths import PAIR, PAIR_TEAM, TRIO
+from support.long_suite import long
 
 
 def test_every_parameter_is_an_option() -> None:
@@ -30,14 +31,17 @@ def test_every_parameter_is_an_option() -> None:
 def parsed(*arguments: str) -> dict[str, object]:
     """Return the parameters of ``run`` that some arguments set."""
     context = running.run.make_context("run", list(arguments))
-    return {name: value for name, value in context.params.items() if value is not None and value != ()}
+    return {name: value for name, value in context.params.items() if value not in (None, (), False)}
 
 
 def test_options_that_are_not_given_set_nothing() -> None:
     assert parsed("-o", "a.mcap") == {"output": Path("a.mcap")}
-    assert parsed("--miss", "-0.25", "--bounds", "-1,2.5", "--no-hash", "--settle", "0") == {
-        "miss": -0.25, "bounds": "-1,2.5", "hash": False, "settle": 0,
+    assert parsed("--miss", "-0.25", "--bounds", "-1,2.5", "--hash", "--settle", "3") == {
+        "miss": -0.25, "bounds": "-1,2.5", "hash": True, "settle": 3,
     }  # fmt: skip
+    context = running.run.make_context("run", ["--no-hash", "--settle", "0"])
+    given = {name: value for name, value in context.params.items() if name in PARAMETERS and value is not None}
+    assert given == {"hash": False, "settle": 0}
 
 
 def test_a_team_file_saved_in_another_folder_names_the_same_logs(
@@ -64,7 +68,7 @@ def test_a_run_prints_its_results(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_compilation_is_announced_once(pair_result: Path, tmp_path: Path) -> None:
     for is_first in (True, False):
-        done = octoreplay_process("query", pair_result, "--at", 1, 0, 0, NUMBA_CACHE_DIR=str(tmp_path))
+        done = octoreplay_process("query", pair_result, "--point", 1, 0, 0, NUMBA_CACHE_DIR=str(tmp_path))
         assert done.returncode == 0
         assert done.stderr.startswith("compiling kernels") == is_first
         assert done.stderr.count("\n") == is_first
@@ -137,13 +141,14 @@ def test_the_first_part_of_a_cut_log_is_used(tmp_path: Path) -> None:
     assert (tmp_path / "out.mcap").exists()
 
 
+@long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_partial_result_and_the_old_result(tmp_path: Path, number: signal.Signals) -> None:
     out, partial = tmp_path / "out.mcap", tmp_path / "out.partial.mcap"
     out.write_text("the result of yesterday")
     # The ramp of gamma takes so long that the run cannot end before the signal.
     settling = ["--rule", "gradient", "--settle", "100000", "--settle-max", "100000"]
-    arguments = ["run", PAIR_TEAM, "-o", out, *settling, "--state-every", "0.001"]
+    arguments = ["run", PAIR_TEAM, "-o", out, "--force", *settling, "--state-every", "0.001"]
     with started(*arguments) as process:
         wait_for(lambda: partial.exists() and partial.stat().st_size > 20_000)
         process.send_signal(number)
@@ -151,11 +156,14 @@ def test_an_interrupted_run_leaves_a_partial_result_and_the_old_result(tmp_path:
     assert process.returncode == 130, errors
     assert f"interrupted; the finished part is in {partial}" in errors
     assert out.read_text() == "the result of yesterday"
+    # From Python a KeyboardInterrupt is enough; here a signal is pending while the check point is saved.
+    assert (tmp_path / "out.checkpoint").exists()
     with open_result(partial) as opened:
         assert opened.summary.stop_reason == "interrupted"
         assert len(opened.metrics) >= 1
 
 
+@long
 def test_a_run_of_a_part_of_the_logs(tmp_path: Path) -> None:
     done = octoreplay(
         "run", PAIR_TEAM, "-o", tmp_path / "a.mcap", "--settle", "0", "--start", "1", "--duration", "2", "--every", "2"

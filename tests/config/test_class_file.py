@@ -19,6 +19,7 @@ from octoreplay.errors import ConfigError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.records import ClassTable, FrameCounts, SemanticClass
 from support.fixture_paths import PAIR
+from support.long_suite import long
 from support.recordings import RECORDINGS, needs_recordings
 
 HYDRA = RECORDINGS / "semantic_labels" / "hydra_label_spaces"
@@ -201,6 +202,7 @@ def test_a_kimera_palette_gives_classes_and_colours(tmp_path):
     )
 
 
+@long
 @needs_recordings
 def test_all_hydra_label_spaces_can_be_read():
     files = sorted(HYDRA.glob("*.yaml"))
@@ -253,15 +255,18 @@ def test_the_option_classes_accepts_a_table_or_a_file(tmp_path, capsys):
         (logs, str(tmp_path / "edits.yaml"), ("both", *rest)),
         ([str(PAIR / "team.yaml")], "nyu40", None),
     ):
-        assert cli._exit_code(["run", *inputs, "--classes", classes, "--save-team", str(saved)]) == 0
+        assert cli._exit_code(["run", *inputs, "--classes", classes, "--save-team", str(saved), "--force"]) == 0
         assert load_team_file(saved).classes.names == (names or with_classes(_run(), "nyu40").classes.names)
-    assert cli._exit_code(["run", *logs, "--classes", "nyu41", "--save-team", str(saved)]) == 2
+    assert cli._exit_code(["run", *logs, "--classes", "nyu41", "--save-team", str(saved), "--force"]) == 2
     assert "did you mean 'nyu40'" in capsys.readouterr().err
 
 
 def test_unknown_colours_are_reported_as_colours():
     counts = FrameCounts(unknown_label_pixels={7: 1}, unknown_colors={0x0A0B0C: 1200, 255: 3})
     assert list(progress.lost_data({"husky_1": counts})) == [
-        "husky_1: 1 pixels or points with labels without a class were ignored: 7",
-        "husky_1: 1,203 pixels or points with colours without a class were ignored: #0000ff, #0a0b0c",
+        "husky_1: 1 pixels or points with labels without a class were ignored: 7; --classes gives them one",
+        (
+            "husky_1: 1,203 pixels or points with colours without a class were ignored: #0000ff, #0a0b0c;"
+            " --classes gives them one"
+        ),
     ]

@@ -25,8 +25,8 @@ def robot(name="a", *, span=(5 * SECOND, 25 * SECOND), **fields):
     [
         ({}, "depth_topic or cloud_topic"),
         ({"pose_topic": "/odom"}, "depth_topic or cloud_topic"),
-        ({"depth_topic": "/depth"}, "pose_topic or pose_file"),
-        ({"cloud_topic": "/points"}, "pose_topic or pose_file"),
+        ({"depth_topic": "/depth"}, "pose_topic, pose_file or pose"),
+        ({"cloud_topic": "/points"}, "pose_topic, pose_file or pose"),
     ],
 )
 def test_a_sensor_topic_and_a_pose_source_are_required(fields, missing):

@@ -13,6 +13,7 @@ from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import _TEAM_KEYS, dump_team, parse_team
 from octoreplay.config.team_template import team_template
+from octoreplay.errors import ConfigError
 
 CLASSES = class_table(
     [
@@ -80,3 +81,8 @@ def test_a_pose_file_is_relative_to_the_team_file():
 def test_edits_of_the_logs_own_classes_are_written_and_read(write):
     config = RunConfig((PLAIN,), merge_classes=(("a", ("b", "c")),), ignore_hits=("d",))
     assert parse_team(write(config), name="team.yaml", folder=Path()) == config
+
+
+def test_a_misspelt_key_is_named_before_the_key_that_it_replaces():
+    with pytest.raises(ConfigError, match=r"^team\.yaml: robtos: unknown key; did you mean 'robots'\?$"):
+        parse_team("robtos: []\n", name="team.yaml", folder=Path())

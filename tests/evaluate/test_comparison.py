@@ -22,7 +22,7 @@ from octoreplay.io.text_files import json_text
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.records import CENTRAL
 from support import octree_factory
-from support.long_suite import examples
+from support.long_suite import examples, long
 from support.result_factory import CLASSES, state, summary, team, tick_metrics
 
 RESOLUTION = 0.25
@@ -149,6 +149,7 @@ def test_exchanged_results_have_the_same_difference(tmp_path_factory, a, b, tole
     assert [getattr(one, name) for name in same] == [getattr(other, name) for name in same]
 
 
+@long
 @examples(20)
 @given(a=maps(), b=maps())
 def test_a_larger_tolerance_does_not_find_more_differences(tmp_path_factory, a, b) -> None:
@@ -281,7 +282,9 @@ def test_different_resolutions_and_classes_are_refused(tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_a_result_is_refused(tmp_path: Path) -> None:
     a = stored(tmp_path / "a", {"alpha": {}})
-    with pytest.raises(InputError, match=r"not a finished MCAP file; give the OUT.mcap of 'octoreplay run'"):
+    with pytest.raises(
+        InputError, match=r"not a finished MCAP file, or damaged; give the OUT.mcap of 'octoreplay run'"
+    ):
         compare_results(a, tmp_path / "a" / "alpha.bag")
     with pytest.raises(InputError, match="cannot be read: No such file"):
         compare_results(tmp_path / "none.mcap", a)

@@ -17,6 +17,7 @@ from octoreplay.mapping.octree import codes_to_keys
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
 from octoreplay.simulate.world_files import labelled_cells, write_ground_truth, write_mesh
+from support.long_suite import long
 
 CLASSES = class_table(
     [{"name": "ground", "color": [10, 20, 30], "raw_labels": [7]}, {"name": "tree", "color": [1, 2, 250]}]
@@ -227,6 +228,7 @@ def test_invalid_ply_files_are_refused(
 # --- files of the simulator -------------------------------------------------------------------------------------------
 
 
+@long
 def test_the_mesh_and_the_cells_of_the_simulator_give_the_same_truth(tmp_path: Path) -> None:
     world, classes = make_village(24.0, 3), village_classes(1)
     write_ground_truth(tmp_path / "world.npz", world, 0.4, classes)

@@ -24,7 +24,7 @@ from support.hostile_logs import (
     write_hostile_log,
 )
 from support.log_factory import write_rows
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 
 CASES = [pytest.param(range(2), id="few"), pytest.param(range(2, 30), id="many", marks=pytest.mark.long)]
 
@@ -36,7 +36,7 @@ def map_of_fixture(name: str) -> MapOutcome:
 
 
 @pytest.mark.parametrize("cases", CASES)
-@pytest.mark.parametrize("name", one_in(2, LOGS))
+@pytest.mark.parametrize("name", one_in(4, LOGS))
 def test_a_damaged_log_gives_a_map_or_a_sentence(tmp_path, name, cases):
     good = map_of_fixture(name)
     assert good.refusal is None
@@ -63,6 +63,7 @@ def test_every_change_of_messages_changes_some_log(mutation):
     assert changed > len(MCAP_LOGS) / 4
 
 
+@long
 def test_rewriting_a_log_changes_nothing(tmp_path):
     for name in MCAP_LOGS:
         path = write_rows(tmp_path / "again.mcap", rows_of(name))

@@ -40,7 +40,9 @@ from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, FrameC
 from support import command_line, room
 from support.fixture_paths import CONTAINERS, STREAMS
 from support.log_factory import IDENTITY, SECOND, Entry
+from support.long_suite import long
 from support.scan_maps import packet_of
+from support.velodyne_logs import rays_of_a_turn
 
 LOGS = sorted(path.name for path in CONTAINERS.iterdir())
 REFERENCE = "cdr_none.mcap"
@@ -172,6 +174,7 @@ def test_the_halves_of_a_split_recording_are_one_log_when_listed() -> None:
         assert packet_of(frames_of(config.robots[0], config.classes), CLASSES.num_classes) == packet_in(REFERENCE)
 
 
+@long
 def test_runs_on_different_containers_end_with_the_same_map(tmp_path: Path) -> None:
     maps = set()
     for name in ("foxglove_protobuf.mcap", "rosbag2_sqlite3_file_zstd", "bz2.bag"):
@@ -230,6 +233,32 @@ def test_cloud_with_labels() -> None:
         np.testing.assert_array_equal(frame.points, points)
         np.testing.assert_array_equal(frame.class_ids, CLASS_IDS[labels])
         np.testing.assert_allclose(frame.T_team_sensor, T, rtol=0, atol=1e-12)
+
+
+def test_livox_clouds_have_the_points_of_ros_clouds() -> None:
+    found, ros = resolved(STREAMS / "livox.mcap", None), resolved(STREAMS / "cloud.mcap", None)
+    assert found.robots[0].cloud_topic == "/livox/lidar"
+    frames, expected = frames_of(found.robots[0], None), frames_of(ros.robots[0], None)
+    assert len(frames) == len(expected) == 4
+    for frame, other in zip(frames, expected, strict=True):
+        assert isinstance(frame, CloudFrame)
+        assert isinstance(other, CloudFrame)
+        assert frame.stamp_ns == other.stamp_ns
+        np.testing.assert_array_equal(frame.points, other.points)
+        np.testing.assert_array_equal(frame.T_team_sensor, other.T_team_sensor)
+
+
+def test_packets_of_a_lidar_have_the_points_that_its_rays_hit() -> None:
+    config = resolved(STREAMS / "velodyne.mcap", None)
+    assert config.robots[0].cloud_topic == "/velodyne_packets"
+    recording, rays = record(4), rays_of_a_turn(12).reshape(-1, 3)
+    frames = frames_of(config.robots[0], None)
+    assert [frame.stamp_ns for frame in frames] == recording.stamps_ns.tolist()
+    for frame, T in zip(frames, lidar_poses(recording), strict=True):
+        assert isinstance(frame, CloudFrame)
+        expected = rays * room.look(T, rays)[0][:, None]
+        # The lasers are up to 11 mm above or below the origin.
+        np.testing.assert_allclose(frame.points, expected, rtol=0, atol=0.015)
 
 
 def test_laser_scan_with_poses_from_tf() -> None:
@@ -296,8 +325,9 @@ def test_foxglove_scans_are_those_of_ros(tmp_path: Path, encoding: str) -> None:
         np.testing.assert_allclose(frame.T_team_sensor[:3, 3], expected.T_team_sensor[:3, 3], rtol=0, atol=1e-12)
 
 
-def test_compressed_images_give_the_map_of_raw_ones() -> None:
-    config = resolved(STREAMS / "compressed.mcap", None)
+@pytest.mark.parametrize("name", ["compressed", "rvl"])
+def test_compressed_images_give_the_map_of_raw_ones(name: str) -> None:
+    config = resolved(STREAMS / f"{name}.mcap", None)
     [robot] = config.robots
     assert (robot.depth_topic, robot.label_topic) == (f"{DEPTH}/compressedDepth", f"{LABELS}/compressed")
     frames = frames_of(robot, config.classes)

@@ -26,6 +26,7 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, CloudFrame, DepthFrame, Frame, SemanticClass
 from support import room
 from support.log_factory import OPTICAL, SECOND, Entry, ros2
+from support.long_suite import long
 from support.scan_maps import octree_of, packet_of, states_of
 
 CLASSES = ClassTable(
@@ -328,6 +329,7 @@ def test_rays_of_a_lens_give_the_map_of_its_points(tmp_path: Path, name: str) ->
     assert differing_share(frames, cloud_frames(tmp_path / "cloud.mcap", DISTORTED[name])) < ROUNDED_RAYS
 
 
+@long
 @pytest.mark.parametrize("name", DISTORTED)
 def test_a_distorted_image_gives_the_map_of_its_points(tmp_path: Path, name: str) -> None:
     """With the lens ignored 28 % of the cells differ, and 48 % with the fisheye."""

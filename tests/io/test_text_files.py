@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from octoreplay.errors import OutputError
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.output_file import write_whole
+from octoreplay.io.text_files import json_text
 
 
 @dataclass(frozen=True)

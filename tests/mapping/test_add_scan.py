@@ -22,6 +22,7 @@ from reference.evidence import Evidence, IndexedScan
 from reference.hand_made import FACING_X, depth_frame
 from reference.scenarios import TeamShape, make_scenario
 from reference.sensor import scan_update
+from support.long_suite import one_in
 from support.octree_factory import cells_of
 from support.scans import NUM_CLASSES, SENSOR, expected_cells, random_boxes, sum_of_scans, with_confidences
 
@@ -75,8 +76,7 @@ def test_full_confidence_equals_no_confidences():
         assert maps[0] == maps[1]
 
 
-@pytest.mark.parametrize("num_classes", [1, 3, 12])
-@pytest.mark.parametrize("hit_other", [None, -0.2])
+@pytest.mark.parametrize(("num_classes", "hit_other"), one_in(4, [1, 3, 12], [None, -0.2]))
 def test_weighted_sums_of_many_scans_equal_the_reference(num_classes, hit_other):
     """Clamped, unclamped and counted; scans with and without confidences in turn."""
     rng = np.random.default_rng(num_classes)

@@ -185,6 +185,7 @@ def test_grid_bytes():
 # --- contents ---------------------------------------------------------------------------------------------------------
 
 
+@long
 @examples(60)
 @given(
     octree=octrees(), content=st.sampled_from(CONTENTS), step=st.sampled_from([0.05, 0.3, 1e-3]), level=st.booleans(),

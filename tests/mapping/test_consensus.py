@@ -227,6 +227,7 @@ def test_cells_of_a_neighbour_become_known_even_with_the_prior_value():
     assert (octree.revisions == 9).all()
 
 
+@long
 @examples(25)
 @given(seed=st.integers(0, 100_000), update=st.sampled_from(UPDATES), with_threads=st.booleans())
 def test_team_step_equals_steps_robot_by_robot(seed, update, with_threads):
@@ -332,7 +333,7 @@ def _values(octree):
     return octree.lookup(_every_cell())[0].astype(np.float64)
 
 
-@pytest.mark.parametrize(("mode", "topology"), one_in(5, ["sync", "on-arrival"], TOPOLOGIES))
+@pytest.mark.parametrize(("mode", "topology"), one_in(9, ["sync", "on-arrival"], TOPOLOGIES))
 def test_bayes_conserves_the_mean_and_converges_to_the_oracle(mode, topology):
     session = _session(rule="bayes", mode=mode, topology=topology)
     num_robots = len(_scenario().robot_ids)
@@ -349,7 +350,7 @@ def test_bayes_conserves_the_mean_and_converges_to_the_oracle(mode, topology):
     assert min(robot.agreement for robot in tick.metrics.robots) > 0.999
 
 
-@pytest.mark.parametrize(("rule", "topology"), one_in(5, ["gradient", "natural", "bayes"], TOPOLOGIES))
+@pytest.mark.parametrize(("rule", "topology"), one_in(9, ["gradient", "natural", "bayes"], TOPOLOGIES))
 def test_settling_removes_the_disagreement(rule, topology):
     session = _session(rule=rule, topology=topology)
     peak = 0.0

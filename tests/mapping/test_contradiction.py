@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.config.sensor import SensorConfig
-from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
+from octoreplay.mapping.contradiction import CellContradiction, EvidenceComparer, cell_contradictions, state_limits
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, ranked_pairs
 from reference.contradiction import cell_states, pair_metrics
@@ -192,3 +192,37 @@ def test_labels_of_any_number_of_classes(num_classes):
     first[0], last[-1] = 1.0, 1.0
     (pair,) = compare({(0, 0, 0): first, (1, 0, 0): last}, {(0, 0, 0): last, (1, 0, 0): last}, num_classes=num_classes)
     assert pair.label_contradiction == (0.5 if num_classes > 1 else 0.0)
+
+
+# --- single cells ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_kinds_of_cells_add_up_to_the_shares_of_the_pair(seed):
+    random = np.random.default_rng(seed)
+    values = [GROUND, TREE, FREE, UNDECIDED, FIRMLY_FREE]
+    evidence = [
+        {tuple(key): values[random.integers(len(values))] for key in random.integers(-6, 6, (900, 3)).tolist()}
+        for _ in range(2)
+    ]
+    (pair,) = compare(*evidence)
+    keys = np.array(list(np.ndindex(14, 14, 14))) - 7
+    octrees = [octree_of(cells, num_classes=2) for cells in evidence]
+    kinds = cell_contradictions(octrees, (keys + 0.5) * octrees[0].resolution, LIMITS)
+    counts = np.bincount(kinds, minlength=len(CellContradiction))
+    assert counts[CellContradiction.CLEAR] == round(pair.clear_contradiction * pair.occupied_cells) > 0
+    contradicting = counts[CellContradiction.CLEAR] + counts[CellContradiction.CONTRADICTION]
+    assert contradicting == round(pair.contradiction * pair.occupied_cells)
+    assert counts[CellContradiction.OTHER_LABEL] == round(pair.label_contradiction * pair.both_occupied_cells) > 0
+    # The cells that both call free are compared too.
+    assert counts[CellContradiction.NONE] > pair.both_occupied_cells - counts[CellContradiction.OTHER_LABEL]
+    assert counts[CellContradiction.UNCOMPARED] > 0
+
+
+def test_the_strongest_relation_of_all_pairs_counts():
+    evidence = [{(0, 0, 0): GROUND}, {(0, 0, 0): TREE}, {(0, 0, 0): FIRMLY_FREE}, {(1, 0, 0): GROUND}]
+    octrees = [octree_of(cells, num_classes=2) for cells in evidence]
+    coords = (np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]]) + 0.5) * octrees[0].resolution
+    expected = [CellContradiction.CLEAR, CellContradiction.UNCOMPARED, CellContradiction.UNCOMPARED]
+    assert cell_contradictions(octrees, coords, LIMITS).tolist() == expected
+    assert cell_contradictions(octrees[:2], coords[:1], LIMITS).tolist() == [CellContradiction.OTHER_LABEL]

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import ends
 from octoreplay.records import read_only
+from support.long_suite import long
 
 HEIGHT, WIDTH = 3, 70
 CAMERA = np.array([32.0, 16.0, 35.0, 1.0])
@@ -79,6 +80,7 @@ def _scans(draw):
     return depth_image, depth_unit, labels, pose, resolution, min(min_range, max_range), max_range
 
 
+@long
 @settings(max_examples=150, deadline=None)
 @given(_scans())
 def test_keys_and_kinds_are_those_of_float64(scan):

@@ -110,6 +110,7 @@ def _ring(size):
     return [[(robot + 1) % size, (robot - 1) % size] for robot in range(size)]
 
 
+@long
 @pytest.mark.parametrize("seed", one_in(2, range(2)))
 def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
     """At every tick, with changing evidence, masses and shares under way add up to the evidence exactly."""
@@ -148,6 +149,7 @@ def test_mass_is_conserved_over_links_that_lose_delay_repeat_and_reorder(seed):
             assert (robot.weight, robot.total_weight) == (robot.twin.weight, robot.twin.total_weight)
 
 
+@long
 def test_ring_with_a_third_of_the_packets_lost_converges_to_the_mean():
     rng = np.random.default_rng(0)
     robots, mean = _team(rng, 6)

@@ -15,7 +15,7 @@ from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import storage
 from octoreplay.records import CloudFrame, DepthFrame
 from reference.hand_made import cloud, depth_frame, facing_x
-from support.long_suite import examples, one_in
+from support.long_suite import examples, long, one_in
 from support.scans import SENSOR, cells_of_scan, check_scan, random_cloud, random_depth
 
 # --- against the reference -------------------------------------------------------------------------------------------
@@ -68,6 +68,7 @@ def test_origins_and_points_on_borders_edges_and_corners(origin, ends, rays):
     check_scan(frame, dataclasses.replace(SENSOR, rays=rays, max_range=100.0), MapConfig(resolution=0.25))
 
 
+@long
 @pytest.mark.parametrize("resolution", one_in(3, [0.1, 0.2, 0.3]))
 def test_walls_at_decimal_places(resolution):
     """Origins at centres and on walls of cells with an edge that is no binary fraction; rays to cell centres."""

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.snapshot import Snapshot
-from support.long_suite import examples
+from support.long_suite import examples, long
 from support.octree_factory import cells_of, octree_of
 from support.packet_format import octrees
 
@@ -20,7 +20,8 @@ def _content(octree):
     return cells_of(octree), revisions
 
 
-@examples(60)
+@long
+@examples(30)
 @given(maps=st.lists(octrees(num_classes=3), min_size=2, max_size=6))
 def test_a_snapshot_keeps_the_content_of_its_time(maps):
     octree = SemanticOctree(maps[0].resolution, 3)

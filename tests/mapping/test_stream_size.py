@@ -11,7 +11,7 @@ from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.stream_size import StreamMeter
 from octoreplay.mapping.streams import StreamSize
-from support.long_suite import examples
+from support.long_suite import examples, long
 from support.octree_factory import cube, octree_of
 from support.packet_format import octrees
 
@@ -22,6 +22,7 @@ def test_the_size_is_that_of_the_whole_stream(octree):
     assert StreamMeter(octree).update(0) == octree.streams().size
 
 
+@long
 @examples(60)
 @given(maps=st.lists(octrees(num_classes=3), min_size=2, max_size=4))
 def test_changes_are_counted_where_they_are(maps):

@@ -73,7 +73,7 @@ def started(tmp_path, monkeypatch):
 
     monkeypatch.setattr(warm_up, "_start", recorded_start)
     monkeypatch.setattr(warm_up, "_num_cores", lambda: 2)
-    monkeypatch.setattr(compiler, "_CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(compiler, "_CACHE_FOLDER", tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     return processes
 
@@ -93,8 +93,7 @@ def test_process_is_ended_when_the_replay_fails(started):
 
 
 def test_no_process_is_started_with_a_filled_cache(started, tmp_path):
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "consensus.team_step-154.py311.nbi").touch()
+    (tmp_path / "consensus.team_step-0123.kernel").touch()
     with warm_up.second_compiler():
         pass
     assert not started
@@ -103,10 +102,10 @@ def test_no_process_is_started_with_a_filled_cache(started, tmp_path):
 def test_compile_if_needed_compiles_with_an_empty_cache_only(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(warm_up, "compile_kernels", lambda: calls.append(1))
-    monkeypatch.setattr(compiler, "_CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(compiler, "_CACHE_FOLDER", tmp_path)
     warm_up.compile_if_needed()
     assert calls == [1]
-    (tmp_path / "consensus.team_step-154.py311.nbi").touch()
+    (tmp_path / "consensus.team_step-0123.kernel").touch()
     warm_up.compile_if_needed()
     assert calls == [1]
 

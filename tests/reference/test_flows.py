@@ -112,6 +112,7 @@ def random_team(seed, num_robots, num_ticks, *, last_evidence=None, **options):
     return config, recording
 
 
+@long
 @examples(50)
 @given(
     seed=st.integers(0, 2**32),
@@ -127,6 +128,7 @@ def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(seed, num_
     assert tick.maps.any()
 
 
+@long
 @examples(24)
 @given(seed=st.integers(0, 2**32), num_robots=st.integers(2, 5))
 def test_a_team_at_rest_with_a_gate_has_the_labels_of_its_evidence(seed, num_robots):

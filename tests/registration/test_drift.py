@@ -10,6 +10,7 @@ import pytest
 from octoreplay.registration.drift import Correction, DriftModel, Repair, correction_of, repair_drift
 from octoreplay.registration.rigid import moved, rotation_exps
 from support.drifting_team import DriftingTeam, drifting_team
+from support.long_suite import long
 
 MODEL = DriftModel(percent=2.0, degrees=1.5, frame_shift=0.1, frame_angle=0.5)
 
@@ -33,6 +34,7 @@ def corrected_poses(team: DriftingTeam, repair: Repair) -> list[np.ndarray]:
     return poses
 
 
+@long
 def test_drift_of_two_robots_is_repaired(team: DriftingTeam, repair: Repair) -> None:
     before = team.errors([track.poses for track in team.tracks])
     after = team.errors(corrected_poses(team, repair))
@@ -42,6 +44,7 @@ def test_drift_of_two_robots_is_repaired(team: DriftingTeam, repair: Repair) -> 
     assert {team.submaps[e.first].robot != team.submaps[e.second].robot for e in repair.edges} == {True, False}
 
 
+@long
 def test_the_repair_moves_with_the_team_frame(team: DriftingTeam, repair: Repair) -> None:
     T_other = moved(np.eye(4)[None], np.array([[0.0, 0.0, 0.8, 20.0, -7.0, 2.0]]))[0]
     submaps = [replace(submap, T_team_anchor=T_other @ submap.T_team_anchor) for submap in team.submaps]
@@ -51,6 +54,7 @@ def test_the_repair_moves_with_the_team_frame(team: DriftingTeam, repair: Repair
     assert np.abs(there.poses - T_other @ repair.poses).max() < 0.1
 
 
+@long
 def test_poses_without_drift_stay() -> None:
     team = drifting_team(scale=0.0, turn=0.0)
     repair = repair_drift(team.submaps, team.tracks, MODEL)

@@ -15,7 +15,7 @@ from octoreplay.registration.own_map import OwnMap
 from octoreplay.registration.pairs import AcceptLimits, align_pair
 from octoreplay.transforms import inverse
 from support.block_worlds import NUM_CLASSES, RESOLUTION, BlockWorld, pose_error, upright_pose
-from support.long_suite import examples, one_in
+from support.long_suite import examples, long, one_in
 
 RADIUS = 9.0
 CENTRES = ((-4.0, 0.0), (3.0, 2.0))
@@ -40,6 +40,7 @@ def test_the_true_pose_is_accepted():
     assert pair.verification.obstacles.share_same > 0.95
 
 
+@long
 @given(st.floats(-math.pi, math.pi), st.floats(-40, 40), st.floats(-40, 40))
 @examples(15)
 def test_moving_a_frame_moves_the_pose(yaw, x, y):
@@ -51,6 +52,7 @@ def test_moving_a_frame_moves_the_pose(yaw, x, y):
     assert angle < 1.5
 
 
+@long
 def test_swapping_the_robots_inverts_the_pose():
     maps = [_view(0, 0.3, 4.0, -7.0), _view(1, -2.0, 11.0, 5.0)]
     forth, back = _aligned(*maps), _aligned(*reversed(maps))
@@ -62,6 +64,7 @@ def test_swapping_the_robots_inverts_the_pose():
     assert forth.verification.score == pytest.approx(back.verification.score, rel=0.05)
 
 
+@long
 def test_other_worlds_are_refused():
     pair = _aligned(_view(0, 0.0, 0.0, 0.0), _view(1, 1.0, 2.0, 3.0, seed=7))
     assert not pair.is_accepted
@@ -83,6 +86,7 @@ def test_a_robot_upside_down_is_refused():
     assert not _aligned(_view(0, 0.0, 0.0, 0.0), upside_down).is_accepted
 
 
+@long
 def test_a_world_that_repeats_itself_is_ambiguous():
     world = BlockWorld(1, num_blocks=0)
     # The same three blocks every 12 m, on ground of one class.
@@ -105,6 +109,7 @@ def test_an_empty_map_is_refused():
             assert not _aligned(*maps, dof=dof).is_accepted
 
 
+@long
 def test_a_guess_is_verified_like_any_candidate():
     first, second = _view(0, 0.0, 0.0, 0.0), _view(1, -2.0, 11.0, 5.0)
     T_true = upright_pose(-2.0, 11.0, 5.0)
@@ -115,6 +120,7 @@ def test_a_guess_is_verified_like_any_candidate():
         assert pose_error(pair.T_first_second, T_true)[0] < 0.2
 
 
+@long
 @pytest.mark.parametrize(
     ("limits", "number"),
     [
@@ -129,6 +135,7 @@ def test_the_refusal_names_the_number_that_failed(limits, number):
     assert pair.refusal.startswith(number)
 
 
+@long
 def test_any_orientation_without_a_vertical_axis():
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([2.0, -0.5, 1.0]).as_matrix()

@@ -14,6 +14,7 @@ from octoreplay.registration.placing import place_robots
 from octoreplay.registration.team import TeamAlignment
 from octoreplay.registration.verify import verify
 from octoreplay.transforms import inverse, pose_difference
+from support.long_suite import long
 from support.village_maps import T_village_map, empty_map, village_map
 
 
@@ -109,6 +110,7 @@ def test_the_surveyed_pose_that_most_others_confirm_places_the_team():
     assert pose_difference(placement.teams[0][0].T_team_map, POSES[0])[0] < 1e-6
 
 
+@long
 def test_a_component_whose_survey_contradicts_the_maps_is_a_team_of_its_own():
     center, radius = (-2.0, 0.0), 13.0
     maps = [village_map(center, radius), village_map(center, radius)]

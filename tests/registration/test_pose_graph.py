@@ -85,6 +85,7 @@ def test_wrong_edges_are_rejected_and_right_ones_kept(seed):
     assert position_errors(solution.poses, truth).mean() < 0.7 * position_errors(start, truth).mean()
 
 
+@long
 def test_poses_do_not_depend_on_the_frame_of_the_initial_poses():
     rng = np.random.default_rng(5)
     truth, edges = chain_with_loops(rng)
@@ -108,6 +109,7 @@ def test_components_are_solved_apart_and_held_at_their_first_pose():
     np.testing.assert_allclose(solution.poses[30:60], T_other @ solution.poses[:30], atol=1e-6)
 
 
+@long
 def test_a_component_that_only_rejected_edges_join_is_named_apart():
     rng = np.random.default_rng(7)
     truth, edges = chain_with_loops(rng, 10, 10)

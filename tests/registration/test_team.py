@@ -13,6 +13,7 @@ from octoreplay.registration.team import align_team, join_pairs
 from octoreplay.registration.verify import CellCounts, Verification
 from octoreplay.transforms import inverse
 from support.block_worlds import BlockWorld, pose_error, upright_pose
+from support.long_suite import long
 
 FRAMES = [
     upright_pose(0.0, 0.0, 0.0),
@@ -89,6 +90,7 @@ def test_maps_give_the_frames_of_the_team(three_maps):
         assert angle < 1.0
 
 
+@long
 def test_components_that_contradict_each_other_are_not_joined(three_maps):
     """A pair's pose that puts a third robot's map into free space of another one is refused."""
     team = align_team(three_maps)

@@ -15,12 +15,14 @@ import pytest
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.team_file import dump_team, parse_team
 from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.text_files import json_text
 from octoreplay.replay.alignment import Alignment, align_robots, aligned_config, check_aligned
-from octoreplay.report.alignment_files import PAIR_COLUMNS, write_alignment
+from octoreplay.report.alignment_files import PAIR_COLUMNS, alignment_content, write_alignment
 from octoreplay.report.alignment_plots import pair_figure, team_figure, write_alignment_figures
 from octoreplay.report.alignment_tables import alignment_tables, pair_numbers
 from octoreplay.report.tables import terminal
 from octoreplay.transforms import inverse, numbers_of, pose_difference
+from support.long_suite import long
 from support.village_maps import T_village_map, empty_map, team_config, village_map
 
 PLACES = {"ant": ((-2.0, 0.0), 0), "bee": ((3.0, 3.0), 1), "cow": ((2.0, -4.0), 2)}
@@ -51,10 +53,23 @@ def test_frames_are_those_of_the_village(alignment):
         assert math.degrees(angle) < 0.2
     first, second, _ = alignment.teams[0]
     assert (first.origin, first.sigma) == ("frame of the team", None)
-    assert second.origin.startswith(f"aligned with {second.partner}, L ")
+    assert second.origin.startswith(f"aligned with {second.partner}")
     assert second.sigma is not None
     assert min(second.sigma) > 0
     assert max(second.sigma) < 0.5
+
+
+def test_the_frames_are_a_table(alignment):
+    table = alignment.as_table()
+    frames = [frame for team in alignment.teams for frame in team]
+    assert table["robot_id"].tolist() == [frame.robot_id for frame in frames]
+    assert table["team"].tolist() == [index for index, team in enumerate(alignment.teams) for _ in team]
+    assert table["partner"].tolist() == [frame.partner or "" for frame in frames]
+    assert [tuple(row[name] for name in ("x", "y", "z", "qx", "qy", "qz", "qw")) for row in table.to_numpy()] == [
+        numbers_of(frame.T_team_map) for frame in frames
+    ]
+    assert np.isnan(table["sigma_x"][0])
+    assert (table["sigma_x"][1], table["sigma_rz"][1]) == (frames[1].sigma[0], frames[1].sigma[5])
 
 
 def test_a_robot_without_a_map_is_left_out_and_named(alignment):
@@ -64,6 +79,7 @@ def test_a_robot_without_a_map_is_left_out_and_named(alignment):
     assert any("map of dog is empty" in sentence for sentence in alignment.notes)
 
 
+@long
 def test_maps_in_a_known_frame_give_the_frames_of_the_robots(maps):
     T_map_own = [T_village_map((1.0, 2.0), turns=turns) for turns in (1, 2)]
     shares = []
@@ -101,7 +117,7 @@ def test_given_poses_keep_the_team_frame_and_wrong_ones_are_named(maps):
     written = aligned_config(team_config(*robots), aligned.teams[0]).robots
     assert written[0] == robots[0]
     assert written[2] == robots[2]
-    assert written[1].T_team_map_from == placed["cow"].origin
+    assert written[1].T_team_map_from == f"{placed['cow'].origin} ({placed['cow'].evidence})"
 
 
 def test_a_guess_is_verified_and_never_trusted():
@@ -111,6 +127,7 @@ def test_a_guess_is_verified_and_never_trusted():
         check_aligned(align_robots(team_config("ant", "bee"), empty, guesses=guess))
 
 
+@long
 def test_each_guess_is_confirmed_or_named(maps):
     far = T_village_map((20.0, 0.0), turns=3)
     for guess, is_right in ((TRUTH["bee"], True), (far, False)):
@@ -183,12 +200,12 @@ def test_the_table_of_many_pairs_ends_with_the_number_of_the_others(alignment, c
 
 
 def test_files_hold_every_pair_and_frame(alignment, tmp_path):
-    csv_path, json_path = tmp_path / "pairs.csv", tmp_path / "frames.json"
-    assert write_alignment(alignment, csv_path=csv_path, json_path=json_path) == [csv_path, json_path]
+    csv_path = tmp_path / "pairs.csv"
+    assert write_alignment(alignment, csv_path) == [csv_path]
     rows = list(csv.DictReader(csv_path.read_text().splitlines()))
     assert tuple(rows[0]) == PAIR_COLUMNS
     assert [row["accepted"] for row in rows] == ["True", "True", "False", "True", "False", "False"]
-    content = json.loads(json_path.read_text())
+    content = json.loads(json_text(alignment_content(alignment)))
     assert content["left_out"] == ["dog"]
     frame = content["components"][0][1]
     assert frame["T_team_map"] == list(numbers_of(alignment.teams[0][1].T_team_map))
@@ -196,6 +213,7 @@ def test_files_hold_every_pair_and_frame(alignment, tmp_path):
     assert len(content["pairs"]) == 6
 
 
+@long
 def test_figures_are_of_the_team_and_of_every_pair(alignment, tmp_path):
     written = write_alignment_figures(dataclasses.replace(alignment, pairs=alignment.pairs[:1]), tmp_path)
     assert written == [tmp_path / "team.png", tmp_path / "pair_ant_bee.png"]

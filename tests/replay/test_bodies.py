@@ -16,7 +16,9 @@ from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.records import ClassTable, SemanticClass
 from octoreplay.replay.run import replay_team
 from octoreplay.replay.session import Session
+from support.interrupted import resumed
 from support.log_factory import robot_entries, write_mcap
+from support.long_suite import long
 
 CLASSES = ClassTable((SemanticClass(1, "occupied", (1, 2, 3), ()),))
 
@@ -67,3 +69,11 @@ def test_hide_robots_changes_the_map_of_the_robot_behind(config):
         volumes[hides] = [robot.entropy_bits for robot in summary.last.robots]
     assert volumes[True][0] != volumes[False][0]
     assert volumes[True][1] == volumes[False][1]
+
+
+@long
+def test_a_resumed_run_with_hidden_robots_ends_with_the_same_bytes(config, tmp_path):
+    team = config.with_parameters({"hide_robots": True, "publish_period": 0.2})
+    replay_team(team, tmp_path / "whole.mcap")
+    resumed(team, tmp_path / "resumed.mcap", 1, 3)
+    assert (tmp_path / "resumed.mcap").read_bytes() == (tmp_path / "whole.mcap").read_bytes()

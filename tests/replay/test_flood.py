@@ -23,7 +23,7 @@ from support.faulty_team import (
     session_of,
     team_sums,
 )
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 
 BAD_RADIO = {"loss": 0.5, "latency": 1.2, "jitter": 1.0}
 
@@ -73,6 +73,7 @@ def test_flood_ends_with_the_oracle_over_a_bad_radio(name, topology):
     assert_all_have_the_oracle(tick, 1e-5)
 
 
+@long
 def test_without_acknowledgements_settling_waits_for_the_next_key_frame():
     """The content of a lost delta arrives with the next key frame, after up to 25 ticks without a change."""
     packets = {"packets": "delta", "acknowledge": False, "key_frame_every": 25}

@@ -10,7 +10,7 @@ import pytest
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.replay.robots import consensus as consensus_module
 from support.faulty_team import configured, dense, session_of
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 from support.sessions import sent_packets
 
 GROUPS = ScheduleEntry(3.0, 7.0, groups=(("robot_0", "robot_1"), ("robot_2", "robot_3")))
@@ -35,7 +35,7 @@ TEAMS = (
 )
 
 
-@pytest.mark.parametrize(("parameters", "mode"), one_in(3, TEAMS, ["sync", "on-arrival"]), ids=str)
+@pytest.mark.parametrize(("parameters", "mode"), one_in(7, TEAMS, ["sync", "on-arrival"]), ids=str)
 def test_the_sum_of_the_maps_is_the_sum_of_the_evidence_in_every_tick(parameters, mode):
     parameters = dict(parameters)
     period = parameters.pop("period", None)
@@ -64,6 +64,7 @@ def test_fewer_bricks_move_with_flows_than_without():
     assert _num_moved(4) < 0.9 * _num_moved(0)
 
 
+@long
 def test_fewer_bricks_move_with_a_gate():
     assert _num_moved(6, 1.0) < _num_moved(6, 0.5) < _num_moved(6)
 
@@ -78,7 +79,9 @@ def test_neighbours_at_rest_differ_by_less_than_the_bound():
 
 @pytest.mark.parametrize(
     "parameters",
-    [{"topology": "ring"}, {"topology": "line", "schedule": (GROUPS,)}, {"topology": "line", "flow_gate": 0.5}],
+    one_in(
+        3, [{"topology": "ring"}, {"topology": "line", "schedule": (GROUPS,)}, {"topology": "line", "flow_gate": 0.5}]
+    ),
     ids=str,
 )
 def test_skipping_bricks_at_rest_does_not_change_a_byte_of_the_deltas(parameters, monkeypatch):
@@ -122,6 +125,7 @@ def _kept_after(cut, rule, mode, anchor_after):
     return kept
 
 
+@long
 @pytest.mark.parametrize("mode", ["sync", "on-arrival"])
 @pytest.mark.parametrize("rule", ["gradient", "natural"])
 def test_a_robot_that_receives_nothing_keeps_what_it_learned(rule, mode):

@@ -106,6 +106,7 @@ def given_run(session, **parameters):
     return replayed(session_of(SCENARIO.config(**{"rule": "bayes", **parameters}), found))
 
 
+@long
 @pytest.mark.parametrize("parameters", [
     {"rule": "bayes"}, {"rule": "local"}, {"rule": "flood", "packets": "delta", "latency": 1.2},
     pytest.param({"rule": "ratio"}, marks=long), pytest.param({"rule": "flood"}, marks=long),
@@ -200,6 +201,7 @@ def test_evidence_is_sent_every_align_every_seconds_and_costs_bytes(monkeypatch)
             assert all(published is None or not published.outbox for published in tick.published)
 
 
+@long
 def test_the_result_does_not_depend_on_the_number_of_threads(by_truth):
     one, four = (replayed(session_of(configured(rule="gradient"), num_threads=n)) for n in (1, 4))
     assert [tick.metrics for tick in one] == [tick.metrics for tick in four]
@@ -207,6 +209,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(by_truth):
         assert_equal(mine, other)
 
 
+@long
 def test_lost_evidence_delays_a_join(by_truth):
     prompt, lossy = session_of(configured()), session_of(configured(loss=0.8))
     list(prompt.ticks()), list(lossy.ticks())

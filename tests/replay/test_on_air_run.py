@@ -17,11 +17,13 @@ from octoreplay.registration.verify import CellCounts, Verification
 from octoreplay.replay.alignment import stored_maps
 from octoreplay.replay.joining import Joining
 from octoreplay.replay.run import replay_team
-from octoreplay.report.export import export_ply
+from octoreplay.report.export import export_map
 from octoreplay.report.plots import metrics_csv
 from octoreplay.result import open_result
 from octoreplay.transforms import inverse, numbers_of, pose_matrix, transform_of
+from support.interrupted import resumed
 from support.log_factory import robot_entries, write_mcap
+from support.long_suite import long
 
 T_A_B = pose_matrix((1.3, -0.7, 0.2), (0.0, 0.0, math.sin(0.4), math.cos(0.4)))
 
@@ -91,8 +93,8 @@ def test_maps_in_different_frames_are_not_exported_together(monkeypatch, tmp_pat
     assert any("in 2 frames at the end" in sentence and "(a; b)" in sentence for sentence in summary.warnings)
     for color in ("robot", "disagreement"):
         with pytest.raises(InputError, match="different frames \\(a in a/map, b in b/map\\)"):
-            export_ply(tmp_path / "air.mcap", tmp_path / "map.ply", color=color)
-    assert export_ply(tmp_path / "air.mcap", tmp_path / "map.ply", robot="b") > 0
+            export_map(tmp_path / "air.mcap", tmp_path / "map.ply", color=color)
+    assert sum(export_map(tmp_path / "air.mcap", tmp_path / "map.ply", robot="b").values()) > 0
     assert b"frame: b/map" in (tmp_path / "map.ply").read_bytes()
 
 
@@ -101,3 +103,12 @@ def test_equal_runs_give_equal_bytes(found, tmp_path: Path) -> None:
     for num_threads, name in ((1, "one.mcap"), (2, "two.mcap")):
         replay_team(team, tmp_path / name, num_threads=num_threads)
     assert (tmp_path / "one.mcap").read_bytes() == (tmp_path / "two.mcap").read_bytes()
+
+
+@long
+def test_a_run_resumed_before_and_after_a_join_ends_with_the_same_bytes(found, tmp_path: Path) -> None:
+    team = config(tmp_path)
+    summary = replay_team(team, tmp_path / "whole.mcap")
+    (join,) = summary.joins
+    resumed(team, tmp_path / "resumed.mcap", join.tick - 1, join.tick, join.tick + 1)
+    assert (tmp_path / "resumed.mcap").read_bytes() == (tmp_path / "whole.mcap").read_bytes()

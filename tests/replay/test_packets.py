@@ -20,7 +20,7 @@ from support.faulty_team import (
     session_of,
     team_sums,
 )
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 from support.sessions import sent_packets
 
 LOSSY = {
@@ -32,7 +32,7 @@ LOSSY = {
 }
 
 
-@pytest.mark.parametrize(("name", "packets"), one_in(3, LOSSY, ["full", "delta"]))
+@pytest.mark.parametrize(("name", "packets"), one_in(5, LOSSY, ["full", "delta"]))
 def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     session = session_of(configured(rule="bayes", settle_max=8, **LOSSY[name], **PACKETS[packets]))
     rounded = 0.0
@@ -45,7 +45,7 @@ def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     assert all(robot.agreement > 0.99 and robot.agreement_occupied > 0.99 for robot in tick.metrics.robots)
 
 
-@pytest.mark.parametrize(("rule", "mode"), one_in(3, ["gradient", "bayes", "natural", "merge"], ["sync", "on-arrival"]))
+@pytest.mark.parametrize(("rule", "mode"), one_in(5, ["gradient", "bayes", "natural", "merge"], ["sync", "on-arrival"]))
 def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
     parameters = {"rule": rule, "mode": mode, "topology": "ring", "settle": 3, "settle_max": 4}
     sessions = [
@@ -102,6 +102,7 @@ def test_flood_ends_with_the_oracle_within_a_budget(topology, packets, radio):
     assert_all_have_the_oracle(tick, 1e-4)
 
 
+@long
 @pytest.mark.parametrize(
     ("packets", "rule"),
     one_in(4, [{"budget": 2200}, {"budget": 640, "content": "int8"}], ["bayes", "natural", "gradient"]),

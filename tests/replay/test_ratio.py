@@ -17,7 +17,7 @@ from support.faulty_team import (
     oracle_errors,
     session_of,
 )
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 
 
 def test_ratio_without_faults_mixes_linearly_and_then_adds_the_new_evidence():
@@ -65,6 +65,7 @@ RATIO_FAULTS = {
 }  # fmt: skip
 
 
+@long
 @pytest.mark.parametrize("name", one_in(6, RATIO_FAULTS))
 def test_ratio_ends_with_the_oracle_despite_faults(name):
     _, tick = finished_run(rule="ratio", **RATIO_FAULTS[name])
@@ -72,6 +73,7 @@ def test_ratio_ends_with_the_oracle_despite_faults(name):
     assert_all_have_the_oracle(tick, RATIO_TOLERANCE)
 
 
+@long
 def test_on_one_way_links_bayes_drifts_and_ratio_does_not():
     deviations = {
         rule: oracle_errors(finished_run(rule=rule, topology="ring", one_way=ONE_WAY_RING)[1])

@@ -2,13 +2,16 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file, parse_team
 from octoreplay.errors import ConfigError
+from octoreplay.io.messages.ros_types import typestore
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from support.fixture_paths import PAIR_TEAM, TRIO_TEAM
@@ -78,3 +81,21 @@ def test_a_dormant_robot_keeps_the_number_of_its_map(tmp_path: Path) -> None:
     with open_result(tmp_path / "out.mcap") as result:
         assert [robot.active for robot in result.summary.last.robots] == [True, False]
         assert [result.map(robot_id).num_robots for robot_id in result.robots] == [1, 2]
+
+
+def test_maps_are_stored_as_cubes_on_request_and_at_the_end(tmp_path: Path) -> None:
+    config = load_team_file(PAIR_TEAM).with_parameters(
+        {"settle": 0, "resolution": 1.0, "markers_every": 2.0, "view_every": 1e6}
+    )
+    replay_team(config, tmp_path / "out.mcap")
+    with AnyReader([tmp_path / "out.mcap"], default_typestore=typestore()) as reader:
+        seen: dict[str, list[Any]] = {}
+        for connection, _, raw in reader.messages():
+            if connection.topic in ("/husky_1/markers", "/husky_1/map"):
+                seen.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    markers, (*_, cloud) = seen["/husky_1/markers"], seen["/husky_1/map"]
+    assert len(markers) > len(seen["/husky_1/map"]) > 0
+    assert all(message.markers[0].action == 3 for message in markers)
+    # The last message of both has the map of the last tick.
+    assert sum(len(marker.points) for marker in markers[-1].markers) == cloud.width > 0
+    assert markers[-1].markers[0].header.stamp == cloud.header.stamp

@@ -55,7 +55,8 @@ def test_six_robots(rule, mode, topology):
     assert (outcome.twin_tick.known.sum(axis=0) >= 2).mean() > 0.3
 
 
-@pytest.mark.parametrize(("gate", "mode", "topology"), one_in(5, [0.5, 1.0], MODES, ["line", "star"]))
+@long
+@pytest.mark.parametrize(("gate", "mode", "topology"), one_in(8, [0.5, 1.0], MODES, ["line", "star"]))
 def test_flows_with_a_gate(gate, mode, topology):
     outcome = compare(
         SMALL, rule="bayes", mode=mode, topology=topology, flow_gate=gate, flow_bits=6, every=5, with_metrics=True
@@ -63,7 +64,7 @@ def test_flows_with_a_gate(gate, mode, topology):
     assert outcome.twin_tick.settling
 
 
-@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(9, RULES, MODES, TOPOLOGIES))
+@pytest.mark.parametrize(("rule", "mode", "topology"), one_in(13, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""
     outcome = compare(
@@ -122,7 +123,7 @@ SENSOR_VARIANTS = {
 }
 
 
-@pytest.mark.parametrize(("rule", "variant"), one_in(5, ["gradient", "bayes"], SENSOR_VARIANTS))
+@pytest.mark.parametrize(("rule", "variant"), one_in(7, ["gradient", "bayes"], SENSOR_VARIANTS))
 def test_sensor_models(variant, rule):
     outcome = compare(SMALL, rule=rule, settle=0, every=8, sensor_parameters=SENSOR_VARIANTS[variant])
     assert outcome.twin_tick.known.any()
@@ -134,7 +135,7 @@ def test_kinds_of_sensors(sensors):
     compare(shape, seed=4, topology="line", rule="gradient", settle=0, every=8)
 
 
-@pytest.mark.parametrize(("rule", "topology", "mode"), one_in(7, RULES, ["complete", "star"], MODES))
+@pytest.mark.parametrize(("rule", "topology", "mode"), one_in(9, RULES, ["complete", "star"], MODES))
 def test_robots_that_leave(rule, topology, mode):
     outcome = compare(
         SMALL, topology=topology, rule=rule, mode=mode, after_end="leave", settle=4, settle_tolerance=1e-3, every=3,
@@ -150,7 +151,7 @@ STEPS_AND_SCHEDULES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("mode", "parameters"), one_in(5, MODES, STEPS_AND_SCHEDULES), ids=str)
+@pytest.mark.parametrize(("mode", "parameters"), one_in(9, MODES, STEPS_AND_SCHEDULES), ids=str)
 def test_steps_and_schedules(parameters, mode):
     compare(SMALL, topology="star", rule="natural", mode=mode, settle=0, every=9, **parameters)
     compare(SMALL, topology="star", rule="gradient", mode=mode, settle=0, every=9, **parameters)
@@ -204,7 +205,14 @@ def test_numbers_of_classes(rule, num_classes):
     compare_frames(config, frames, with_metrics=True)
 
 
-@pytest.mark.parametrize(("rule", "mode"), [("gradient", "sync"), ("bayes", "on-arrival"), ("local", "sync")])
+@pytest.mark.parametrize(
+    ("rule", "mode"),
+    [
+        ("bayes", "on-arrival"),
+        pytest.param("gradient", "sync", marks=long),
+        pytest.param("local", "sync", marks=long),
+    ],
+)
 def test_threads_do_not_change_a_byte(rule, mode):
     scenario = scenario_of(1, SMALL)
     config = scenario.config(rule=rule, mode=mode, topology="ring", settle=2)
@@ -219,7 +227,7 @@ def test_threads_do_not_change_a_byte(rule, mode):
     assert runs[0] == runs[1]
 
 
-@pytest.mark.parametrize(("rule", "topology"), one_in(3, ["gradient", "bayes", "natural"], ["complete", "line"]))
+@pytest.mark.parametrize(("rule", "topology"), one_in(4, ["gradient", "bayes", "natural"], ["complete", "line"]))
 def test_skipping_bricks_at_rest_does_not_change_a_byte(rule, topology, monkeypatch):
     scenario = scenario_of(1, SMALL)
     config = scenario.config(rule=rule, topology=topology, settle=3)

@@ -21,6 +21,7 @@ from octoreplay.replay.robots import robot as robot_module
 from octoreplay.replay.robots.anchor import Anchor
 from octoreplay.replay.session import Session
 from reference import flows, rules
+from support.long_suite import long
 from support.octree_factory import class_rows
 from support.twin_comparison import SMALL, compare
 
@@ -232,6 +233,7 @@ LOG_ODDS_DIFFER = "log-odds differ"
 MAPS_DIFFER = "log-odds differ|cells are missing|cells are spurious|iterations differ"
 
 
+@long
 @pytest.mark.parametrize(
     ("rule", "mode", "fault", "message"),
     [
@@ -285,6 +287,7 @@ def _compare(rule, mode):
 _compare_without_fault = functools.cache(_compare)
 
 
+@long
 def test_the_comparison_fails_with_ties_that_are_absolute(monkeypatch):
     """Averages of evidence are small."""
     right = MapComparer.compare
@@ -301,6 +304,7 @@ def test_the_comparison_fails_with_ties_that_are_absolute(monkeypatch):
         compare_averages()
 
 
+@long
 @pytest.mark.parametrize(
     ("gate", "mode", "fault"),
     [

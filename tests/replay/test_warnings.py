@@ -19,14 +19,14 @@ from support.fixture_paths import PAIR_TEAM
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
-        ({"rule": "bayes", "loss": 0.2}, "with losses it drifts from the mean; rule 'ratio' or 'flood' does not"),
+        ({"rule": "bayes", "loss": 0.2}, "with losses it drifts from the mean; use --rule ratio or flood"),
         ({"rule": "bayes", "latency": 0.3}, "with maps that arrive in a later tick it drifts"),
         ({"rule": "bayes", "rate": 1e6}, "with maps that arrive in a later tick it drifts"),
         (
             {"rule": "bayes", "loss": 0.2, "latency": 0.3},
             "with losses and maps that arrive in a later tick it drifts",
         ),
-        ({"rule": "bayes", "packets": "delta", "budget": 9000}, "drifts from the mean; rule 'flood' does not"),
+        ({"rule": "bayes", "packets": "delta", "budget": 9000}, "drifts from the mean; use --rule flood"),
         ({"rule": "merge"}, "rule 'merge' counts received evidence again in every tick"),
     ],
 )

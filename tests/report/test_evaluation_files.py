@@ -13,8 +13,9 @@ import pytest
 
 from octoreplay.errors import OutputError
 from octoreplay.evaluate.records import SCORES, MapScores, TruthScores
+from octoreplay.io.text_files import json_text
 from octoreplay.records import CENTRAL
-from octoreplay.report.evaluation_files import evaluation_csv, evaluation_json, write_evaluation
+from octoreplay.report.evaluation_files import evaluation_content, evaluation_csv, write_evaluation
 from octoreplay.run_metrics import PAIR_SHARES
 from support.evaluation_factory import evaluation
 
@@ -34,7 +35,7 @@ def test_csv_has_one_row_per_map_and_three_for_the_team() -> None:
     assert {row["map_kind"] for row in table} == {"posterior"}
     of_means = dataclasses.replace(judged, map_kind="mean")
     assert {row["map_kind"] for row in rows(evaluation_csv(of_means))} == {"mean"}
-    assert json.loads(evaluation_json(of_means))["map_kind"] == "mean"
+    assert json.loads(json_text(evaluation_content(of_means)))["map_kind"] == "mean"
     places = iter(table)
     for tick in judged.ticks:
         for scores in tick.maps:
@@ -63,14 +64,14 @@ def test_csv_and_json_have_every_field() -> None:
     fields = (item.name for record in (MapScores, TruthScores) for item in dataclasses.fields(record))
     names = set(fields) - {"truth", "iou"}
     assert names | {"iou.ground", "iou.tree"} <= set(rows(evaluation_csv(evaluation()))[0])
-    tick = json.loads(evaluation_json(evaluation()))["ticks"][0]
+    tick = json.loads(json_text(evaluation_content(evaluation())))["ticks"][0]
     assert set(tick["maps"][0]) == names | {"iou"}
     assert set(tick["mean"]) == set(tick["least"]) == set(tick["largest"]) == {*SCORES, "iou"}
 
 
 def test_json_and_csv_have_equal_values() -> None:
     judged = evaluation()
-    content = json.loads(evaluation_json(judged))
+    content = json.loads(json_text(evaluation_content(judged)))
     assert {name: content[name] for name in ("result", "truth", "against")} == {
         "result": "result.mcap", "truth": "world.npz", "against": "central",
     }  # fmt: skip
@@ -100,11 +101,8 @@ def test_team_statistics_are_over_the_active_robots() -> None:
     assert by_kind["mean"]["iou.tree"] == by_kind["least"]["iou.tree"] == ""
 
 
-def test_files_are_written_to_the_given_paths(tmp_path: Path) -> None:
-    write_evaluation(evaluation())
-    assert list(tmp_path.iterdir()) == []
-    write_evaluation(evaluation(), csv_path=tmp_path / "a.csv", json_path=tmp_path / "a.json")
+def test_a_file_is_written_to_the_given_path(tmp_path: Path) -> None:
+    write_evaluation(evaluation(), tmp_path / "a.csv")
     assert (tmp_path / "a.csv").read_text() == evaluation_csv(evaluation())
-    assert (tmp_path / "a.json").read_text() == evaluation_json(evaluation())
     with pytest.raises(OutputError):
-        write_evaluation(evaluation(), csv_path=tmp_path / "none" / "a.csv")
+        write_evaluation(evaluation(), tmp_path / "none" / "a.csv")

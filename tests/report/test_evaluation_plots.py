@@ -12,11 +12,12 @@ from octoreplay.errors import OutputError
 from octoreplay.report import evaluation_plots
 from octoreplay.report.evaluation_plots import write_evaluation_figures
 from support.evaluation_factory import evaluation
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 
 NAMES = ["agreement.png", "iou.png", "class_iou.png", "coverage.png", "calibration.png"]
 
 
+@long
 def test_figures_are_not_blank_and_reproducible(tmp_path: Path) -> None:
     paths = write_evaluation_figures(evaluation(), tmp_path / "a")
     assert [path.name for path in paths] == NAMES
@@ -26,12 +27,14 @@ def test_figures_are_not_blank_and_reproducible(tmp_path: Path) -> None:
         assert np.asarray(Image.open(path).convert("L")).std() > 5
 
 
+@long
 @pytest.mark.parametrize(("has_central", "num_ticks"), one_in(3, [True, False], [1, 2]))
 def test_figures_of_one_tick_or_without_a_centralised_map(tmp_path: Path, num_ticks: int, has_central: bool) -> None:
     judged = evaluation(num_ticks, has_central=has_central)
     assert len(write_evaluation_figures(judged, tmp_path)) == len(NAMES)
 
 
+@long
 def test_without_truth_only_agreement_is_drawn(tmp_path: Path) -> None:
     paths = write_evaluation_figures(evaluation(has_truth=False), tmp_path)
     assert [path.name for path in paths] == ["agreement.png"]

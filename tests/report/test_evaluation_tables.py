@@ -13,9 +13,9 @@ from octoreplay.report.evaluation_tables import MAX_TIMES, evaluation_tables
 from support.evaluation_factory import evaluation
 
 
-def rendered(judged: Evaluation) -> str:
+def rendered(judged: Evaluation, *, is_verbose: bool = False) -> str:
     text = io.StringIO()
-    tables.show(tables.terminal(file=text, width=100), evaluation_tables(judged))
+    tables.show(tables.terminal(file=text, width=100), evaluation_tables(judged, is_verbose=is_verbose))
     lines = [line.rstrip() for line in text.getvalue().splitlines()]
     assert all(len(line) <= 100 for line in lines)
     return "\n".join(lines)
@@ -45,6 +45,24 @@ def test_every_map_and_the_mean_have_a_row() -> None:
     mean = rendered(dataclasses.replace(judged, map_kind="mean"))
     assert "(mean of the team), agreement with the centralised map\n" in mean
     assert "cells with different labels: 8.33 %" in text
+
+
+def test_robots_with_equal_maps_are_one_row() -> None:
+    judged = evaluation()
+    first, final = judged.final.robots[0], judged.final
+    equal = tuple(dataclasses.replace(first, robot_id=scores.robot_id) for scores in final.robots)
+    assert final.central is not None
+    tick = dataclasses.replace(final, maps=(*equal, final.central))
+    same = dataclasses.replace(judged, ticks=(tick,))
+    text = rendered(same)
+    for title in ("Maps 5.0 s after the start", "Against world.npz"):
+        assert row(text, title, "all 3")[1:] == row(rendered(same, is_verbose=True), title, first.robot_id)
+    assert first.robot_id not in text.replace(f"{first.robot_id} and", "")
+    assert "\nmean " not in text
+    assert "The robots' maps agree; -v shows each robot." in text
+    assert len(row(text, "IoU of the classes", "ground")) == 2
+    off = dataclasses.replace(tick, maps=(dataclasses.replace(first, is_active=False), *tick.maps[1:]))
+    assert f"{first.robot_id} (off)" in rendered(dataclasses.replace(judged, ticks=(off,)))
 
 
 def test_the_classes_of_a_small_team_have_one_column_per_robot() -> None:

@@ -10,8 +10,11 @@ from octoreplay.config.class_tables.palette import PALETTE
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import LeafTable
-from octoreplay.report.export import FREE_COLOR, export_ply
+from octoreplay.report.cell_colors import FREE_COLOR
+from octoreplay.report.export import export_map
+from octoreplay.result import open_result
 from support import leaf_list
+from support.octomap_reader import read_octomap
 from support.result_factory import leaf_table, state, write_result
 
 LEAVES = leaf_table()
@@ -41,7 +44,7 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def exported(result: Path, **options: object) -> tuple[list[list[float]], list[list[int]], PlyData]:
     """Positions and colours of the points, and the file."""
     path = result.with_name("map.ply")
-    count = export_ply(result, path, **options)
+    count = export_map(result, path, **options)[path]
     data = PlyData.read(path)
     vertices = data["vertex"]
     assert count == len(vertices.data)
@@ -84,7 +87,7 @@ def test_the_posterior_has_higher_probabilities(result: Path) -> None:
 def test_a_map_at_an_earlier_time_can_be_exported(result: Path) -> None:
     assert len(exported(result, at=2.5)[0]) == 1
     with pytest.raises(InputError, match="no map of robot 'alpha' is stored up to"):
-        export_ply(result, result.with_name("map.ply"), at=0.5)
+        export_map(result, result.with_name("map.ply"), at=0.5)
 
 
 def test_probability_colours_run_from_uniform_to_certain(result: Path) -> None:
@@ -131,12 +134,72 @@ def test_robot_colours_are_mixed_where_both_robots_know_a_leaf(result: Path) -> 
 
 def test_voxels_are_exported_as_cubes(result: Path) -> None:
     path = result.with_name("cubes.ply")
-    assert export_ply(result, path, what="voxels") == 3
+    assert export_map(result, path, what="voxels") == {path: 3}
     data = PlyData.read(path)
     assert (data["vertex"].count, data["face"].count) == (24, 36)
 
 
-@pytest.mark.parametrize("options", [{"what": "mesh"}, {"color": "height"}])
+@pytest.mark.parametrize("options", [{"what": "mesh"}, {"color": "rainbow"}])
 def test_unknown_options_are_refused(result: Path, options: dict[str, str]) -> None:
     with pytest.raises(ConfigError, match="is not one of"):
-        export_ply(result, result.with_name("map.ply"), **options)
+        export_map(result, result.with_name("map.ply"), **options)
+
+
+# --- other formats ---------------------------------------------------------------------------------------------------
+
+
+def test_heights_are_coloured_from_the_lowest_to_the_highest(result: Path) -> None:
+    positions, colors, data = exported(result, color="height")
+    heights = [position[2] for position in positions]
+    assert colors[int(np.argmin(heights))] == DARK
+    assert colors[int(np.argmax(heights))] == YELLOW
+    assert f"color: height (dark {min(heights):g} m, yellow {max(heights):g} m)" in data.comments
+
+
+def test_archives_hold_the_leaves(result: Path) -> None:
+    path = result.with_name("map.npz")
+    count = export_map(str(result), str(path), free=True)[path]
+    with np.load(path) as archive, open_result(result) as opened:
+        leaves = opened.map("alpha").leaves()
+        assert count == len(leaves) == len(archive["sizes"])
+        np.testing.assert_array_equal(archive["centers"], leaves.centers)
+        np.testing.assert_array_equal(archive["log_odds"], leaves.log_odds)
+        np.testing.assert_allclose(archive["probabilities"].sum(axis=1), 1.0, atol=1e-6)
+        assert archive["class_names"].tolist() == ["free", *opened.class_table.names]
+
+
+def test_trees_hold_free_and_occupied_leaves(result: Path) -> None:
+    path = result.with_name("map.bt")
+    count = export_map(result, path)[path]
+    _, leaves = read_octomap(path)
+    assert count == len(leaves)
+    assert {value for (value,) in leaves.values()} == {True, False}
+
+
+def test_a_map_without_occupied_leaves_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leaf_list.install(monkeypatch)
+    free = LeafTable(LEAVES.centers[:1], LEAVES.sizes[:1], np.array([[-1.0, -1.0]], np.float32))
+
+    def fill_free(writer: ResultWriter) -> None:
+        writer.write_state(state("alpha", 0, 1, leaf_list.encode(free), key=True))
+
+    path = write_result(tmp_path, fill_free)
+    with pytest.raises(InputError, match="the map of alpha holds no occupied leaf; use --free, or a later time"):
+        export_map(path, tmp_path / "map.ply")
+    assert export_map(path, tmp_path / "map.ply", free=True) == {tmp_path / "map.ply": 1}
+
+
+@pytest.mark.parametrize(("num_free", "is_warned"), [(1, True), (2, False)])
+def test_a_grid_of_mostly_occupied_cells_warns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, num_free: int, is_warned: bool
+) -> None:
+    leaf_list.install(monkeypatch)
+    centers = np.array([[column + 0.1, 0.1, 0.1] for column in range(4)])
+    log_odds = np.full((4, 2), 3.0, np.float32)
+    log_odds[:num_free] = -3.0
+    leaves = LeafTable(centers, np.full(4, 0.2), log_odds)
+    result = write_result(
+        tmp_path, lambda writer: writer.write_state(state("alpha", 0, 1, leaf_list.encode(leaves), key=True))
+    )
+    export_map(result, tmp_path / "map.yaml")
+    assert ("leave it out with --heights LOW HIGH" in caplog.text) == is_warned

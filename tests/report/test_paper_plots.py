@@ -10,32 +10,14 @@ from support.result_factory import CLASSES, tick_metrics
 METRICS = [tick_metrics(tick) for tick in range(1, 9)]
 
 
-def test_figures_have_the_values_of_the_metrics() -> None:
-    [axes] = paper_plots.distance_figure(METRICS, (1.0,)).axes
-    np.testing.assert_array_equal(axes.get_lines()[0].get_ydata(), [tick.total_distance for tick in METRICS])
-    np.testing.assert_array_equal(axes.get_lines()[0].get_xdata(), range(8))
-    assert axes.get_lines()[1].get_xdata() == [1.0, 1.0]
-
-    upper, lower = paper_plots.agreement_figure(METRICS, ()).axes
-    worst = [min(robot.agreement for robot in tick.robots if robot.active) for tick in METRICS]
-    occupied = [min(robot.agreement_occupied for robot in tick.robots if robot.active) for tick in METRICS]
-    assert occupied[0] > occupied[1]  # Beta, which agrees less, is inactive at first.
-    np.testing.assert_array_equal(upper.get_lines()[0].get_ydata(), worst)
-    np.testing.assert_array_equal(upper.get_lines()[1].get_ydata(), occupied)
-    np.testing.assert_array_equal(lower.get_lines()[0].get_ydata(), [tick.label_disagreement for tick in METRICS])
-
-
-def test_packet_figure_has_mean_deviation_and_ratio() -> None:
-    upper, lower = paper_plots.packet_figure(METRICS, ()).axes
-    grid = np.array([[robot.grid_bytes for robot in tick.robots] for tick in METRICS])
-    octree = np.array([[robot.octree_bytes for robot in tick.robots] for tick in METRICS])
-    curves = {line.get_label(): line.get_ydata() for line in upper.get_lines()}
-    np.testing.assert_allclose(curves["uniform grid"], grid.mean(axis=1))
-    np.testing.assert_allclose(curves["octree"], octree.mean(axis=1))
-    band = upper.collections[0].get_paths()[0].vertices
-    assert band[:, 1].max() == grid.mean(axis=1)[-1] + grid.std(axis=1)[-1]
-    np.testing.assert_allclose(lower.get_lines()[0].get_ydata(), grid.mean(axis=1) / octree.mean(axis=1))
-    assert set(lower.get_lines()[1].get_ydata()) == {4.0}
+def test_figures_have_the_moments_and_the_ratio_of_the_paper() -> None:
+    figures = paper_plots.paper_figures(METRICS, (1.0, 3.0))
+    assert set(figures) == {"total_distance.png", "agreement.png", "packet_size.png"}
+    for figure in figures.values():
+        for axes in figure.axes:
+            assert {1.0, 3.0} <= {line.get_xdata()[0] for line in axes.get_lines() if len(set(line.get_xdata())) == 1}
+    ratio = figures["packet_size.png"].axes[1]
+    assert any(set(line.get_ydata()) == {paper_plots.PAPER_RATIO} for line in ratio.get_lines())
 
 
 def test_pictures_of_maps_are_placed_side_by_side() -> None:

@@ -11,7 +11,10 @@ from PIL import Image
 from octoreplay.errors import InputError, OutputError
 from octoreplay.report import plots
 from octoreplay.report.contradiction_plots import MAX_COLORED, contradiction_figure
+from octoreplay.report.figures import SCREEN
+from octoreplay.report.log_time import PlottedRun
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics, TickMetrics
+from support.long_suite import long
 from support.result_factory import tick_metrics
 
 METRICS = [tick_metrics(tick, settling=tick > 6) for tick in range(1, 9)]
@@ -55,27 +58,17 @@ def test_ticks_without_a_link_have_empty_columns_for_it() -> None:
     assert [row["alpha>beta.num_sent"] for row in table] == ["", "1", ""]
 
 
+@long
 def test_figures_are_not_blank_and_reproducible(tmp_path: Path) -> None:
     first = plots.write_figures(METRICS, tmp_path / "a" / "b")
     second = plots.write_figures(METRICS, tmp_path / "c")
-    assert [path.name for path in first] == ["disagreement.png", "packet_size.png", "contradiction.png"]
+    names = ("disagreement", "agreement", "packet_size", "contradiction")
+    assert [path.name for path in first] == [f"{name}.png" for name in names]
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()
         with Image.open(one) as image:
-            assert image.size == ((1650, 900) if one.name == "contradiction.png" else (1050, 540))
+            assert image.width == (1650 if one.name == "contradiction.png" else 1050)
             assert len(np.unique(np.asarray(image.convert("L")))) > 20
-
-
-def test_figures_have_the_values_of_the_metrics() -> None:
-    figure = plots._disagreement_figure(METRICS)
-    axes = figure.axes[0]
-    curves = {line.get_label(): line for line in axes.get_lines()}
-    np.testing.assert_array_equal(curves["\u03a6 over the links"].get_ydata(), [m.total_distance for m in METRICS])
-    np.testing.assert_array_equal(curves["\u03a6 over all pairs"].get_ydata(), [m.total_distance_all for m in METRICS])
-    assert axes.get_yscale() == "log"
-    packets = {line.get_label(): line for line in plots._packet_figure(METRICS).axes[0].get_lines()}
-    mean = [np.mean([robot.grid_bytes for robot in tick.robots]) for tick in METRICS]
-    np.testing.assert_allclose(packets["uniform grid"].get_ydata(), mean)
 
 
 def large_team(num_robots: int) -> list[TickMetrics]:
@@ -86,19 +79,26 @@ def large_team(num_robots: int) -> list[TickMetrics]:
     for tick in METRICS:
         pairs = tuple(
             dataclasses.replace(
-                tick.pairs[0], first=a, second=b, contradiction=(0.6 if b == ids[-1] else 0.1) + n / 1e4
+                tick.pairs[0],
+                first=a,
+                second=b,
+                contradiction=(0.6 if b == ids[-1] else 0.1) + n / 1e4,
+                clear_contradiction=(0.06 if b == ids[-1] else 0.01) + n / 1e5,
             )
             for n, (a, b) in enumerate(itertools.combinations(ids, 2))
         )
-        small = dataclasses.replace(pairs[0], occupied_cells=MIN_COMPARED_CELLS - 1, contradiction=1.0)
+        small = dataclasses.replace(
+            pairs[0], occupied_cells=MIN_COMPARED_CELLS - 1, contradiction=1.0, clear_contradiction=1.0
+        )
         made.append(dataclasses.replace(tick, robots=robots, pairs=(small, *pairs[1:])))
     return made
 
 
+@long
 @pytest.mark.parametrize("num_robots", [2, 6, 16])
 def test_the_worst_pairs_have_colours_and_the_others_are_grey(num_robots: int) -> None:
     metrics = METRICS if num_robots == 2 else large_team(num_robots)
-    figure = contradiction_figure(metrics, plots.log_seconds(metrics))
+    figure, _ = contradiction_figure([PlottedRun("run", metrics)], SCREEN)
     lines = figure.axes[0].get_lines()
     counted = 1 if num_robots == 2 else num_robots * (num_robots - 1) // 2 - 1
     assert len(lines) == counted
@@ -111,14 +111,7 @@ def test_the_worst_pairs_have_colours_and_the_others_are_grey(num_robots: int) -
     assert image.get_array().shape == (num_robots, num_robots)
 
 
-def test_a_robot_that_did_not_publish_is_left_out_of_the_mean() -> None:
-    silent = dataclasses.replace(METRICS[0].robots[0], packet_bytes=0, octree_bytes=0, grid_bytes=0)
-    tick = dataclasses.replace(METRICS[0], robots=(silent, METRICS[0].robots[1]))
-    mean, deviation = plots.over_robots([tick], "grid_bytes")
-    assert mean.tolist() == [METRICS[0].robots[1].grid_bytes]
-    assert deviation.tolist() == [0.0]
-
-
+@long
 def test_figures_of_a_run_without_exchange_or_disagreement(tmp_path: Path) -> None:
     silent = [
         dataclasses.replace(
@@ -127,7 +120,7 @@ def test_figures_of_a_run_without_exchange_or_disagreement(tmp_path: Path) -> No
         )
         for tick in METRICS[:1]
     ]  # fmt: skip
-    assert len(plots.write_figures(silent, tmp_path)) == 2
+    assert len(plots.write_figures(silent, tmp_path)) == 3
 
 
 def test_metrics_without_a_tick_are_refused(tmp_path: Path) -> None:

@@ -51,6 +51,25 @@ def test_other_settings_become_bars() -> None:
     np.testing.assert_allclose(heights, [[0.3, 0.33], [0.2, 0.23], [0.4 + 0.1, 0.4 + 0.13]])
 
 
+def test_bars_that_would_look_alike_become_points_on_a_zoomed_axis() -> None:
+    rows = [row(rule=rule, agreement=value) for rule, value in (("a", 0.994), ("b", 0.999))]
+    (axes,) = axes_of(rows, [("rule",)])
+    assert not [bars for bars in axes.containers if hasattr(bars, "patches")]
+    (line,) = [entry[0] for entry in axes.containers]
+    np.testing.assert_allclose(line.get_ydata(orig=False), [0.994, 0.999])
+    low, high = axes.get_ylim()
+    assert 0.99 < low < 0.994
+    assert 0.999 < high < 1.0
+
+
+def test_shares_near_one_are_stretched() -> None:
+    values = (0.5, 0.994, 0.995, 0.999, 0.9995)
+    rows = [row(loss=str(n), agreement=value) for n, value in enumerate(values)]
+    (axes,) = axes_of(rows, [("loss",)])
+    places = [axes.transData.transform((0.0, value))[1] for value in values]
+    assert places[3] - places[1] > 0.15 * axes.bbox.height
+
+
 def test_further_settings_become_panels() -> None:
     rows = [{**entry, "team": team, "loss": "0"} for team in ("a", "b", "c") for entry in ROWS]
     panels = axes_of(rows, [("resolution",), ("rule",), ("loss",)])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from octoreplay.simulate.exploration import CELL, Motion, _shortest_paths, explore
 from octoreplay.simulate.village import make_village
+from support.long_suite import long
 
 PERIOD = 0.1
 
@@ -29,6 +30,7 @@ def cells_of(world, xy: np.ndarray) -> np.ndarray:
     return np.floor((xy + world.size / 2) / CELL).astype(int)
 
 
+@long
 def test_robots_keep_clear_of_obstacles_and_the_edge(drive):
     world, exploration = drive
     # One cell of distance is at least half a metre between the robot's centre and an obstacle.

@@ -179,6 +179,7 @@ def test_odometry_and_tf_have_equal_poses_and_the_twist_is_their_derivative(smal
     assert speeds.max() > 0.5
 
 
+@long
 def test_pose_errors_are_stationary_and_change_over_ten_seconds():
     errors = pose_errors(0.5, 400_000, 0.05, np.random.default_rng(0))
     np.testing.assert_allclose(errors.std(axis=0), [0.5, 0.5, 0.05], rtol=0.05)

@@ -94,7 +94,7 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
 ) -> None:
     arguments = ("-o", tmp_path / "d", "--scheduler", dask.address)
     with started("sweep", PAIR_TEAM, *ENDLESS, *arguments) as process:
-        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        wait_for(lambda: any((tmp_path / "d").glob("unfinished-*/*.mcap")))
         running = dask.children()
         assert len(running) == 1
         process.send_signal(number)
@@ -112,7 +112,7 @@ def test_an_interrupted_sweep_ends_its_processes_on_the_workers(
 
 def test_a_lost_scheduler_is_reported_in_one_sentence(dask: Cluster, tmp_path: Path) -> None:
     with started("sweep", PAIR_TEAM, *ENDLESS, "-o", tmp_path / "d", "--scheduler", dask.address) as process:
-        wait_for(lambda: any((tmp_path / "d" / "unfinished").glob("*/*.mcap")))
+        wait_for(lambda: any((tmp_path / "d").glob("unfinished-*/*.mcap")))
         dask.scheduler.kill()
         _, err = process.communicate(timeout=120)
     assert process.returncode == 1

@@ -10,6 +10,7 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError, OutputError
+from octoreplay.replay.run import Progress
 from octoreplay.result import open_result
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study import teams
@@ -131,7 +132,7 @@ def test_a_simulation_that_cannot_be_finished_leaves_nothing(tmp_path: Path, mon
 
 
 def test_the_remains_of_a_killed_simulation_are_removed(stored: Path, tmp_path: Path) -> None:
-    left = tmp_path / ".team.partial"
+    left = tmp_path / ".team.0a1b2c3d.tmp"
     left.mkdir()
     (left / "husky_7.mcap").write_text("half")
     simulated_team(tmp_path / "team", SMALL)
@@ -175,17 +176,23 @@ def test_a_result_of_another_version_is_refused(stored: Path, monkeypatch: pytes
 
 def test_a_file_that_is_not_a_result_is_refused(made: Path) -> None:
     (made / "result.mcap").write_text("mine")
-    with pytest.raises(InputError, match=r"result\.mcap: not a finished MCAP file"):
+    with pytest.raises(InputError, match=r"result\.mcap: not a finished MCAP file, or damaged"):
         replayed_team(load_team_file(made / "team" / "team.yaml"), made / "result.mcap")
 
 
-def test_an_interrupted_replay_leaves_nothing(stored: Path, tmp_path: Path) -> None:
-    def interrupt(progress: object) -> None:
-        raise KeyboardInterrupt
+def test_an_interrupted_replay_is_continued(stored: Path, tmp_path: Path) -> None:
+    ticks: list[int] = []
+
+    def interrupt(progress: Progress) -> None:
+        ticks.append(progress.tick)
+        if progress.tick == 1:
+            raise KeyboardInterrupt
 
     config = load_team_file(stored / "team" / "team.yaml")
     with pytest.raises(KeyboardInterrupt):
         replayed_team(config, tmp_path / "result.mcap", interrupt)
-    assert list(tmp_path.iterdir()) == []
-    with open_result(replayed_team(config, tmp_path / "result.mcap")) as result:
+    replayed_team(config, tmp_path / "result.mcap", lambda progress: ticks.append(progress.tick))
+    assert ticks == list(range(len(ticks)))
+    assert [path.name for path in tmp_path.iterdir()] == ["result.mcap"]
+    with open_result(tmp_path / "result.mcap") as result:
         assert result.is_complete

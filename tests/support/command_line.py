@@ -25,9 +25,9 @@ def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.Com
     """Call the command line in this process, 100 columns wide; exceptions that no exit code covers are raised."""
     words = [str(argument) for argument in arguments]
     out, err = io.StringIO(), io.StringIO()
-    log = logging.StreamHandler(err)
-    logger = logging.getLogger("octoreplay")
-    logger.addHandler(log)
+    with contextlib.redirect_stderr(err):
+        log = cli.log_handler()
+    logging.root.addHandler(log)
     try:
         with (
             mock.patch.dict(os.environ, ENVIRONMENT),
@@ -37,7 +37,7 @@ def octoreplay(*arguments: object, folder: Path | None = None) -> subprocess.Com
         ):
             code = cli._exit_code(words)
     finally:
-        logger.removeHandler(log)
+        logging.root.removeHandler(log)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 

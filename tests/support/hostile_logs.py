@@ -20,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from fixtures.make_streams import PALETTE
 from octoreplay.config.consensus import ConsensusConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -50,7 +51,6 @@ LOGS = tuple(
 MCAP_LOGS = tuple(name for name in LOGS if name.endswith(".mcap"))
 """Those of them whose messages are rewritten."""
 
-PALETTE = {1: (196, 160, 110), 2: (220, 220, 230), 7: (90, 140, 60), 12: (150, 75, 0)}
 CLASSES = ClassTable(
     tuple(
         SemanticClass(index + 1, name, PALETTE[raw], (raw,), (PALETTE[raw],))

@@ -18,7 +18,9 @@ class LeafList:
         self.num_classes = leaves.log_odds.shape[1]
         self.table = leaves
 
-    def leaves(self, prior: float = 0.0) -> LeafTable:
+    memory_bytes = 0
+
+    def leaves(self, prior: float = 0.0, most_bytes: int | None = None) -> LeafTable:
         return LeafTable(self.table.centers, self.table.sizes, self.table.log_odds + np.float32(prior))
 
     def lookup(self, coords: Float64Array) -> tuple[Float32Array, BoolArray, Float64Array]:
@@ -40,14 +42,14 @@ def encode(leaves: LeafTable, resolution: float = 0.2) -> bytes:
     return stream.getvalue()
 
 
-def decode(data: bytes) -> LeafList:
+def decode(data: bytes, most_bytes: int | None = None) -> LeafList:
     """A leaf list from its bytes."""
     content = np.load(io.BytesIO(data))
     leaves = LeafTable(content["centers"], content["sizes"], content["log_odds"])
     return LeafList(float(content["resolution"]), leaves)
 
 
-def apply(octree: LeafList, data: bytes) -> None:
+def apply(octree: LeafList, data: bytes, most_bytes: int | None = None) -> None:
     """Append the delta's leaves."""
     more, old = decode(data).table, octree.table
     octree.table = LeafTable(

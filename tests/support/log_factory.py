@@ -196,6 +196,25 @@ class Factory:
             position_covariance_type=0 if sigma is None else 2,
         )  # fmt: skip
 
+    def imu(
+        self, stamp_ns: int, angular_velocity: Sequence[float], acceleration: Sequence[float] = (0.0, 0.0, 9.81), *,
+        frame_id: str = "imu", unmeasured: Sequence[str] = (),
+    ) -> Any:  # fmt: skip
+        """An Imu without orientation; ``unmeasured`` names fields with a covariance of -1."""
+
+        def vector(xyz: Sequence[float]) -> Any:
+            return self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, xyz), strict=True)))
+
+        covariances = {
+            f"{name}_covariance": np.array([-1.0 if name in ("orientation", *unmeasured) else 0.0] + 8 * [0.0])
+            for name in ("orientation", "angular_velocity", "linear_acceleration")
+        }
+        return self.make(
+            "sensor_msgs/msg/Imu", header=self.header(stamp_ns, frame_id),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            angular_velocity=vector(angular_velocity), linear_acceleration=vector(acceleration), **covariances,
+        )  # fmt: skip
+
     def tags(self, stamp_ns: int, positions: Mapping[int, Sequence[float]], *, frame_id: str = "camera") -> Any:
         """Detected tags of ROS 1 at positions in the camera's frame, with the camera's rotation."""
         detections = [
@@ -445,6 +464,7 @@ def robot_entries(
 
 def write_mcap(path: Path, entries: Iterable[Entry], *, chunk_size: int = 1 << 20) -> Path:
     """Write messages with the project's own writer."""
+    path.unlink(missing_ok=True)
     with RosMcapWriter(path, chunk_size=chunk_size) as writer:
         for entry in entries:
             writer.write(entry.topic, entry.type_name, entry.value, entry.log_time_ns)

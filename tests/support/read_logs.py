@@ -34,9 +34,11 @@ def robot_of(path, **fields) -> ResolvedRobot:
 
 
 def read(robot: ResolvedRobot, table=TABLE, **time):
-    """A robot's frames and counts."""
+    """A robot's frames and counts; every message is accounted for."""
     with RobotLog(robot, TimeConfig(**time), table) as log:
-        return list(log.frames()), log.counts
+        frames = list(log.frames())
+        assert log.counts.unaccounted == {}
+        return frames, log.counts
 
 
 def read_entries(tmp_path, entries, table=TABLE, time=None, **fields):

@@ -11,7 +11,15 @@ from octoreplay.config.class_file import class_table
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import FrameCounts, LeafTable, MapState, RobotPose
-from octoreplay.run_metrics import LinkMetrics, LinkTotals, PairMetrics, RobotMetrics, RunSummary, TickMetrics
+from octoreplay.run_metrics import (
+    LinkMetrics,
+    LinkTotals,
+    PairMetrics,
+    RobotMetrics,
+    RunSummary,
+    TickMetrics,
+    log_sent_bytes,
+)
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -69,7 +77,7 @@ def summary(metrics: Sequence[TickMetrics]) -> RunSummary:
         num_ticks=len(metrics), num_settling_ticks=sum(tick.settling for tick in metrics), stop_reason="it was over",
         log_seconds=12.5, wall_seconds=3.25, last=metrics[-1], peak_total_distance=77.0, peak_total_distance_all=88.0,
         mean_packet_bytes=150.5, mean_octree_bytes=250.25, mean_grid_bytes=6000.125, total_sent_bytes=9999,
-        links=links.totals(),
+        log_sent_bytes=log_sent_bytes(metrics), links=links.totals(),
         frame_counts={
             "alpha": FrameCounts(used=7, no_pose=2, unknown_label_pixels={42: 3}, unknown_colors={0xA0B0C: 5}),
             "beta": FrameCounts(used=9, truncated_files=["beta.bag"]),
@@ -120,3 +128,13 @@ def write_until(error: type[BaseException], path: Path, metrics: Sequence[TickMe
         for tick in metrics:
             writer.write_metrics(tick)
         raise error
+
+
+def write_killed(path: Path, metrics: Sequence[TickMetrics]) -> Path:
+    """Leave what a killed process leaves after some ticks: an unfinished file. Return its path."""
+    with ResultWriter(path, team(path.parent)) as writer:
+        for tick in metrics:
+            writer.write_metrics(tick)
+        left = writer.partial_path.read_bytes()
+    writer.partial_path.write_bytes(left)
+    return writer.partial_path

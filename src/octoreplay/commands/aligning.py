@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import glob
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
 from octoreplay.commands.options import (
     SectionedCommand,
-    check_folder,
+    check_new_folder,
     check_output,
     existing_path,
+    force_option,
+    lock_folder,
     with_parameters,
 )
-from octoreplay.commands.progress import lost_data, progress_bar, warn
+from octoreplay.commands.progress import lost_data, progress_bar
+from octoreplay.commands.suggestions import Choice
 from octoreplay.commands.team_options import base_config, save_team_file
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from octoreplay.config.resolved import ResolvedRun
     from octoreplay.config.run import RunConfig
     from octoreplay.io.robots.survey import LogSurveys
@@ -34,34 +37,32 @@ if TYPE_CHECKING:
     from octoreplay.replay.own_maps import OwnEvidence
 
 
-dof_option = click.option(
-    "--dof",
-    type=click.Choice(("4", "6")),
-    default=None,
-    help="unknowns of a frame: 4 if the z axes of all map frames are vertical; 6 if not, as for hand-held cameras"
-    "  [default: 4]",
-)
+def dof_option(kind: type[click.Option] = click.Option) -> Callable[[Any], Any]:
+    """Return the option --dof as an option of a class."""
+    return click.option("--dof", cls=kind, type=Choice(("4", "6")), default=None,
+                        help="unknowns of a frame: 4 if the z axes of all map frames are vertical; 6 if not, as for"
+                             " hand-held cameras  [default: 4]")  # fmt: skip
 
 
 @with_parameters("sensor", "map", "time")
 @click.command(cls=SectionedCommand, short_help="Find the frames of a team from its robots' maps.")
 @click.argument("inputs", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml | LOG... | RESULT.mcap")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="ALIGNED.yaml", help="team file to write")
-@dof_option
+@dof_option()
 @click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
               help="transforms T_team_map to try, which are used only where the maps verify them")  # fmt: skip
 @click.option("--components", is_flag=True,
               help="write further components of aligned robots to team files too (ALIGNED-2.yaml, ...)")  # fmt: skip
 @click.option("--csv", type=existing_path, metavar="FILE.csv", help="write the numbers of all pairs as CSV")
-@click.option("--json", type=existing_path, metavar="FILE.json",
-              help="write frames, covariances and pairs as JSON")  # fmt: skip
 @click.option("--plot", type=existing_path, metavar="DIR",
               help="write pictures of the maps before and after into this folder")  # fmt: skip
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
+@force_option
+@prints
 def align(
     inputs: tuple[Path, ...], output: Path, dof: str | None, guess: Path | None, components: bool, csv: Path | None,
-    json: Path | None, plot: Path | None, classes: str | None, **parameters: Any,
+    plot: Path | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
 
@@ -70,27 +71,31 @@ def align(
     the maps; else 1, and no team file is written if no two robots are connected. Exit code 3: all robots are connected,
     but data of the logs was lost.
     """
-    from octoreplay.report import tables
-    from octoreplay.report.alignment_files import write_alignment
+    for path, suffix in {output: ".yaml", **({csv: ".csv"} if csv else {})}.items():
+        check_output(path, suffix, [*inputs, *([guess] if guess else [])])
+    further = sorted(output.parent.glob(f"{glob.escape(output.stem)}-[0-9]*{output.suffix}")) if components else []
+    for path in further:
+        check_output(path, ".yaml")
+    if plot is not None:
+        check_new_folder(plot)
+        lock_folder(plot)
+
+    from octoreplay.report.alignment_files import alignment_content, write_alignment
     from octoreplay.report.alignment_plots import write_alignment_figures
     from octoreplay.report.alignment_tables import alignment_tables
 
-    outputs = {output: ".yaml", **{path: suffix for path, suffix in ((csv, ".csv"), (json, ".json")) if path}}
-    for path, suffix in outputs.items():
-        check_output(path, suffix, [*inputs, *([guess] if guess else [])])
-    if plot is not None:
-        check_folder(plot)
-    out, err = tables.terminal(), tables.terminal(stderr=True)
+    here = terminal()
     given = {name: value for name, value in parameters.items() if value is not None}
-    config, alignment, warnings, counts = _aligned(inputs, int(dof or 4), guess, classes, given, err)
-    tables.show(out, alignment_tables(alignment))
-    written = write_alignment(alignment, csv_path=csv, json_path=json)
+    config, alignment, warnings, counts = _aligned(inputs, int(dof or 4), guess, classes, given)
+    here.show(alignment_tables(alignment))
+    written = write_alignment(alignment, csv) if csv is not None else []
     written += write_alignment_figures(alignment, plot) if plot is not None else []
     for sentence in (*warnings, *lost_data(counts), *alignment.warnings):
-        warn(err, sentence)
+        here.warn(sentence)
     written = [*_write_teams(config, alignment, output, components=components), *written]
     for path in written:
-        out.print(f"wrote {path}", soft_wrap=True)
+        here.line(f"wrote {path}")
+    here.give(is_whole=alignment.is_whole, **alignment_content(alignment), written=written)
     if not alignment.is_whole:
         return EXIT_ERROR
     return EXIT_DATA_LOST if any(count.lost_data for count in counts.values()) else 0
@@ -119,28 +124,27 @@ def align_with_bar(
         )
 
 
-def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys, out: Console) -> tuple[ResolvedRun, Alignment]:
+def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys) -> tuple[ResolvedRun, Alignment]:
     """Align the robots of a configuration, show the tables, and return the aligned run, resolved, with the alignment.
 
     Raises InputError where no two robots are connected.
     """
     from octoreplay.io.robots import discover
     from octoreplay.replay.alignment import aligned_config, check_alignable, check_aligned
-    from octoreplay.report import tables
     from octoreplay.report.alignment_tables import alignment_tables
 
     check_alignable(chosen, {})
     # Frames that nothing relates are the reason to align them.
     resolved = discover.resolve(chosen.with_parameters({"strict_frames": False}), surveys)
     alignment = align_with_bar(chosen, evidence_with_bar(resolved), dof)
-    tables.show(out, alignment_tables(alignment))
+    terminal().show(alignment_tables(alignment))
     check_aligned(alignment)
     config = discover.resolve(aligned_config(chosen, alignment.teams[0]), surveys)
     return dataclasses.replace(config, warnings=(*config.warnings, *alignment.warnings)), alignment
 
 
 def _aligned(
-    inputs: tuple[Path, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any], err: Console
+    inputs: tuple[Path, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any]
 ) -> tuple[RunConfig, Alignment, tuple[str, ...], Mapping[str, FrameCounts]]:
     """The configuration of the inputs, the alignment of its robots, and warnings and counts of the logs."""
     from octoreplay.config.frames_file import load_frames_file
@@ -157,7 +161,7 @@ def _aligned(
             raise ConfigError(f"{inputs[0]}: holds finished maps; leave out {_option(given)}, or name its logs")
         return (*_aligned_result(inputs[0], dof, guesses), (), {})
     with LogSurveys() as surveys:
-        config = base_config(inputs, None, err, surveys)
+        config = base_config(inputs, None, surveys)
         config = (config if classes is None else with_classes(config, classes)).with_parameters(given)
         check_alignable(config, guesses or {})
         resolved = discover.resolve(config.with_parameters({"strict_frames": False}), surveys)

@@ -6,8 +6,16 @@ from pathlib import Path
 
 import click
 
-from octoreplay.commands.options import check_folder, check_output, existing_path, map_option
-from octoreplay.commands.progress import progress_bar, warn
+from octoreplay.commands.console import prints, terminal
+from octoreplay.commands.options import (
+    check_new_folder,
+    check_output,
+    existing_path,
+    force_option,
+    lock_folder,
+    map_option,
+)
+from octoreplay.commands.progress import progress_bar
 from octoreplay.records import CENTRAL
 
 
@@ -20,13 +28,14 @@ from octoreplay.records import CENTRAL
 @map_option
 @click.option("--csv", type=existing_path, metavar="FILE.csv",
               help="write the scores of every map at every stored tick as CSV")  # fmt: skip
-@click.option("--json", type=existing_path, metavar="FILE.json", help="write the same scores as JSON")
 @click.option("--plot", type=existing_path, metavar="DIR",
               help="write figures of IoU, coverage, calibration and agreement into this folder")  # fmt: skip
 @click.option("--last", is_flag=True, help="evaluate only the last stored maps, which is faster")
+@force_option
+@prints
 def evaluate(
-    result: Path, truth: Path | None, against: str, map_kind: str, csv: Path | None, json: Path | None,
-    plot: Path | None, last: bool,
+    result: Path, truth: Path | None, against: str, map_kind: str, csv: Path | None, plot: Path | None,
+    last: bool,
 ) -> int:  # fmt: skip
     """Evaluate the maps of a result, over time and at the end.
 
@@ -34,39 +43,39 @@ def evaluate(
     probabilities. Without it only scores that need no ground truth: entropy, agreement with the centralised map,
     disputed labels, contradiction of the robots' evidence.
     """
+    inputs = [result, *([truth] if truth is not None else []), Path(against)]
+    if csv is not None:
+        check_output(csv, ".csv", inputs)
+    if plot is not None:
+        check_new_folder(plot)
+        lock_folder(plot)
+
     from octoreplay.evaluate.evaluation import evaluate_result, truth_beside_logs
-    from octoreplay.report import tables
-    from octoreplay.report.evaluation_files import write_evaluation
+    from octoreplay.report.evaluation_files import evaluation_content, write_evaluation
     from octoreplay.report.evaluation_plots import write_evaluation_figures
     from octoreplay.report.evaluation_tables import evaluation_tables
-    from octoreplay.result import open_result
 
-    inputs = [result, *([truth] if truth is not None else []), Path(against)]
-    for path, suffix in ((csv, ".csv"), (json, ".json")):
-        if path is not None:
-            check_output(path, suffix, inputs)
-    if plot is not None:
-        check_folder(plot)
-    out, err = tables.terminal(), tables.terminal(stderr=True)
-    with open_result(result) as opened:
-        if not opened.is_complete:
-            warn(err, f"{result}: the run was interrupted; only the maps stored before are evaluated")
+    here = terminal()
     with progress_bar("evaluate") as update:
         evaluation = evaluate_result(
             result, truth=truth, against=against, map_kind=map_kind, over_time=not last,
             progress=lambda share: update(share, None, ""),
         )  # fmt: skip
-    tables.show(out, evaluation_tables(evaluation))
-    for sentence in evaluation.warnings:
-        warn(err, sentence)
+    here.show(evaluation_tables(evaluation, is_verbose=here.is_verbose))
+    content = evaluation_content(evaluation)
+    for sentence in content.pop("warnings"):
+        here.warn(sentence)
     if truth is None:
         beside = truth_beside_logs(result)
         found = "" if beside is None else f"; found beside the logs: {beside}"
-        err.print(f"IoU, coverage and calibration need the ground truth: --truth WORLD{found}", soft_wrap=True)
-    write_evaluation(evaluation, csv_path=csv, json_path=json)
-    written = [path for path in (csv, json) if path is not None]
+        here.note(f"IoU, coverage and calibration need the ground truth: --truth WORLD{found}")
+    written: list[Path] = []
+    if csv is not None:
+        write_evaluation(evaluation, csv)
+        written.append(csv)
     if plot is not None:
         written += write_evaluation_figures(evaluation, plot)
     for path in written:
-        click.echo(f"wrote {path}")
+        here.line(f"wrote {path}")
+    here.give(**content, written=written)
     return 0

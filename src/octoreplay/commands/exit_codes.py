@@ -1,3 +1,5 @@
 """Exit codes of the commands (docs/cli.md)."""
 
-EXIT_ERROR, EXIT_USAGE, EXIT_DATA_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
+from octoreplay import interrupts
+
+EXIT_ERROR, EXIT_USAGE, EXIT_DATA_LOST, EXIT_INTERRUPTED = 1, 2, 3, interrupts.EXIT_CODE

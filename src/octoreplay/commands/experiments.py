@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from octoreplay.commands.options import existing_path
+from octoreplay.commands.console import prints, terminal
+from octoreplay.commands.options import existing_path, lock_folder
 from octoreplay.commands.progress import progress_bar, replay_bar
+from octoreplay.commands.suggestions import SuggestingGroup
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
     from octoreplay.simulate.team import SimulationConfig
 
 
-@click.group(short_help="Repeat the experiments of the documentation.")
+@click.group(cls=SuggestingGroup, short_help="Repeat the experiments of the documentation.")
 def experiment() -> None:
     """Repeat an experiment: simulate, replay, and write its figures and numbers.
 
@@ -29,28 +30,30 @@ def experiment() -> None:
 @click.option("--duration", type=float, default=300.0, show_default=True, help="length of the logs, 6 s or more [s]")
 @click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
 @click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
+@prints
 def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     """Repeat the paper's experiment and write its figures and numbers into DIR (default: octoreplay-paper).
 
     The figures show disagreement, packet sizes and maps. Takes about three minutes. Complete logs and results of the
     same settings in DIR are used again.
     """
-    from octoreplay.report import tables
+    from octoreplay.io.output_file import mark_written
     from octoreplay.report.experiment_tables import paper_table
+    from octoreplay.report.tables import made_files, number
     from octoreplay.study import paper as study
 
+    lock_folder(folder)
     simulation = study.paper_team(robots, duration, seed)
     team_file = team_with_bar(folder / study.TEAM, simulation)
     result_with_bar(study.paper_config(team_file, simulation), folder / study.RESULT)
-    click.echo("drawing figures", err=True)
+    here = terminal()
+    here.note("drawing figures")
     numbers = study.write_paper(folder, simulation)
-    out = tables.terminal()
-    tables.show(out, paper_table([vars(moment) for moment in numbers.moments]))
-    peak = tables.number(numbers.peak_total_distance)
-    out.print(
-        f"\u03a6 has its maximum {peak} at {numbers.peak_seconds:.0f} s; uniform grid / octree is"
-        f" {numbers.mean_ratio:.2f} on average over time, {numbers.least_ratio:.2f} at least\n",
-        soft_wrap=True,
+    mark_written(folder)
+    here.show(paper_table([vars(moment) for moment in numbers.moments]))
+    here.line(
+        f"\u03a6 has its maximum {number(numbers.peak_total_distance)} at {numbers.peak_seconds:.0f} s; uniform grid /"
+        f" octree is {numbers.mean_ratio:.2f} on average over time, {numbers.least_ratio:.2f} at least"
     )
     figures = folder / study.FIGURES
     made = {
@@ -62,7 +65,8 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
         folder / study.RESULT: "result, for 'octoreplay metrics', 'export' and 'query'",
         folder / study.TEAM: "logs of the robots, team file and ground truth",
     }
-    tables.show(out, tables.made_files(made))
+    here.show(made_files(made))
+    here.give(numbers=numbers, written=list(made))
     return 0
 
 
@@ -76,14 +80,15 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         jobs: int | None = None,
         scheduler: str | None = None,
     ) -> int:
-        from octoreplay.io.text_files import write_whole
-        from octoreplay.report import tables
+        from octoreplay.io.output_file import mark_written, write_whole
         from octoreplay.report.experiment_plots import figures
         from octoreplay.report.experiment_tables import answer_tables
         from octoreplay.report.figures import save_figures
+        from octoreplay.report.tables import made_files
         from octoreplay.study.experiments import run_experiment
         from octoreplay.study.questions import QUESTIONS
 
+        lock_folder(folder)
         with progress_bar(name) as update:
             found = run_experiment(
                 QUESTIONS[name](duration, villages), folder, num_jobs=jobs, scheduler=scheduler,
@@ -96,7 +101,9 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
             summary: "tables",
             **{folder / f"{plan}.csv": "numbers of every run" for plan in found},
         }
-        tables.show(tables.terminal(), tables.made_files(written))
+        mark_written(folder)
+        terminal().show(made_files(written))
+        terminal().give(written=list(written))
         return 0
 
     default = Path(f"octoreplay-{name}")
@@ -118,7 +125,7 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default: {default}). The"
         " same command continues after an interruption."
     )
-    command: Callable[..., int] = run_and_report
+    command = prints(run_and_report)
     for option in reversed(options):
         command = option(command)
     experiment.command(name, help=text, short_help=question)(command)
@@ -133,14 +140,19 @@ _add_experiment(
 _add_experiment("choose", 60.0, 2, "Compare settings for a good radio, for a poor radio and for many robots.")
 
 
-def team_with_bar(folder: Path, simulation: SimulationConfig) -> Path:
-    """Simulate a team with a progress bar, or use it again, and report which; return the team file."""
+def team_with_bar(folder: Path, simulation: SimulationConfig, *, replaces_others: bool = False) -> Path:
+    """Simulate a team with a progress bar, or use it again, and report which; return the team file.
+
+    With ``replaces_others`` a simulated team of other settings is replaced.
+    """
     from octoreplay.study.teams import is_simulated, simulated_team
 
-    exists = is_simulated(folder, simulation)
+    exists = is_simulated(folder, simulation, replaces_others=replaces_others)
     with progress_bar("simulate") as update:
-        team_file = simulated_team(folder, simulation, lambda share: update(share, None, ""))
-    click.echo(f"used the team in {folder} again" if exists else f"simulated the team in {folder}", err=True)
+        team_file = simulated_team(
+            folder, simulation, lambda share: update(share, None, ""), replaces_others=replaces_others
+        )
+    terminal().note(f"used the team in {folder} again" if exists else f"simulated the team in {folder}")
     return team_file
 
 
@@ -151,5 +163,5 @@ def result_with_bar(config: RunConfig, output: Path) -> Path:
     exists = is_replayed(config, output)
     with replay_bar() as show:
         replayed_team(config, output, show)
-    click.echo(f"used {output} again" if exists else f"wrote {output}", err=True)
+    terminal().note(f"used {output} again" if exists else f"wrote {output}")
     return output

@@ -2,53 +2,158 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
+from octoreplay.commands.suggestions import Choice
+from octoreplay.config.fields import path_problem
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, Parameter
 from octoreplay.config.presets import PRESETS
 from octoreplay.errors import ConfigError, OutputError
+from octoreplay.io.output_file import FOLDER_LOCK, locked, writing
 from octoreplay.records import MAP_KINDS, POSTERIOR
 
 _METAVARS = {"float": "NUMBER", "int": "INTEGER", "floats": "NUMBERS", "str": "WORD"}
 """Placeholders of values in ``--help``, by the kind of the parameter."""
 
-existing_path = click.Path(path_type=Path, readable=False)
+
+class _PathType(click.Path):
+    """Path of a file or folder whose name a file system can hold; it need not exist."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; refuse a name that no file can have, and a folder that must not be read."""
+        path = Path(value)
+        problem = path_problem(path)
+        if problem is None:
+            try:
+                path.exists()
+            except OSError as error:
+                problem = str(error.strerror)
+        if problem is not None:
+            self.fail(f"'{str(path)[:100]}': {problem}", param, ctx)
+        return super().convert(value, param, ctx)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Return the files with the suffixes in the parameter's placeholder, and folders; all files without any."""
+        placeholder = param.metavar or ""
+        suffixes = {*re.findall(r"\.[a-z]+\b", placeholder), *(_LOG_SUFFIXES if "LOG" in placeholder else ())}
+        start = incomplete.rpartition("/")[2]
+        folder = incomplete.removesuffix(start)
+        try:
+            entries = [entry for entry in sorted(Path(folder or ".").iterdir()) if entry.name.startswith(start)]
+        except OSError:
+            entries = []
+        files = [entry.name for entry in entries if entry.suffix.lower() in suffixes and entry.is_file()]
+        if not files:
+            # The shell completes folders itself, without a space behind them.
+            return super().shell_complete(ctx, param, incomplete)
+        folders = [f"{entry.name}/" for entry in entries if entry.is_dir()]
+        return [CompletionItem(f"{folder}{name}") for name in (*files, *folders)]
 
 
-preset_option = click.option("--preset", type=click.Choice(tuple(PRESETS)),
+_LOG_SUFFIXES = (".mcap", ".bag", ".db3")
+"""Suffixes of logs in files."""
+
+
+existing_path = _PathType(path_type=Path, readable=False)
+
+
+_UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+"""Bytes of each unit, in upper case."""
+
+
+def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
+    """Return the number of bytes of an option's text such as 500MB, 8GB or 8GiB. Raises BadParameter."""
+    if value is None:
+        return None
+    parts = re.fullmatch(r"([0-9]{1,15}(?:\.[0-9]{0,15})?) ?([A-Za-z]*)", value)
+    num_bytes = int(float(parts[1]) * _UNITS.get(parts[2].upper(), 0)) if parts else 0
+    if num_bytes < 1:
+        raise click.BadParameter(f"'{value}' is not a size such as 500MB or 8GB", ctx, param)
+    return num_bytes
+
+
+preset_option = click.option("--preset", type=Choice(tuple(PRESETS)),
                              help="named set of settings, overridden by options; paper: the paper's experiment, roam:"
                                   " the exchange of the authors' code")  # fmt: skip
-map_option = click.option("--map", "map_kind", type=click.Choice(MAP_KINDS), default=POSTERIOR, show_default=True,
+map_option = click.option("--map", "map_kind", type=Choice(MAP_KINDS), default=POSTERIOR, show_default=True,
                           help="form of the maps: posterior, h_0 + N (h - h_0), the evidence of the N robots that they"
                                " are the mean of, or this mean h")  # fmt: skip
+
+color_option = click.option(
+    "--color", default=None,
+    type=click.Choice(("label", "height", "robot", "seen-by", "disagreement", "contradiction", "probability")),
+    help="quantity shown by the colours  [default: label, or height for a map with a single class]",
+)  # fmt: skip
 
 
 class _ParameterOption(click.Option):
     """Command line option of a configuration parameter."""
 
     section = ""
+    is_common = True
+
+
+class RareOption(click.Option):
+    """Option that only --help-all shows."""
+
+    is_common = False
 
 
 class SectionedCommand(click.Command):
-    """Command whose help lists the options under the titles of the configuration's sections."""
+    """Command whose help lists the options under the titles of the configuration's sections.
+
+    ``--help`` lists the common ones, ``--help-all`` all.
+    """
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the parameters, with --help-all."""
+        return [*super().get_params(ctx), _help_all]
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, section by section."""
-        for heading, records in option_groups(self, ctx).items():
+        shows_all = ctx.meta.get(_SHOWS_ALL, False)
+        for heading, records in option_groups(self, ctx, common_only=not shows_all).items():
             with formatter.section(heading):
                 formatter.write_dl(records)
+        rest = sum(not getattr(parameter, "is_common", True) for parameter in self.params)
+        if rest and not shows_all:
+            formatter.write(f"\n{rest} more options: {ctx.command_path} --help-all\n")
 
 
-def option_groups(command: click.Command, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
-    """Return the options of a command with their help texts, by the titles of the configuration's sections."""
+_SHOWS_ALL = "octoreplay.help_all"
+"""Name of the flag of --help-all in the context of a command."""
+
+
+def _show_all(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    """Print the help with all options and end the command, if ``value``."""
+    if value and not ctx.resilient_parsing:
+        ctx.meta[_SHOWS_ALL] = True
+        click.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+_help_all = click.Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all,
+                         help="Show all options and exit.")  # fmt: skip
+
+
+def option_groups(
+    command: click.Command, ctx: click.Context, *, common_only: bool = False
+) -> dict[str, list[tuple[str, str]]]:
+    """Return the options of a command with their help texts, by the titles of the configuration's sections.
+
+    ``common_only`` leaves out those that only --help-all shows.
+    """
     groups: dict[str, list[tuple[str, str]]] = {"Options": []}
     for parameter in command.get_params(ctx):
         record = parameter.get_help_record(ctx)
-        if record is not None and isinstance(parameter, click.Option):
+        is_shown = getattr(parameter, "is_common", True) or not common_only
+        if record is not None and is_shown and isinstance(parameter, click.Option):
             section = SECTIONS.get(getattr(parameter, "section", ""))
             groups.setdefault(section.title if section else "Options", []).append(record)
     return groups
@@ -65,12 +170,12 @@ def _option(parameter: Parameter) -> _ParameterOption:
     default = "" if value in (None, ()) else f"  [default: {value}]"
     option = _ParameterOption(
         [declaration, parameter.name],
-        type=click.Choice(parameter.choices) if parameter.choices else kind,
+        type=Choice(parameter.choices) if parameter.choices else kind,
         default=None,
         help=parameter.help + default,
         metavar=None if parameter.choices else _METAVARS.get(parameter.kind),
     )
-    option.section = parameter.section
+    option.section, option.is_common = parameter.section, parameter.is_common
     return option
 
 
@@ -100,32 +205,65 @@ def numbers(name: str, text: str, count: int) -> tuple[float, ...]:
     return found
 
 
-def check_folder(path: Path) -> None:
-    """Check, before any work is done, that the path of an output folder is not a file. Raises OutputError."""
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file; name a folder")
+_FORCE = "octoreplay.force"
+"""Name of the flag of --force in the context of a command."""
 
 
-force_option = click.option("--force", is_flag=True, help="overwrite existing files")
+def _set_force(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    """Keep the flag for the checks of outputs."""
+    ctx.meta[_FORCE] = value
 
 
-def check_new(*paths: Path, force: bool) -> None:
-    """Check that outputs do not exist, unless ``force`` is set. Raises OutputError."""
-    for path in paths:
-        if path.exists() and not force:
-            raise OutputError(f"{path}: already exists; name another file, or use --force to overwrite it")
+force_option = click.option("--force", is_flag=True, expose_value=False, is_eager=True, callback=_set_force,
+                            help="overwrite existing outputs")  # fmt: skip
 
 
-def check_output(path: Path, suffix: str, inputs: Sequence[Path] = ()) -> None:
-    """Check, before any work is done, that an output file can be written and is not an input of the command.
+def _check_new(path: Path, *, is_present: bool) -> None:
+    """Raise OutputError for an output that ``is_present``, unless --force is given."""
+    if is_present and not click.get_current_context().meta.get(_FORCE, False):
+        raise OutputError(f"{path}: already exists; give another name, or use --force to overwrite it")
 
-    Raises ConfigError for a wrong suffix, OutputError otherwise.
+
+def check_new_folder(path: Path) -> None:
+    """Check, before any work is done, that an output folder is new or empty. Raises OutputError.
+
+    With --force it may hold files.
     """
-    if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: is a folder or a device; use a file name such as out{suffix}")
-    if path.suffix.lower() != suffix and not (suffix == ".yaml" and path.suffix.lower() == ".yml"):
-        raise ConfigError(f"{path}: the name of the output must end in {suffix}")
+    _check_no_file(path)
+    with writing(path):
+        is_present = path.exists() and any(entry.name != FOLDER_LOCK for entry in path.iterdir())
+    _check_new(path, is_present=is_present)
+
+
+def lock_folder(path: Path) -> None:
+    """Check that an output folder, which the command may continue, is no file, and lock it. Raises OutputError."""
+    _check_no_file(path)
+    click.get_current_context().with_resource(locked(path, is_folder=True, is_awaited=True))
+
+
+def _check_no_file(path: Path) -> None:
+    """Raise OutputError for a folder that is a file."""
+    with writing(path):
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path}: is a file; name a folder")
+
+
+def check_output(path: Path, suffix: str | Sequence[str], inputs: Sequence[Path] = (), *, is_kept: bool = True) -> None:
+    """Check, before any work is done, that an output file can be written, is new and no input, and lock it.
+
+    ``suffix`` is that of its name, or several to choose from. With --force, and without ``is_kept``, it may exist.
+    Raises ConfigError for a wrong suffix, OutputError otherwise, also where another process writes the file.
+    """
+    suffixes = [suffix] if isinstance(suffix, str) else list(suffix)
+    with writing(path):
+        is_present, is_file = path.exists(), path.is_file()
+    if is_present and not is_file:
+        raise OutputError(f"{path}: is a folder or a device; use a file name such as out{suffixes[0]}")
+    if path.suffix.lower() not in suffixes and not (".yaml" in suffixes and path.suffix.lower() == ".yml"):
+        raise ConfigError(f"{path}: the name of the output must end in {' or '.join(suffixes)}")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: cannot be written: the folder '{path.parent}' does not exist")
     if any(path.resolve() == entry.resolve() for entry in inputs):
         raise OutputError(f"{path}: is an input of this command; name another output")
+    _check_new(path, is_present=is_present and is_kept)
+    click.get_current_context().with_resource(locked(path, is_awaited=True))

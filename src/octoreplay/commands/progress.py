@@ -7,30 +7,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
+from octoreplay.commands.console import terminal
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from octoreplay.records import FrameCounts
     from octoreplay.replay.run import Progress
     from octoreplay.run_metrics import RunSummary
 
 
-def replay_with_bar(config: RunConfig, output: Path) -> RunSummary:
-    """Replay with a progress bar. An interrupt's message names the partial result."""
-    from octoreplay.io.results.result_writer import partial_path
+def replay_with_bar(config: RunConfig, output: Path, **options: Any) -> RunSummary:
+    """Replay with a progress bar; ``options`` are those of ``replay_team``."""
     from octoreplay.replay.run import replay_team
 
     with replay_bar() as show:
-        try:
-            return replay_team(config, output, progress=show)
-        except KeyboardInterrupt:
-            partial = partial_path(output)
-            kept = f"; the finished part is in {partial}" if partial.exists() else ""
-            raise KeyboardInterrupt(f"interrupted{kept}") from None
+        return replay_team(config, output, progress=show, **options)
 
 
 @contextlib.contextmanager
@@ -54,9 +45,8 @@ def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
 
     with progress_bar("simulate") as update:
         summary = simulate_team(folder, SimulationConfig(**options), lambda share: update(share, None, ""))
-    click.echo(
-        f"simulated {len(summary.logs)} robots: {summary.num_frames:,} images, {size(summary.num_bytes)} in {folder}"
-    )
+    images = f"{summary.num_frames:,} images, {size(summary.num_bytes)}"
+    terminal().line(f"simulated {len(summary.logs)} robots: {images} in {folder}")
     return summary.team_file
 
 
@@ -66,13 +56,16 @@ def _ignore(*_: object) -> None:
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, str], None]]:
-    """Progress bar on stderr if that is a terminal; gives update(finished share, replayed seconds of log, text)."""
+    """Progress bar on stderr if that is a terminal; gives update(finished share, replayed seconds of log, text).
+
+    With --quiet there is none.
+    """
     from rich import progress as bars
 
-    from octoreplay.report.tables import terminal
+    from octoreplay.report import tables
 
-    console = terminal(stderr=True)
-    if not console.is_terminal:
+    console = tables.terminal(stderr=True)
+    if not console.is_terminal or terminal().is_quiet:
         yield _ignore
         return
     columns = (
@@ -90,13 +83,19 @@ def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, s
         yield update
 
 
-def show_warnings(err: Console, summary: RunSummary, shown: Sequence[str] = ()) -> None:
-    """Print a run's warnings, except those ``shown`` before, and the data that each robot's logs lost."""
-    for sentence in summary.warnings:
-        if sentence not in shown:
-            warn(err, sentence)
-    for sentence in lost_data(summary.frame_counts):
-        warn(err, sentence)
+def show_results(summary: RunSummary, *, warnings: Sequence[str] = ()) -> dict[str, Any]:
+    """Show the tables of a run, warn of what it reports and of lost data, and return the verdict and the summary.
+
+    ``warnings`` are further sentences that the verdict counts.
+    """
+    from octoreplay.evaluate.verdict import run_verdict
+    from octoreplay.report.tables import results
+
+    here = terminal()
+    for sentence in (*summary.warnings, *lost_data(summary.frame_counts), *warnings):
+        here.warn(sentence)
+    here.show(results(summary, num_warnings=here.num_warnings, is_verbose=here.is_verbose))
+    return {"verdict": run_verdict(summary), "summary": summary}
 
 
 def lost_data(counts_by_robot: Mapping[str, FrameCounts]) -> Iterator[str]:
@@ -111,16 +110,27 @@ def lost_data(counts_by_robot: Mapping[str, FrameCounts]) -> Iterator[str]:
 def _losses(counts: FrameCounts) -> Iterator[str]:
     """Sentences on each kind of data of one robot's logs that could not be used."""
     for cause, reason in (
-        ("no_pose", "had no pose: none within pose_gap on both sides, or one outside the map's range"),
-        ("no_label", "had no labels or confidences within pair_tolerance"),
-        ("late", "were more than reorder_window late"),
+        ("no_pose", "had no pose: none within --pose-gap on both sides, or one outside the map's range"),
+        ("no_label", "had no labels or confidences within --pair-tolerance"),
+        ("late", "were more than --reorder-window late"),
         ("undecodable", "could not be read"),
     ):
         count, first = getattr(counts, cause), counts.first_missing.get(cause)
         if count:
-            yield f"{count:,} of the images or clouds {reason}" + (f"; the first: {first}" if first else "")
+            span = _span(counts, cause)
+            yield f"{count:,} of the images or clouds {reason}{span}" + (f"; the first: {first}" if first else "")
+    if "leading" in counts.first_missing:
+        yield f"images or clouds before the first mapped one: {counts.first_missing['leading']}"
+    if "late_pose" in counts.first_missing:
+        late = counts.first_missing["late_pose"]
+        yield (
+            f"poses arrived after the images or clouds that needed them, such as {late}; a larger --reorder-window "
+            f"waits for them, or name another pose source for that time"
+        )
     if counts.duplicate:
-        yield f"{counts.duplicate:,} images or clouds had the same stamp as another one and were skipped"
+        span = _span(counts, "duplicate")
+        yield f"{counts.duplicate:,} images or clouds had the same stamp as another one and were skipped{span}"
+    yield from _other_losses(counts)
     for kind, numbers, spelling in (
         ("labels", counts.unknown_label_pixels, "{}"),
         ("colours", counts.unknown_colors, "#{:06x}"),
@@ -129,11 +139,31 @@ def _losses(counts: FrameCounts) -> Iterator[str]:
             shown = ", ".join(spelling.format(number) for number in sorted(numbers)[:8])
             more = ", ..." if len(numbers) > 8 else ""
             total = sum(numbers.values())
-            yield f"{total:,} pixels or points with {kind} without a class were ignored: {shown}{more}"
+            what = f"{total:,} pixels or points with {kind} without a class were ignored"
+            yield f"{what}: {shown}{more}; --classes gives them one"
 
 
-def warn(err: Console, sentence: str) -> None:
-    """Print one warning."""
-    from rich.text import Text
+def _span(counts: FrameCounts, cause: str, topic: str | None = None) -> str:
+    """Clause on the first and last stamp of the messages of a cause; empty in results without them."""
+    span = counts.spans.get(topic or counts.sensor_topic, {}).get(cause)
+    if span is None:
+        return ""
+    kind = "log times" if cause in _CAUSES_WITHOUT_STAMP else "stamps"
+    return f" ({kind} {span[0] / 1e9:.3f} s to {span[1] / 1e9:.3f} s)"
 
-    err.print(Text.assemble(("warning: ", "yellow"), sentence), soft_wrap=True)
+
+def _other_losses(counts: FrameCounts) -> Iterator[str]:
+    """Sentences on poses and labels that could not be used, and on messages that are not accounted for."""
+    for topic, outcomes in counts.messages.items():
+        for cause, reason in _CAUSES_WITHOUT_STAMP.items():
+            if topic != counts.sensor_topic and cause in outcomes:
+                yield f"{outcomes[cause]:,} messages of '{topic}' {reason}{_span(counts, cause, topic)}"
+    for topic, number in counts.unaccounted.items():
+        yield f"{number:,} messages of '{topic}' are not accounted for; please report this as a defect of octoreplay"
+
+
+_CAUSES_WITHOUT_STAMP = {
+    "undecodable": "could not be read",
+    "unusable": "held no pose of finite numbers with a rotation",
+}
+"""Causes for which a message has no usable stamp, and their reasons."""

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from octoreplay import interrupts
+from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import check_folder, check_new, check_output, existing_path, force_option, numbers
-from octoreplay.commands.progress import lost_data, progress_bar, warn
+from octoreplay.commands.options import check_new_folder, check_output, existing_path, force_option, numbers
+from octoreplay.commands.progress import lost_data, progress_bar
 from octoreplay.commands.team_options import is_team_file, save_team_file
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.errors import OutputError
 
 if TYPE_CHECKING:
     from octoreplay.replay.refinement import Refinement, RobotTrajectory
@@ -37,9 +36,10 @@ if TYPE_CHECKING:
               help="folder with the true trajectories ROBOT.tum, to show the errors")  # fmt: skip
 @click.option("--plot", type=existing_path, metavar="FILE.png", help="write a figure of the trajectories")
 @force_option
+@prints
 def refine(
     team: Path, output: Path, drift: str, frame_sigma: str, submap_seconds: float, hold_back: int, truth: Path | None,
-    plot: Path | None, force: bool,
+    plot: Path | None,
 ) -> int:  # fmt: skip
     """Repair the drift of a team's poses, and write a team file with the corrected trajectories.
 
@@ -52,12 +52,12 @@ def refine(
     from octoreplay.io.robots import discover
     from octoreplay.registration.drift import DriftModel
     from octoreplay.replay.refinement import RefinementConfig, refine_team
-    from octoreplay.report import refinement_report, tables
+    from octoreplay.report import refinement_report
 
     if not is_team_file([team]):
         raise click.UsageError(f"{team}: is no team file; write one with octoreplay init, then octoreplay align")
     poses = output.with_name(f"{output.stem}-poses")
-    _check_outputs(team, output, poses, plot, force=force)
+    _check_outputs(team, output, poses, plot)
     model = DriftModel(*numbers("drift", drift, 2), *numbers("frame_sigma", frame_sigma, 2))
     settings = RefinementConfig(submap_seconds, hold_back, model)
     config = load_team_file(team)
@@ -65,68 +65,58 @@ def refine(
     with progress_bar("refine") as update:
         refinement = refine_team(discover.resolve(config), settings, progress=lambda share: update(share, None, ""))
     errors = None if true is None else trajectory_errors(refinement.trajectories, true)
-    out, err = tables.terminal(), tables.terminal(stderr=True)
-    tables.show(out, refinement_report.refinement_table(refinement, errors))
-    out.print(
+    here = terminal()
+    here.show(refinement_report.refinement_table(refinement, errors))
+    here.line(
         f"{refinement.num_submaps} submaps, {refinement.num_edges} registrations accepted,"
-        f" {refinement.num_rejected} rejected", soft_wrap=True,
-    )  # fmt: skip
+        f" {refinement.num_rejected} rejected"
+    )
     for sentence in lost_data(refinement.frame_counts):
-        warn(err, sentence)
+        here.warn(sentence)
     _write(config, refinement, output, poses)
-    out.print(f"wrote {output}", soft_wrap=True)
+    written = [output]
     if plot is not None:
         refinement_report.write_trajectory_figure(refinement, plot)
-        out.print(f"wrote {plot}", soft_wrap=True)
+        written.append(plot)
+    for path in written:
+        here.line(f"wrote {path}")
+    here.give(**refinement_report.refinement_content(refinement, errors), written=written)
     return EXIT_DATA_LOST if refinement.lost_data else 0
 
 
-def _check_outputs(team: Path, output: Path, poses: Path, plot: Path | None, *, force: bool) -> None:
+def _check_outputs(team: Path, output: Path, poses: Path, plot: Path | None) -> None:
     """Check, before any work is done, that the outputs can be written."""
     check_output(output, ".yaml", [team])
-    check_folder(poses)
+    check_new_folder(poses)
     if plot is not None:
         check_output(plot, ".png")
-    check_new(output, poses, force=force)
 
 
 def _write(config: RunConfig, refinement: Refinement, output: Path, folder: Path) -> None:
     """Write the trajectories of the corrected robots, then the team file that names them."""
     from octoreplay.io.datasets.pose_files import write_tum
+    from octoreplay.io.output_file import new_folder
 
-    partial = folder.with_name(f"{folder.name}.partial")
     corrected = {trajectory.robot_id: trajectory for trajectory in refinement.trajectories if trajectory.is_accepted}
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        if corrected:
-            partial.mkdir()
-        for robot_id, trajectory in corrected.items():
-            write_tum(partial / f"{robot_id}.tum", trajectory.stamps_ns, trajectory.map_poses)
-        if folder.exists():
-            shutil.rmtree(folder)
-        if corrected:
-            partial.replace(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(partial, ignore_errors=True)
     robots = tuple(
         _with_trajectory(robot, corrected[robot.robot_id], folder) if robot.robot_id in corrected else robot
         for robot in config.robots
     )
-    save_team_file(dataclasses.replace(config, robots=robots), output)
+    with new_folder(folder) as new:
+        for robot_id, trajectory in corrected.items():
+            write_tum(new.path / f"{robot_id}.tum", trajectory.stamps_ns, trajectory.map_poses)
+        # Both or none: a team file must not name the trajectories of another run.
+        with interrupts.deferred():
+            new.put()
+            save_team_file(dataclasses.replace(config, robots=robots), output)
 
 
 def _with_trajectory(robot: RobotConfig, trajectory: RobotTrajectory, folder: Path) -> RobotConfig:
-    """Return a robot with its corrected trajectory."""
-    return dataclasses.replace(
-        robot,
-        pose_topic=None,
-        pose_times=None,
-        pose_file=folder / f"{robot.robot_id}.tum",
-        T_body_sensor=trajectory.T_body_sensor,
-        T_team_map=trajectory.T_team_map,
-        T_team_map_sigma=None,
-        T_team_map_from="refined",
+    """Return a robot with its corrected trajectory, or with a corrected frame where its sensor stands still."""
+    robot = dataclasses.replace(
+        robot, T_team_map=trajectory.T_team_map, T_team_map_sigma=None, T_team_map_from="refined"
     )
+    if robot.pose is not None:
+        return robot
+    robot = robot.with_poses(pose_file=folder / f"{robot.robot_id}.tum", pose_format="tum")
+    return dataclasses.replace(robot, T_body_sensor=trajectory.T_body_sensor)

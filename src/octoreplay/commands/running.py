@@ -9,16 +9,35 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from octoreplay.commands.aligning import aligned_run, dof_option
+from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import SectionedCommand, check_output, existing_path, preset_option, with_parameters
-from octoreplay.commands.progress import replay_with_bar, show_warnings, simulate_with_bar, warn
-from octoreplay.commands.team_options import base_config, is_team_file, save_team_file, with_network
+from octoreplay.commands.options import (
+    RareOption,
+    SectionedCommand,
+    check_output,
+    existing_path,
+    force_option,
+    lock_folder,
+    numbers,
+    parse_size,
+    preset_option,
+    with_parameters,
+)
+from octoreplay.commands.progress import replay_with_bar, show_results, simulate_with_bar
+from octoreplay.commands.suggestions import Choice
+from octoreplay.commands.team_options import (
+    base_config,
+    is_team_file,
+    save_team_file,
+    static_pose_option,
+    with_network,
+)
 from octoreplay.config.alignment import ON_AIR
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.presets import with_options
-from octoreplay.errors import ConfigError
+from octoreplay.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from octoreplay.config.resolved import ResolvedRun
@@ -68,75 +87,118 @@ def _check_input(word: str) -> None:
 @click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="result to write")
 @click.option("--config-from", type=existing_path, metavar="RESULT.mcap",
               help="use the logs and settings stored in this result, instead of TEAM.yaml or LOG")  # fmt: skip
+@click.option("--resume", is_flag=True,
+              help="continue an interrupted run after its last check point; ends with the same bytes")  # fmt: skip
+@click.option("--restart", cls=RareOption, is_flag=True,
+              help="remove the unfinished result that an earlier run left, and start from the beginning")  # fmt: skip
+@click.option("--checkpoint-every", cls=RareOption, type=click.FloatRange(min=0.0), metavar="SECONDS",
+              help="least time between check points, 0 for none  [default: at most 3 % of the run's time]")  # fmt: skip
+@click.option("--memory-limit", cls=RareOption, callback=parse_size, metavar="SIZE",
+              help="end the run above this memory, such as 8GB; --resume continues it")  # fmt: skip
+@click.option("--report", type=existing_path, metavar="PAGE.html",
+              help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
               help="write robots, topics and settings to this team file")  # fmt: skip
 @preset_option
-@click.option("--edges", metavar="A:B[:W],...",
+@click.option("--edges", cls=RareOption, metavar="A:B[:W],...",
               help="edge list of the communication graph; give a weight W for all edges or for none")  # fmt: skip
-@click.option("--one-way", metavar="A:B,...", help="links that carry packets from A to B only")
-@click.option("--schedule", type=existing_path, metavar="FILE.yaml",
+@click.option("--one-way", cls=RareOption, metavar="A:B,...", help="links that carry packets from A to B only")
+@click.option("--schedule", cls=RareOption, type=existing_path, metavar="FILE.yaml",
               help="schedule of failures of robots and links (docs/communication.md)")  # fmt: skip
-@click.option("--align", type=click.Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
+@click.option("--align", type=Choice(_ALIGN_VALUES), metavar="[before|on-air|off]",
               help=f"{PARAMETERS['align'].help}; before, also without a value: find the frames first, as 'octoreplay"
               " align' does, and leave other robots out")  # fmt: skip
-@dof_option
+@dof_option(RareOption)
+@static_pose_option
 @click.option("--classes", metavar="NAME|FILE",
               help=f"class table that gives the meaning of labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
+@force_option
+@prints
 def run(
-    inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, save_team: Path | None,
+    inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
+    checkpoint_every: float | None, memory_limit: int | None, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
-    dof: str | None, classes: str | None, **parameters: Any,
+    dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Replay a team's logs into semantic octree maps and run a distributed consensus on them.
 
     The input is a team file, or logs (MCAP, ROS 1 bags, rosbag2 folders) in which robots and topics are detected. What
     is detected is shown, and --save-team writes it to a team file.
     """
-    from octoreplay.io.robots import discover
-    from octoreplay.io.robots.survey import LogSurveys
-    from octoreplay.report import tables
-
     if output is None and save_team is None:
         raise click.UsageError("name the result with -o OUT.mcap (or use --save-team TEAM.yaml to stop before the run)")
     if dof is not None and align != _BEFORE:
         raise click.UsageError(
             "--dof needs --align" + ("; robots that align on air know their vertical axes" if align == ON_AIR else "")
         )
+    if resume and restart:
+        raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
     if output is not None:
-        check_output(output, ".mcap")
+        _check_result(output, config_from, resume=resume, restart=restart)
+    if report is not None:
+        check_output(report, ".html")
     if save_team is not None:
         check_output(save_team, ".yaml", inputs)
-    out, err = tables.terminal(), tables.terminal(stderr=True)
+
+    from octoreplay.io.robots import discover
+    from octoreplay.io.robots.survey import LogSurveys
+    from octoreplay.report.log_tables import chosen_inputs, class_list
+    from octoreplay.report.tables import size
+
+    here = terminal()
     given = {name: value for name, value in parameters.items() if value is not None}
     if align is not None:
         given["align"] = "off" if align == _BEFORE else align
     with LogSurveys() as surveys:
-        base = base_config(inputs, config_from, err, surveys)
+        base = base_config(inputs, config_from, surveys, static_poses)
         base = base if classes is None else with_classes(base, classes)
         chosen = with_network(with_options(base, preset, edges, given), one_way, schedule)
         if align == _BEFORE:
-            config, alignment = aligned_run(chosen, int(dof or 4), surveys, out)
+            config, alignment = aligned_run(chosen, int(dof or 4), surveys)
         else:
             config, alignment = discover.resolve(chosen, surveys), None
+    for sentence in config.warnings:
+        here.warn(sentence)
     if config_from is None and not is_team_file(inputs):
-        tables.show(out, tables.chosen_inputs(config))
-        tables.show(out, tables.class_list(config.classes))
+        here.show(chosen_inputs(config), class_list(config.classes))
     else:
         for line in _found_frames(base, config):
-            out.print(line, soft_wrap=True)
-    for sentence in config.warnings:
-        warn(err, sentence)
+            here.line(line)
     if save_team is not None:
         save_team_file(config, save_team)
-        out.print(f"saved {save_team}", soft_wrap=True)
+        here.line(f"saved {save_team}")
+        here.give(team_file=save_team)
     if output is None:
         return 0
-    summary = replay_with_bar(config, output)
-    tables.show(out, tables.results(summary))
-    show_warnings(err, summary, shown=config.warnings)
-    out.print(f"wrote {output} ({tables.size(output.stat().st_size)})", soft_wrap=True)
+    summary = replay_with_bar(
+        config, output, restart=restart, resume=resume, checkpoint_every=checkpoint_every, memory_limit=memory_limit
+    )
+    document = show_results(summary)
+    here.line(f"wrote {output} ({size(output.stat().st_size)})")
+    if report is not None:
+        from octoreplay.report.page.page import write_page
+
+        here.line(f"wrote {report} ({size(write_page(output, report))})")
+    here.give(result=output, team_file=save_team, report=report, **document)
     is_whole = summary.last.num_components == 1 and (alignment is None or alignment.is_whole)
     return EXIT_DATA_LOST if summary.lost_data or not is_whole else 0
+
+
+def _check_result(output: Path, config_from: Path | None, *, resume: bool, restart: bool) -> None:
+    """Check the path of the result, and of the unfinished result of an earlier run that this run must not remove.
+
+    A run that continues may replace the result, as the interrupted one. Raises OutputError.
+    """
+    from octoreplay.io.results.result_writer import check_unstarted, partial_path
+    from octoreplay.replay.checkpoint import can_resume
+
+    continues = resume and can_resume(output)
+    check_output(output, ".mcap", is_kept=not continues)
+    if not resume and not restart:
+        check_unstarted(output)
+        return
+    if not continues and config_from is not None and config_from.resolve() == partial_path(output).resolve():
+        raise OutputError(f"{config_from}: this run would remove this result of --config-from; name another output")
 
 
 def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
@@ -172,19 +234,30 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
               help="write a position fix (GPS) each second, with this standard deviation [m]")  # fmt: skip
 @click.option("--kinds-per-class", type=int, default=1, show_default=True,
               help="divide each of the eight classes into this many classes")  # fmt: skip
+@click.option("--colour", type=Choice(("raw", "jpeg", "png")), default=None,
+              help="write colour images with light, shadow and noise in this form")  # fmt: skip
+@click.option("--colour-offset", default="0,0,0", show_default=True, metavar="X,Y,Z",
+              help="position of the colour camera in the depth camera's frame; 0,0,0: aligned [m]")  # fmt: skip
+@click.option("--no-labels", is_flag=True, help="write no label images and no class names")
 @click.option("--world-size", type=float, default=70.0, show_default=True, help="edge length of the square village [m]")
-def simulate(folder: Path, robots: int, image: str, odometry_drift: str, **options: Any) -> int:
+@prints
+def simulate(
+    folder: Path, robots: int, image: str, odometry_drift: str, colour_offset: str, no_labels: bool, **options: Any
+) -> int:
     """Simulate a team that explores a village and write its logs into DIR.
 
     Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply; with own frames or drift
     also frames.yaml and truth/ROBOT.tum). Equal options give equal bytes.
     """
-    values = {"num_robots": robots, "image": _image_size(image), "odometry_drift": _drift(odometry_drift)}
+    values = {
+        "num_robots": robots, "image": _image_size(image), "odometry_drift": _drift(odometry_drift),
+        "colour_offset": numbers("colour_offset", colour_offset, 3), "has_labels": not no_labels,
+    }  # fmt: skip
+    lock_folder(folder)
     team_file = simulate_with_bar(folder, {**values, **options})
-    if options["own_frames"]:
-        click.echo(f"next: octoreplay align {team_file} -o {folder / 'aligned.yaml'}")
-    else:
-        click.echo(f"next: octoreplay run {team_file} -o {folder / 'result.mcap'}")
+    command, suffix = ("align", "aligned.yaml") if options["own_frames"] else ("run", "result.mcap")
+    terminal().line(f"next: octoreplay {command} {team_file} -o {folder / suffix}")
+    terminal().give(team_file=team_file)
     return 0
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR
-from octoreplay.commands.options import SectionedCommand, existing_path, preset_option, with_parameters
-from octoreplay.commands.progress import progress_bar, warn
+from octoreplay.commands.options import SectionedCommand, existing_path, lock_folder, preset_option, with_parameters
+from octoreplay.commands.progress import progress_bar
 
 if TYPE_CHECKING:
     from octoreplay.study.sweep import Sweep, SweepProgress
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 @click.option("--scheduler", metavar="tcp://HOST:PORT",
               help="address of a dask scheduler; runs are executed on its workers instead of this machine")  # fmt: skip
 @preset_option
+@prints
 def sweep(
     teams: tuple[Path, ...], output: Path, vary: tuple[str, ...], seeds: int | None, truth: Path | None, keep: bool,
     jobs: int | None, threads: int, scheduler: str | None, preset: str | None, **parameters: Any,
@@ -44,7 +46,8 @@ def sweep(
     Runs that are already finished in DIR are not repeated, so the same command continues after an interruption. A
     failed run does not stop the others.
     """
-    from octoreplay.report import tables
+    lock_folder(output)
+
     from octoreplay.study.sweep import run_sweep
 
     with progress_bar("sweep") as update:
@@ -56,11 +59,13 @@ def sweep(
             teams, vary, output, settings={**parameters, "preset": preset}, num_seeds=seeds, truth=truth, keep=keep,
             num_jobs=jobs, num_threads=threads, scheduler=scheduler, progress=show,
         )  # fmt: skip
-    out = tables.terminal()
+    here = terminal()
     earlier = f", {done.num_earlier} of them before" if done.num_earlier else ""
     for sentence in done.warnings:
-        warn(tables.terminal(stderr=True), sentence)
-    out.print(f"wrote {done.table} ({len(done.rows)} runs{earlier}), figures in {output / 'figures'}", soft_wrap=True)
+        here.warn(sentence)
+    here.line(f"wrote {done.table} ({len(done.rows)} runs{earlier}), figures in {output / 'figures'}")
+    here.give(table=done.table, num_runs=len(done.rows), num_failed=len(done.failed), lost_data=done.lost_data,
+              runs=done.rows)  # fmt: skip
     return _end(done)
 
 
@@ -78,7 +83,7 @@ def _end(done: Sweep) -> int:
     """Report the failed runs and return the exit code."""
     names = ("team", *done.names, "seed")
     for row in done.failed:
-        click.echo(f"failed: {', '.join(f'{name}={row[name]}' for name in names)}: {row['error']}", err=True)
+        terminal().warn(f"failed: {', '.join(f'{name}={row[name]}' for name in names)}: {row['error']}")
     if done.failed:
         return EXIT_ERROR
     return EXIT_DATA_LOST if done.lost_data else 0

@@ -8,12 +8,10 @@ from typing import Any
 
 import click
 
+from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_ERROR
-from octoreplay.commands.options import check_output, existing_path, map_option
+from octoreplay.commands.options import existing_path, map_option
 from octoreplay.evaluate.checks import LIMITS, check_result
-
-_json_option = click.option("--json", "json_file", type=existing_path, metavar="FILE.json",
-                            help="write the table as JSON")  # fmt: skip
 
 
 def _with_limits(command: Callable[..., int]) -> Callable[..., int]:
@@ -31,27 +29,21 @@ def _with_limits(command: Callable[..., int]) -> Callable[..., int]:
 @click.option("--truth", type=existing_path, metavar="WORLD",
               help="ground truth for limits that need it: world.npz, its folder, or a labelled PLY file")  # fmt: skip
 @map_option
-@_json_option
-def check(
-    result: Path, settled: bool, truth: Path | None, map_kind: str, json_file: Path | None, **options: float | None
-) -> int:
+@prints
+def check(result: Path, settled: bool, truth: Path | None, map_kind: str, **options: float | None) -> int:
     """Check a result against limits, for continuous integration.
 
     Exit code 0 if all limits hold, 1 if one is violated. The result of an interrupted run fails.
     """
-    from octoreplay.io.text_files import json_text, write_whole
-    from octoreplay.report import tables, verdict_tables
+    from octoreplay.report import verdict_tables
 
     limits = {name: limit for name, limit in options.items() if limit is not None}
-    if json_file is not None:
-        check_output(json_file, ".json", [result])
     rows = check_result(result, limits, settled=settled, truth=truth, map_kind=map_kind)
     passed = all(row.passed for row in rows)
-    if json_file is not None:
-        write_whole(json_file, json_text({"result": result, "passed": passed, "rows": rows}))
-    out = tables.terminal()
-    tables.show(out, verdict_tables.check_rows(rows))
-    out.print(verdict_tables.check_verdict(rows), soft_wrap=True)
+    here = terminal()
+    here.show(verdict_tables.check_rows(rows))
+    here.line(verdict_tables.check_verdict(rows))
+    here.give(result=result, passed=passed, rows=rows)
     return 0 if passed else EXIT_ERROR
 
 
@@ -63,22 +55,18 @@ def check(
               help="time of the maps since each run's start [s]  [default: the end]")  # fmt: skip
 @click.option("--tolerance", type=float, default=0.0, show_default=True,
               help="largest difference of log-odds that counts as equal")  # fmt: skip
-@_json_option
-def compare(a: Path, b: Path, json_file: Path | None, **options: Any) -> int:
+@prints
+def compare(a: Path, b: Path, **options: Any) -> int:
     """Compare the maps of two results and show where and by how much they differ.
 
     Exit code 0 if all maps are equal, 1 otherwise.
     """
     from octoreplay.evaluate.comparison import compare_results
-    from octoreplay.io.text_files import json_text, write_whole
-    from octoreplay.report import tables, verdict_tables
+    from octoreplay.report import verdict_tables
 
-    if json_file is not None:
-        check_output(json_file, ".json", [a, b])
     comparison = compare_results(a, b, **options)
-    if json_file is not None:
-        write_whole(json_file, json_text(comparison))
-    out = tables.terminal()
-    tables.show(out, *verdict_tables.comparison(comparison))
-    out.print(verdict_tables.comparison_verdict(comparison), soft_wrap=True)
+    here = terminal()
+    here.show(*verdict_tables.comparison(comparison, is_verbose=here.is_verbose))
+    here.line(verdict_tables.comparison_verdict(comparison))
+    here.give(**vars(comparison))
     return 0 if comparison.is_same else EXIT_ERROR

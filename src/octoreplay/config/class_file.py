@@ -10,7 +10,7 @@ from typing import Any
 from octoreplay.config.class_tables.edits import Merges, edited
 from octoreplay.config.class_tables.label_rows import BUILT_IN, built_in_rows, hydra_rows, kimera_rows, table_of_rows
 from octoreplay.config.class_tables.palette import PALETTE
-from octoreplay.config.fields import is_number
+from octoreplay.config.fields import is_number, path_problem
 from octoreplay.config.run import RunConfig
 from octoreplay.config.yaml_file import load_yaml, read_text
 from octoreplay.errors import ConfigError, suggestion
@@ -30,6 +30,14 @@ def with_classes(config: RunConfig, name: str) -> RunConfig:
     if "classes" not in settings and config.classes is not None:
         settings = {"classes": edited(config.classes, settings["merge_classes"], settings["ignore_hits"])}
     return dataclasses.replace(config, **{"merge_classes": (), "ignore_hits": (), **settings})
+
+
+def named_class_table(name: str) -> ClassTable:
+    """Return the class table of a built-in name or a file. Raises ConfigError, also for a file without 'classes'."""
+    table: ClassTable | None = _named_classes(name, Path()).get("classes")
+    if table is None:
+        raise ConfigError(f"{name}: the file has no key 'classes'")
+    return table
 
 
 def class_settings(content: Mapping[str, Any], folder: Path, files: tuple[Path, ...] = ()) -> dict[str, Any]:
@@ -61,7 +69,7 @@ def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dic
     if name in BUILT_IN:
         return {"classes": table_of_rows(built_in_rows(name), PALETTE)}
     path = folder / name
-    if not _is_file(path):
+    if path_problem(path) is not None or not path.is_file():
         near = suggestion(name.lower(), BUILT_IN)
         raise ConfigError(f"classes: '{name}' is neither a file nor a built-in table ({', '.join(BUILT_IN)}){near}")
     if path.resolve() in files:
@@ -87,14 +95,6 @@ def _named_classes(name: str, folder: Path, files: tuple[Path, ...] = ()) -> dic
         return class_settings(content, path.parent, (*files, path.resolve()))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-
-
-def _is_file(path: Path) -> bool:
-    """True for a file; False also for an invalid file name."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def _merges(entries: Any) -> Merges:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from octoreplay.config.fields import SMALLEST, check_ranges, parameter
+from octoreplay.config.fields import MAX_TICKS, SMALLEST, check_ranges, parameter
 from octoreplay.config.rules import RULES, Rule
 from octoreplay.errors import ConfigError
 
@@ -25,6 +25,7 @@ class ConsensusConfig:
         " gradient), ratio and flood (exact in spite of lost packets), merge (baseline that counts evidence"
         " repeatedly), local (no exchange)",
         choices=tuple(RULES),
+        is_common=True,
     )
     evidence: str = parameter(
         "sum",
@@ -40,7 +41,10 @@ class ConsensusConfig:
     )
     gamma: float = parameter(0.5, "gradient step size, for the rules gradient and natural", minimum=0.0)
     gamma_power: float = parameter(
-        0.0, "exponent of gamma's decay: gamma_k = gamma / (1 + k / gamma_decay)^gamma_power (0: constant)", minimum=0.0
+        0.0,
+        "exponent of gamma's decay: gamma_k = gamma / (1 + k / gamma_decay)^gamma_power (0: constant)",
+        minimum=0.0,
+        maximum=10.0,
     )
     gamma_decay: float = parameter(1.0, "time constant of gamma's decay [iterations]", above=0.0)
     gamma_per_arrival: str = parameter(
@@ -83,13 +87,20 @@ class ConsensusConfig:
         minimum=0,
     )
     settle: int = parameter(
-        20, "ticks over which gamma ramps to 0 after the end of the logs (0: no settling)", minimum=0
+        20,
+        "ticks over which gamma ramps to 0 after the end of the logs (0: no settling)",
+        minimum=0,
+        maximum=MAX_TICKS,
+        is_common=True,
     )
     settle_tolerance: float = parameter(
         1e-6, "settling ends when no log-odds changes by this much in a tick", above=0.0
     )
     settle_max: int | None = parameter(
-        None, "maximum number of settling ticks (default: derived from the graph's convergence rate)", minimum=1
+        None,
+        "maximum number of settling ticks (default: derived from the graph's convergence rate)",
+        minimum=1,
+        maximum=MAX_TICKS,
     )
 
     def __post_init__(self) -> None:

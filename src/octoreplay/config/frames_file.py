@@ -9,11 +9,12 @@ from typing import Any
 from octoreplay.config.fields import as_number, transform_problem
 from octoreplay.config.yaml_file import dump_yaml, load_yaml, read_text
 from octoreplay.errors import ConfigError
+from octoreplay.records import FilePath
 
 _KEY = "T_team_map"
 
 
-def load_frames_file(path: str | Path) -> dict[str, tuple[float, ...]]:
+def load_frames_file(path: FilePath) -> dict[str, tuple[float, ...]]:
     """Read a frames file, such as the ``frames.yaml`` of a simulated team with ``own_frames``.
 
     Returns T_team_map by robot id, as in team files: the transform from the robot's map frame to the team's frame,

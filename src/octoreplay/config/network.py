@@ -51,6 +51,7 @@ class NetworkConfig:
         "communication graph: complete, ring, line, star, grid, nearest (neighbours), range (radio range), random"
         " (Erdos-Renyi) or edges (edge list)",
         choices=TOPOLOGIES,
+        is_common=True,
     )
     edges: tuple[tuple[str, str, float | None], ...] = field(default=())
     one_way: tuple[tuple[str, str], ...] = field(default=())
@@ -68,7 +69,11 @@ class NetworkConfig:
         choices=WEIGHTS,
     )
     publish_period: float = parameter(
-        1.0, "period between a robot's published maps, the length of a tick [s]", above=0.0, maximum=86_400.0
+        1.0,
+        "period between a robot's published maps, the length of a tick [s]",
+        above=0.0,
+        maximum=86_400.0,
+        is_common=True,
     )
     after_end: str = parameter(
         "stay", "after its last scan a robot keeps exchanging maps (stay) or not (leave)", choices=("stay", "leave")
@@ -105,7 +110,9 @@ class LinkConfig:
     jitter: float = parameter(
         0.0, "largest deviation from the mean packet delay, uniformly distributed [s]", minimum=0.0
     )
-    loss: float = parameter(0.0, "probability that a packet is lost, outside bursts", minimum=0.0, maximum=1.0)
+    loss: float = parameter(
+        0.0, "probability that a packet is lost, outside bursts", minimum=0.0, maximum=1.0, is_common=True
+    )
     burst_start: float = parameter(
         0.0, "probability per packet that a burst of losses starts (Gilbert-Elliott model)", minimum=0.0, maximum=1.0
     )

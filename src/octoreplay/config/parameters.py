@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -21,7 +22,7 @@ from octoreplay.errors import ConfigError, suggestion
 
 @dataclass(frozen=True)
 class Parameter:
-    """One flat parameter: name, section, type, default, help text and choices."""
+    """One flat parameter: name, section, type, default, help text, choices, and whether ``--help`` shows it."""
 
     name: str
     section: str
@@ -29,12 +30,19 @@ class Parameter:
     default: Any
     help: str
     choices: tuple[str, ...] | None
+    is_common: bool
+
+    @property
+    def unit(self) -> str:
+        """Unit, as the help text gives it in brackets; empty without one."""
+        found = re.search(r"\[([^]]+)]", self.help)
+        return found[1] if found else ""
 
     def coerce(self, value: Any) -> Any:
         """Value in the parameter's type. Raises ConfigError for another type."""
         try:
             return self._coerce(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             expected = {"float": "a number", "int": "a whole number", "bool": "true or false", "str": "a word",
                         "floats": "numbers"}[self.kind]  # fmt: skip
             raise ConfigError(f"{self.name}: expects {expected}, got {value!r}") from None
@@ -92,7 +100,7 @@ def _parameters() -> Iterator[Parameter]:
             if item.metadata:
                 yield Parameter(
                     item.name, name, kinds[str(item.type)], item.default, item.metadata["help"],
-                    item.metadata["choices"],
+                    item.metadata["choices"], item.metadata["is_common"],
                 )  # fmt: skip
 
 

@@ -62,10 +62,10 @@ class ResolvedRobot(RobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.depth_topic or self.cloud_topic):
+        if not (self.depth_topic or self.cloud_topic or self.sensors):
             raise ConfigError(f"robot '{self.robot_id}': needs a depth_topic or cloud_topic")
-        if not (self.pose_topic or self.pose_file):
-            raise ConfigError(f"robot '{self.robot_id}': needs a pose_topic or pose_file")
+        if not self.has_poses:
+            raise ConfigError(f"robot '{self.robot_id}': needs a pose_topic, pose_file or pose")
 
     @classmethod
     def from_config(cls, robot: RobotConfig, span_ns: tuple[int, int] | None, frame: MapFrame | None = None) -> Self:
@@ -78,8 +78,9 @@ class ResolvedRobot(RobotConfig):
 
     @property
     def sensor_topic(self) -> str:
-        """Topic that the map is made from: ``depth_topic`` or ``cloud_topic``."""
-        return str(self.depth_topic or self.cloud_topic)
+        """Topic that the map is made from: ``depth_topic`` or ``cloud_topic``, of several sensors the first one's."""
+        first = self.sensors[0] if self.sensors else self
+        return str(first.depth_topic or first.cloud_topic)
 
     @property
     def clock_offset_ns(self) -> int:
@@ -102,7 +103,7 @@ class ResolvedRun(RunConfig):
     """Run configuration whose robots are resolved and whose class table is known.
 
     ``merge_classes`` and ``ignore_hits`` are empty: they are part of ``classes`` already. ``warnings`` are sentences on
-    frames and clocks of the robots that do not fit together. Changed parameters (``with_parameters``,
+    frames, clocks and classes that do not fit together. Changed parameters (``with_parameters``,
     ``dataclasses.replace``) keep the resolution.
     """
 

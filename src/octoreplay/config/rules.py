@@ -112,7 +112,8 @@ _RULES = (
         mixes_differences=False,
         map_is_mean=False,
         keeps_last_evidence=True,
-        warning="rule 'merge' counts received evidence again in every tick; it is a baseline, not a map to trust",
+        warning="rule 'merge' counts received evidence again in every tick; it is a baseline, not a map to trust;"
+        " --rule bayes counts it once",
     ),
     Rule(name="local", exchanges=Exchanged.NOTHING, map_is_mean=False),
 )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,6 +25,10 @@ from octoreplay.config.sensor import MapConfig, SensorConfig, rounded_sensor
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import ConfigError
 from octoreplay.records import ClassTable
+
+MAX_ROBOTS = 1_000
+"""Largest number of robots of a team: links, weights and pairs are N x N, and packets hold a robot's index in 16 bits.
+"""
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,14 @@ class RunConfig:
     def __post_init__(self) -> None:
         if not self.robots:
             raise ConfigError("robots: a team needs at least one robot")
+        if len(self.robots) > MAX_ROBOTS:
+            raise ConfigError(
+                f"robots: {len(self.robots):,} robots are more than {MAX_ROBOTS:,}, the largest team of a run; replay"
+                " parts of the team"
+            )
         ids = [robot.robot_id for robot in self.robots]
-        for robot_id in ids:
-            if ids.count(robot_id) > 1:
+        for robot_id, number in Counter(ids).items():
+            if number > 1:
                 raise ConfigError(f"robots: '{robot_id}' is listed twice")
         self._check_edges(ids)
         for key, robot_id in _named_robots(self):
@@ -72,6 +82,19 @@ class RunConfig:
                 raise ConfigError(f"{key}: robot '{robot_id}' is not in the team: {', '.join(sorted(ids))}")
         self._check_link_overrides()
         self._check_publish_times()
+        for view in (view for robot in self.robots for view in robot.views):
+            if view.max_range is not None and view.max_range > self.sensor.max_range:
+                raise ConfigError(
+                    f"robot '{view.robot_id}': max_range {view.max_range:g} m is above the team's max_range "
+                    f"{self.sensor.max_range:g} m; raise the team's, which is the limit of all sensors"
+                )
+            if (view.min_range or 0.0) >= self.sensor.max_range or (
+                view.max_range or math.inf
+            ) <= self.sensor.min_range:
+                raise ConfigError(
+                    f"robot '{view.robot_id}': its own range and the team's, {self.sensor.min_range:g} - "
+                    f"{self.sensor.max_range:g} m, leave no measured point"
+                )
         if self.sensor.hide_robots and all(robot.body_box is None for robot in self.robots):
             raise ConfigError("hide_robots: no robot has a body_box; give it in the team file")
         _check_rule(self)

@@ -23,7 +23,9 @@ class SensorConfig:
     clamp_min: float = parameter(-5.0, "lower limit of a class's log-odds", maximum=0.0)
     clamp_max: float = parameter(5.0, "upper limit of a class's log-odds", minimum=0.0)
     min_range: float = parameter(0.0, "minimum range of a measured point; nearer points are ignored [m]", minimum=0.0)
-    max_range: float = parameter(10.0, "maximum length of a ray; farther points only mark free space [m]", above=0.0)
+    max_range: float = parameter(
+        10.0, "maximum length of a ray; farther points only mark free space [m]", above=0.0, is_common=True
+    )
     rays: str = parameter(
         "cells", "one ray for each end cell (cells) or for each measured point (all)", choices=("cells", "all")
     )
@@ -66,7 +68,7 @@ def rounded_sensor(sensor: SensorConfig, quantum: float) -> SensorConfig:
 class MapConfig:
     """Configuration of the map: geometry, prior and pruning."""
 
-    resolution: float = parameter(0.2, "edge length of the finest cell [m]", above=0.0)
+    resolution: float = parameter(0.2, "edge length of the finest cell [m]", above=0.0, is_common=True)
     bounds: tuple[float, ...] = parameter(
         (), "mapped region, ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the team's frame [m] (default: no limit)"
     )

@@ -13,18 +13,22 @@ from octoreplay.config.fields import as_number, is_number
 from octoreplay.config.network import LinkConfig, ScheduleEntry
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, coerced
 from octoreplay.config.robot import RobotConfig
+from octoreplay.config.robot_sensor import SENSOR_KEYS, RobotSensor
 from octoreplay.config.run import RunConfig
 from octoreplay.config.yaml_file import dump_yaml, load_yaml, read_text
 from octoreplay.errors import ConfigError, suggestion
+from octoreplay.records import FilePath
 
 _ROBOT_KEYS = ("id", "log", *(f.name for f in dataclasses.fields(RobotConfig) if f.name not in ("robot_id", "logs")))
+_ROBOT_LISTS = ("intrinsics", "pose", "pose_origin", "T_team_map", "T_team_map_sigma", "T_body_sensor", "body_box")
+_ROBOT_NUMBERS = ("clock_offset", "depth_unit", "min_range", "max_range", "publish_period", "publish_phase")
 _SCHEDULE_KEYS = {"from": "start", "to": "end", **{f.name: f.name for f in dataclasses.fields(ScheduleEntry)[2:]}}
 _LINK_KEYS = tuple(f.name for f in dataclasses.fields(LinkConfig))
 _TEAM_KEYS = ("robots", *CLASSES_KEYS, "edges", "one_way", "schedule", "links")
 """Keys of a team file that are not parameters."""
 
 
-def load_team_file(path: str | Path) -> RunConfig:
+def load_team_file(path: FilePath) -> RunConfig:
     """Read a team file. Relative paths in it are relative to its folder.
 
     Raises ConfigError that names the file and the key for an unreadable file, an unknown key or a wrong value.
@@ -49,11 +53,11 @@ def _team_from_mapping(content: Any, folder: Path) -> RunConfig:
     """Configuration of a team file's content."""
     if not isinstance(content, Mapping):
         raise ConfigError("expects a YAML mapping with the key 'robots'")
-    if "robots" not in content or not isinstance(content["robots"], list):
-        raise ConfigError("robots: expects a list of robots, each with 'id' and 'log'")
     for key in content:
         if key not in _TEAM_KEYS and key not in PARAMETERS:
             raise ConfigError(f"{key}: unknown key{suggestion(str(key), (*_TEAM_KEYS, *PARAMETERS))}")
+    if "robots" not in content or not isinstance(content["robots"], list):
+        raise ConfigError("robots: expects a list of robots, each with 'id' and 'log'")
     robots = tuple(_robot_from_mapping(entry, folder) for entry in content["robots"])
     changes = coerced({key: value for key, value in content.items() if key in PARAMETERS})
     changes.setdefault("network", {}).update(
@@ -82,18 +86,42 @@ def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
     logs = (logs,) if isinstance(logs, str) else logs
     if not isinstance(logs, list | tuple) or not all(isinstance(log, str) for log in logs):
         raise ConfigError(f"robot '{robot_id}': log: expects a path or a list of paths")
+    sensors = entry.get("sensors") or ()
+    if not isinstance(sensors, list | tuple):
+        raise ConfigError(f"robot '{robot_id}': sensors: expects a list of sensors, each with its topics")
+    values = {key: value for key, value in entry.items() if key not in ("id", "log", "sensors")}
+    return RobotConfig(
+        robot_id=robot_id,
+        logs=tuple(folder / log for log in logs),
+        sensors=tuple(_sensor_from_mapping(robot_id, sensor) for sensor in sensors),
+        **_robot_values(robot_id, values, folder),
+    )
+
+
+def _sensor_from_mapping(robot_id: str, entry: Any) -> RobotSensor:
+    """Configuration of one entry of a robot's 'sensors'."""
+    if not isinstance(entry, Mapping):
+        raise ConfigError(f"robot '{robot_id}': sensors: every sensor is a mapping with its topics")
+    for key in entry:
+        if key not in SENSOR_KEYS:
+            raise ConfigError(f"robot '{robot_id}': sensors: {key}: unknown key{suggestion(str(key), SENSOR_KEYS)}")
+    return RobotSensor(**_robot_values(robot_id, entry, Path()))
+
+
+def _robot_values(robot_id: str, entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Values of a robot's or sensor's keys, with their types."""
     fields: dict[str, Any] = {}
     for key, value in entry.items():
-        if key in ("id", "log") or value is None:
+        if value is None:
             continue
         try:
-            if key in ("intrinsics", "T_team_map", "T_team_map_sigma", "T_body_sensor", "body_box"):
+            if key in _ROBOT_LISTS:
                 fields[key] = tuple(as_number(number) for number in value)
             elif key == "rectified":
                 if not isinstance(value, bool):
                     raise TypeError
                 fields[key] = value
-            elif key in ("clock_offset", "depth_unit", "publish_period", "publish_phase"):
+            elif key in _ROBOT_NUMBERS:
                 fields[key] = as_number(value)
             else:
                 if not isinstance(value, str):
@@ -101,11 +129,13 @@ def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
                 fields[key] = folder / value if key in ("pose_file", "pose_times") else value
         except (TypeError, ValueError):
             raise ConfigError(f"robot '{robot_id}': {key}: {value!r} has the wrong type") from None
-    return RobotConfig(robot_id=robot_id, logs=tuple(folder / log for log in logs), **fields)
+    return fields
 
 
 def _edges(entries: Any) -> tuple[tuple[str, str, float | None], ...]:
     """Edges from lists [a, b] or [a, b, weight]."""
+    if not isinstance(entries, list | tuple):
+        raise ConfigError("edges: expects a list of edges, each [robot, robot] or [robot, robot, weight]")
     edges = []
     for entry in entries:
         if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
@@ -123,7 +153,7 @@ def _pairs(key: str, entries: Any) -> tuple[tuple[str, str], ...]:
     return tuple((str(a), str(b)) for a, b in entries)
 
 
-def load_schedule(path: str | Path) -> tuple[ScheduleEntry, ...]:
+def load_schedule(path: FilePath) -> tuple[ScheduleEntry, ...]:
     """Read a schedule file: a YAML list of entries. Raises ConfigError with the file and the entry."""
     path = Path(path)
     content = load_yaml(read_text(path, "schedule"), str(path))
@@ -261,6 +291,16 @@ def robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
         value = getattr(robot, item.name)
         if isinstance(value, Path):
             value = text(value)
+        if item.name == "sensors":
+            value = [_set_values(sensor) for sensor in robot.sensors] or item.default
         if value != item.default:
             entry[item.name] = list(value) if isinstance(value, tuple) else value
     return entry
+
+
+def _set_values(sensor: RobotSensor) -> dict[str, Any]:
+    """Content of one entry of 'sensors'."""
+    values = {name: getattr(sensor, name) for name in SENSOR_KEYS}
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in values.items() if value is not None
+    }

@@ -44,7 +44,11 @@ _EXAMPLES: Mapping[str, Mapping[str, tuple[Any, str]]] = {
 }  # fmt: skip
 """Example and comment of each key that is not a parameter, by the section that follows the key ('' for the first)."""
 
-_ROBOT_EXAMPLES: Mapping[str, Any] = {"T_team_map": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+_ROBOT_EXAMPLES: Mapping[str, Any] = {
+    "pose": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+    "T_team_map": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+    "sensors": [{"cloud_topic": "/front/points", "max_range": 20.0}, {"cloud_topic": "/rear/points"}],
+}
 """Example of keys of a robot that have no default."""
 
 
@@ -102,6 +106,10 @@ def _robot_lines(robot: RobotConfig, comments: Sequence[str], folder: Path | Non
     for item in dataclasses.fields(RobotConfig):
         if item.metadata:
             value = entry.get(item.name, _ROBOT_EXAMPLES.get(item.name, item.default))
+            if item.name == "sensors" and robot.sensors:
+                lines.append(_line("sensors", None, item.metadata["help"], is_set=True, indent=4))
+                lines += (f"      - {_flow(sensor)}" for sensor in value)
+                continue
             lines.append(_line(item.name, value, item.metadata["help"], is_set=item.name in entry, indent=4))
     return lines
 

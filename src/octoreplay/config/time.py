@@ -23,7 +23,7 @@ class TimeConfig:
         0.0, "start of the replayed span, after the team's first stamp [s]", minimum=0.0, maximum=1e9
     )
     duration: float | None = parameter(
-        None, "length of the replayed span [s] (default: to the end)", above=0.0, maximum=1e9
+        None, "length of the replayed span [s] (default: to the end)", above=0.0, maximum=1e9, is_common=True
     )
     every: int = parameter(1, "use every n-th image or cloud of each robot", minimum=1)
     rate_limit: float | None = parameter(

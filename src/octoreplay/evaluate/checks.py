@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from octoreplay.errors import ConfigError, suggestion
-from octoreplay.records import CONVERGED, POSTERIOR
+from octoreplay.records import CONVERGED, POSTERIOR, FilePath
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, RobotMetrics, RunSummary, TickMetrics, ranked_pairs
 
 if TYPE_CHECKING:
@@ -132,11 +132,11 @@ class Quantity:
 
 
 def check_result(
-    path: str | Path,
+    path: FilePath,
     limits: Mapping[str, float],
     *,
     settled: bool = False,
-    truth: str | Path | None = None,
+    truth: FilePath | None = None,
     map_kind: str = POSTERIOR,
 ) -> tuple[CheckRow, ...]:
     """Check a result against limits and return one row per check, failed ones first, in the order of ``LIMITS``.

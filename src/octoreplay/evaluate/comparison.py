@@ -18,11 +18,12 @@ import numpy as np
 
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.run import RunConfig
+from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.evaluate.morton_intervals import MortonIntervals, bounding_box, common_intervals
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys
-from octoreplay.records import CENTRAL, BoolArray, Float64Array, Int64Array
+from octoreplay.records import CENTRAL, BoolArray, FilePath, Float64Array, Int64Array
 from octoreplay.result import Result, StoredMap, open_result
 
 Point: TypeAlias = tuple[float, float, float]
@@ -147,9 +148,13 @@ class ResultComparison:
     same_inputs: bool | None
     settings: tuple[SettingDifference, ...]
 
+    def as_table(self) -> Table:
+        """Return the numbers of ``maps`` as a table, one row per robot."""
+        return Table.from_records(MapDifference, self.maps)
+
 
 def compare_results(
-    a: str | Path, b: str | Path, *, robot: str | None = None, at: float | None = None, tolerance: float = 0.0
+    a: FilePath, b: FilePath, *, robot: str | None = None, at: float | None = None, tolerance: float = 0.0
 ) -> ResultComparison:
     """Compare the robots' maps and the centralised maps of two results.
 
@@ -175,6 +180,7 @@ def compare_results(
         raise ConfigError(f"tolerance: {tolerance:g} is not a finite number of at least 0")
     if at is not None and not abs(at) <= _LATEST:
         raise ConfigError(f"at: {at:g} is not a number of seconds up to {_LATEST:g}")
+    a, b = Path(a), Path(b)
     with ExitStack() as stack:
         result_a, result_b = (stack.enter_context(open_result(path)) for path in (a, b))
         _check_comparable(result_a, result_b)

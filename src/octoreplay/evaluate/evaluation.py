@@ -20,17 +20,17 @@ from octoreplay.evaluate.truth_frame import truth_frame_warning
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
-from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, BoolArray
+from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, BoolArray, FilePath
 from octoreplay.replay.warnings import team_frame_warnings
 from octoreplay.result import Result, StoredMap, open_result
 from octoreplay.run_metrics import PairMetrics, TickMetrics
 
 
 def evaluate_result(
-    path: str | Path,
+    path: FilePath,
     *,
-    truth: str | Path | None = None,
-    against: str | Path = CENTRAL,
+    truth: FilePath | None = None,
+    against: FilePath = CENTRAL,
     map_kind: str = POSTERIOR,
     over_time: bool = True,
     progress: Callable[[float], None] | None = None,
@@ -64,12 +64,14 @@ def evaluate_result(
     """
     if map_kind not in MAP_KINDS:
         raise ConfigError(f"map: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
+    path, against = Path(path), against if against == CENTRAL else Path(against)
+    truth = None if truth is None else Path(truth)
     with contextlib.ExitStack() as files:
         result = files.enter_context(open_result(path))
         other = None if against == CENTRAL else files.enter_context(open_result(against))
         if other is not None:
             _check_fit(result, other)
-        surface = None if truth is None else load_truth(Path(truth), result.class_table, result.config.map.resolution)
+        surface = None if truth is None else load_truth(truth, result.class_table, result.config.map.resolution)
         evaluator = _Evaluator(result, surface, other, map_kind)
         stored: Iterable[Mapping[str, StoredMap]] = result.history() if over_time else [evaluator.last_maps]
         ticks = []
@@ -77,14 +79,14 @@ def evaluate_result(
             ticks.append(evaluator.evaluate(maps))
             if progress is not None:
                 progress(min(1.0, (ticks[-1].tick + 1) / (result.metrics[-1].tick + 1)))
-        misplaced = None if truth is None else truth_frame_warning(result, Path(truth))
+        misplaced = None if truth is None else truth_frame_warning(result, truth)
         return Evaluation(
             str(path), None if truth is None else str(truth), str(against), map_kind, result.class_table.names,
             tuple(ticks), (*evaluator.warnings, *([misplaced] if misplaced is not None else [])),
         )  # fmt: skip
 
 
-def truth_beside_logs(path: str | Path) -> Path | None:
+def truth_beside_logs(path: FilePath) -> Path | None:
     """Return the world.npz in the folder of one of a result's logs, None without one. Raises InputError."""
     with open_result(path) as result:
         folders = dict.fromkeys((result.path.parent / name).parent for name in result.inputs)

@@ -6,6 +6,9 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from octoreplay.data_table import Table
 from octoreplay.records import CENTRAL
 from octoreplay.run_metrics import PairMetrics, PairTotals
 
@@ -71,6 +74,7 @@ MAP_SCORES = ("num_cells", "entropy_bits", "agreement", "agreement_occupied")
 
 SCORES = (*MAP_SCORES, *(item.name for item in dataclasses.fields(TruthScores) if item.name != "iou"))
 """All scores of a map that are one number."""
+_TICK_COLUMNS = ("tick", "seconds", "label_disagreement")
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,22 @@ class Evaluation:
     def final(self) -> EvaluatedTick:
         """Scores at the end of the run."""
         return self.ticks[-1]
+
+    def as_table(self) -> Table:
+        """Return the scores of all maps as a table: one row per stored tick and map, 'central' included.
+
+        The columns are tick, seconds, label_disagreement of the team, robot_id, is_active, all scores (NaN without a
+        truth), and ``iou.<class>`` for each class.
+        """
+        rows = [(tick, scores) for tick in self.ticks for scores in tick.maps]
+        first = {name: np.array([getattr(tick, name) for tick, _ in rows]) for name in _TICK_COLUMNS}
+        maps = Table.from_records(MapScores, [scores for _, scores in rows], first).columns
+        against_truth = {
+            name: np.array([scores.score(name) for _, scores in rows]) for name in SCORES if name not in MAP_SCORES
+        }
+        iou = np.array([self.iou(scores) for _, scores in rows]).reshape(len(rows), len(self.class_names))
+        classes = {f"iou.{name}": values for name, values in zip(self.class_names, iou.T, strict=True)}
+        return Table({**maps, **against_truth, **classes})
 
     def iou(self, scores: MapScores) -> tuple[float, ...]:
         """Return the intersection over union (C,) of each class in one of the maps; NaN without a truth."""

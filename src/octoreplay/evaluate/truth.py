@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import InputError
+from octoreplay.io.containers.decompression import content_limit
 from octoreplay.io.datasets.ply_files import read_labelled_ply
 from octoreplay.mapping.octree import KEY_OFFSET, keys_to_codes
 from octoreplay.mapping.surface import CellVotes, num_cuts, points_on_triangles
@@ -114,6 +115,9 @@ def _arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
             file = np.load(stream, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise InputError(f"{path}: is a single array; {_REMEDY}")
+            size = sum(entry.file_size for entry in zipfile.ZipFile(path).infolist())
+            if size > content_limit(path.stat().st_size):
+                raise InputError(f"{path}: its arrays take {size:,} bytes, which a file of its size cannot; {_REMEDY}")
             arrays = {name: file[name] for name in _ARRAYS if name in file}
     except _DAMAGE as error:
         raise InputError(f"{path}: cannot be read, or is truncated or damaged: {error}; {_REMEDY}") from error

@@ -25,7 +25,21 @@ def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
             yield f"{path} line {number}", fields
 
 
+def comments(path: Path) -> list[str]:
+    """Return the comment lines (#) above the first row of a text table, without the sign.
+
+    Raises InputError where the file cannot be read or is not text.
+    """
+    found = []
+    for line in _read_text(path).splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            break
+        found.append(line.strip().lstrip("#"))
+    return found
+
+
 def _read_text(path: Path) -> str:
+    """Text of a file."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:

@@ -26,6 +26,12 @@ NO_COMPRESSION, ZSTD = 0, 1
 MAX_ZSTD_RATIO = 1 << 15
 """Maximum compression ratio of zstd: a block of at least 4 bytes holds at most 2^17 bytes."""
 MAX_CLASSES = 254
+VALUE_BYTES = 16
+"""Memory for each value while a packet is decoded: code, literal, bits and float32, rounded up [byte]."""
+SMALL_MAP = 1 << 28
+"""Memory that a map may take however small its packets are [byte]."""
+MEMORY_PER_BYTE = 256
+"""Memory that a map may take for each byte of its packets, where that is more than ``SMALL_MAP`` [byte]."""
 
 WRONG_SIZE = "map packet damaged: its size does not match its counts"
 
@@ -35,6 +41,14 @@ _HEADER = struct.Struct("<4sBBBBdqHHIIIfIIIIII")
 words, leaves, masks, own values, payload bytes, CRC."""
 
 HEADER_BYTES = _HEADER.size
+
+
+def max_memory(num_bytes: int) -> int:
+    """Return the largest memory of maps that are read from ``num_bytes`` of packets [byte].
+
+    A leaf of a few bits may stand for 2^24 bricks, so without this limit packets of 120 bytes would take 10 GB.
+    """
+    return max(SMALL_MAP, MEMORY_PER_BYTE * num_bytes)
 
 
 @dataclass(frozen=True)
@@ -176,25 +190,30 @@ def read_header(data: bytes) -> PacketHeader:
     return PacketHeader(kind, CONTENTS[content], compression, resolution, num_classes, map_version, step, *sizes)
 
 
-def decode_packet(data: bytes) -> SemanticOctree:
-    """Return the map of a key-frame packet. Raises PacketError for a delta and for damaged or other bytes."""
+def decode_packet(data: bytes, most_bytes: int | None = None) -> SemanticOctree:
+    """Return the map of a key-frame packet.
+
+    Raises PacketError for a delta, for damaged or other bytes, and for a map of more than ``most_bytes`` (None:
+    ``max_memory`` of the packet).
+    """
     header = read_header(data)
     if header.kind != FULL:
         raise PacketError("map packet is a delta; it needs the map that it changes")
-    return _decode(data, header)
+    return _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes)
 
 
-def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0) -> None:
+def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0, most_bytes: int | None = None) -> None:
     """Replace the bricks that a delta packet holds, in place.
 
-    Raises PacketError for other packets and other bytes, and then leaves the map unchanged.
+    Raises PacketError for other packets and other bytes, and for new bricks of more than ``most_bytes`` (None:
+    ``max_memory`` of the packet); it then leaves the map unchanged.
     """
     header = read_header(data)
     if header.kind != DELTA:
         raise PacketError("map packet is a key frame, not a delta")
     if header.resolution != octree.resolution or header.num_classes != octree.num_classes:
         raise PacketError("map packet with another resolution or number of classes than the map that it changes")
-    changed = _decode(data, header)
+    changed = _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes)
     octree.overwrite(changed, np.arange(changed.num_bricks), revision)
 
 
@@ -241,8 +260,12 @@ def _compressed(parts: list[bytes], level: int) -> bytes:
     return b"".join([*chunks, compressor.flush()])
 
 
-def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
-    """Return the octree of a packet with a valid header."""
+def _decode(data: bytes, header: PacketHeader, most_bytes: int) -> SemanticOctree:
+    """Return the octree of a packet with a valid header, of at most ``most_bytes``."""
+    num_values = header.num_leaves + header.num_own_values
+    most_bytes -= header.raw_bytes + VALUE_BYTES * num_values
+    if most_bytes < 0:
+        raise PacketError(f"map packet damaged: {len(data)} bytes cannot hold {num_values} values")
     payload = _Payload(memoryview(data)[HEADER_BYTES:], header)
     width = mask_bytes(header.num_classes)
     words = payload.take(2 * header.num_words).view("<u2")
@@ -252,7 +275,7 @@ def _decode(data: bytes, header: PacketHeader) -> SemanticOctree:
     payload.check_end()
     try:
         streams = TreeStreams(np.require(words, np.uint16, "A"), values, masks, own_values)
-        return octree_from_streams(streams, header.resolution, header.num_classes)
+        return octree_from_streams(streams, header.resolution, header.num_classes, most_bytes)
     except ValueError as error:
         raise PacketError(f"map packet damaged: {error}") from error
 
@@ -285,7 +308,10 @@ class _Payload:
             numbers = self.take(count * self._dtype.itemsize).view(self._dtype)
         if self._header.content == "int8" and (numbers < -INT8_MAX).any():
             raise PacketError(f"map packet damaged: an int8 is outside {-INT8_MAX} to {INT8_MAX}")
-        return np.require(content_values(numbers, self._header.content, self._header.step), np.float32, "A")
+        values = np.require(content_values(numbers, self._header.content, self._header.step), np.float32, "A")
+        if not np.isfinite(values).all():
+            raise PacketError("map packet damaged: a value is not finite")
+        return values
 
     def _take_coded(self, count: int) -> npt.NDArray[Any]:
         """Return the bits of the next ``count`` numbers, decoded from codes and literals."""

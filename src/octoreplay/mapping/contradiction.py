@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import enum
+import itertools
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -10,9 +12,19 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from octoreplay.config.sensor import SensorConfig
+from octoreplay.log_odds import best_labels
 from octoreplay.mapping.kernels import contradiction as kernels
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import ArrayT, Int32Array, Int64Array, UInt8Array, UInt64Array
+from octoreplay.records import (
+    ArrayT,
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    UInt8Array,
+    UInt64Array,
+)
 from octoreplay.run_metrics import PairMetrics, ranked_pairs
 
 CLEAR_LIMIT, LABEL_LIMIT = 0.035, 0.25
@@ -54,6 +66,67 @@ def state_limits(sensor: SensorConfig) -> StateLimits:
 def contradicting_pairs(pairs: Sequence[PairMetrics]) -> list[PairMetrics]:
     """Return the pairs with a clear contradiction above CLEAR_LIMIT, the largest first."""
     return [pair for pair in ranked_pairs(pairs, "clear_contradiction") if pair.clear_contradiction > CLEAR_LIMIT]
+
+
+class CellContradiction(enum.IntEnum):
+    """Relation of the robots' evidence in a cell, lowest precedence first; all pairs of robots count.
+
+    UNCOMPARED: fewer than two robots call the cell occupied or free. NONE: they do not differ. OTHER_LABEL: occupied
+    with different labels. CONTRADICTION: occupied and free. CLEAR: occupied and, for another robot, firmly free without
+    an occupied cell among the 26 neighbours.
+    """
+
+    UNCOMPARED = 0
+    NONE = 1
+    OTHER_LABEL = 2
+    CONTRADICTION = 3
+    CLEAR = 4
+
+
+def cell_contradictions(evidence: Sequence[SemanticOctree], coords: Float64Array, limits: StateLimits) -> UInt8Array:
+    """Return the CellContradiction (P,) uint8 of the cells that hold ``coords`` (P, 3) [m].
+
+    ``evidence`` are the N octrees s_i with one resolution, ``limits`` those of ``state_limits``. The states of a cell
+    are those that EvidenceComparer counts.
+    """
+    found = np.full(len(coords), CellContradiction.UNCOMPARED, np.uint8)
+    states = [_cell_states(octree, coords, limits) for octree in evidence]
+    for own, other in itertools.permutations(states, 2):
+        is_compared = (own.labels > 0) | own.is_free
+        is_compared &= (other.labels > 0) | other.is_free
+        np.maximum(found, np.uint8(CellContradiction.NONE), out=found, where=is_compared)
+        differs = (own.labels > 0) & (other.labels > 0) & (own.labels != other.labels)
+        np.maximum(found, np.uint8(CellContradiction.OTHER_LABEL), out=found, where=differs)
+        contradicts = (own.labels > 0) & other.is_free
+        np.maximum(found, np.uint8(CellContradiction.CONTRADICTION), out=found, where=contradicts)
+    for octree, own in zip(evidence, states, strict=True):
+        firm = np.flatnonzero((found == CellContradiction.CONTRADICTION) & own.is_firm)
+        found[firm[~_is_near_occupied(octree, coords[firm], limits)]] = CellContradiction.CLEAR
+    return found
+
+
+class _CellStates(NamedTuple):
+    """States of cells in one robot's evidence: label (P,), 0 unless occupied; free and firmly free (P,)."""
+
+    labels: UInt8Array
+    is_free: BoolArray
+    is_firm: BoolArray
+
+
+def _cell_states(octree: SemanticOctree, coords: Float64Array, limits: StateLimits) -> _CellStates:
+    """States of the cells at coordinates (P, 3)."""
+    values, known, _ = octree.lookup(coords)
+    largest = values.max(axis=1, initial=-np.inf)
+    labels = np.where(known & (largest >= limits.occupied_from), best_labels(values), 0).astype(np.uint8)
+    return _CellStates(labels, known & (largest <= limits.free_to), known & (largest <= limits.firm_to))
+
+
+def _is_near_occupied(octree: SemanticOctree, coords: Float64Array, limits: StateLimits) -> BoolArray:
+    """True (P,) where one of the 26 cells around a coordinate (P, 3), or its own cell, is occupied."""
+    steps = np.array(list(itertools.product((-1, 0, 1), repeat=3))) * octree.resolution
+    values: Float32Array = octree.lookup((coords[:, None] + steps).reshape(-1, 3))[0]
+    is_occupied = values.max(axis=1, initial=-np.inf) >= limits.occupied_from
+    return np.asarray(is_occupied.reshape(len(coords), len(steps)).any(axis=1))
 
 
 class EvidenceComparer:

@@ -19,6 +19,7 @@ from octoreplay.mapping.kernels.storage import Bricks, BrickTable
 from octoreplay.mapping.streams import (
     TreeStreams,
     brick_masks,
+    chosen_leaves,
     class_bits,
     encode_bricks,
     leaf_list,
@@ -52,6 +53,9 @@ NUM_PARTS = 16
 
 BRICK_ARRAYS = ("codes", "blocks", "values", "masks", "known", "revisions")
 """Names of the arrays with one entry for each brick."""
+
+COPIED_ARRAYS = (*BRICK_ARRAYS, "table", "counters", "free")
+"""Names of all arrays of the bricks but the rows of values."""
 
 CACHE_LINE = 64
 """Size of a cache line [byte]."""
@@ -205,13 +209,23 @@ class SemanticOctree:
     def copy(self) -> Self:
         """Return an octree with the same content."""
         twin = type(self)(self.resolution, self.num_classes)
-        rows = self.bricks.rows[: self.bricks.counters[storage.NUM_ROWS]]
-        used = {name: getattr(self.bricks, name)[: self.num_bricks] for name in BRICK_ARRAYS}
-        rest = {name: getattr(self.bricks, name) for name in ("table", "counters", "free")}
-        copies = {name: array.copy() for name, array in (used | rest).items()}
-        twin.bricks = Bricks(**copies, rows=cache_aligned(rows.shape, rows.dtype))
-        twin.bricks.rows[:] = rows
+        state = self.__getstate__()
+        twin.__setstate__({name: value.copy() if name in COPIED_ARRAYS else value for name, value in state.items()})
         return twin
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the content without unused memory, for ``pickle``."""
+        rest = {name: getattr(self.bricks, name) for name in COPIED_ARRAYS if name not in BRICK_ARRAYS}
+        used = {name: getattr(self.bricks, name)[: self.num_bricks] for name in BRICK_ARRAYS}
+        rows = self.bricks.rows[: self.bricks.counters[storage.NUM_ROWS]]
+        return {"resolution": self.resolution, "num_classes": self.num_classes, **used, **rest, "rows": rows}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the content of ``__getstate__``, with a copy of the rows."""
+        self.resolution, self.num_classes = state["resolution"], state["num_classes"]
+        rows = cache_aligned(state["rows"].shape, np.float32)
+        rows[:] = state["rows"]
+        self.bricks = Bricks(**{name: state[name] for name in COPIED_ARRAYS}, rows=rows)
 
     def streams(self, indices: Int64Array | None = None, *, prune: bool = True, tolerance: float = 0.0) -> TreeStreams:
         """Return the octree, or its bricks ``indices`` (n,), as a depth-first stream.
@@ -221,10 +235,11 @@ class SemanticOctree:
         """
         return encode_bricks(self.bricks, code_order(self, indices), self.num_classes, prune=prune, tolerance=tolerance)
 
-    def leaves(self, prior: float = 0.0, *, occupied_only: bool = False) -> LeafTable:
+    def leaves(self, prior: float = 0.0, *, occupied_only: bool = False, most_bytes: int | None = None) -> LeafTable:
         """Return all leaves in Morton order, or those with a class that is more probable than free.
 
-        ``prior`` is h_0 [log-odds], which is added to the deviations.
+        ``prior`` is h_0 [log-odds], which is added to the deviations. Raises ValueError where the table would take more
+        than ``most_bytes``.
         """
         streams = self.streams(self._occupied_bricks(prior) if occupied_only else None)
         codes, depths, is_vector = leaf_list(streams)
@@ -233,15 +248,15 @@ class SemanticOctree:
             occupied_own = np.repeat(np.arange(num_own.size), num_own)[streams.own_values + np.float32(prior) > 0]
             chosen = streams.values + np.float32(prior) > 0
             chosen[np.flatnonzero(is_vector)[occupied_own]] = True
-            chosen_vectors = chosen[is_vector]
-            streams = TreeStreams(
-                streams.words, streams.values[chosen], streams.masks[chosen_vectors],
-                streams.own_values[np.repeat(chosen_vectors, num_own)],
-            )  # fmt: skip
+            streams = chosen_leaves(streams, is_vector, chosen)
             codes, depths, is_vector = codes[chosen], depths[chosen], is_vector[chosen]
+        if most_bytes is not None and codes.size * (LEAF_BYTES + 5 * self.num_classes) > most_bytes:
+            raise ValueError(f"{codes.size} leaves of {self.num_classes} classes take more than {most_bytes} bytes")
+        log_odds = leaf_values(streams, is_vector, self.num_classes)
+        log_odds += np.float32(prior)
         sizes = np.exp2(KEY_BITS - depths.astype(np.float64)) * self.resolution
         centers = codes_to_keys(codes) * self.resolution + sizes[:, None] / 2
-        return LeafTable(centers, sizes, leaf_values(streams, is_vector, self.num_classes) + np.float32(prior))
+        return LeafTable(centers, sizes, log_odds)
 
     def _occupied_bricks(self, prior: float) -> Int64Array:
         """Return the indices (n,) of the bricks with a value above free, which include those of all occupied leaves."""
@@ -273,7 +288,11 @@ class SemanticOctree:
         known = inside & (leaf >= 0)
         known[known] = cell_codes[known] < (codes + spans)[leaf[known]]
         log_odds = np.zeros((len(keys), self.num_classes), np.float32)
-        log_odds[known] = leaf_values(streams, is_vector, self.num_classes)[leaf[known]]
+        # Dense values of all leaves would take more memory than the map.
+        chosen = np.zeros(codes.size, np.bool_)
+        chosen[leaf[known]] = True
+        values = leaf_values(chosen_leaves(streams, is_vector, chosen), is_vector[chosen], self.num_classes)
+        log_odds[known] = values[np.cumsum(chosen)[leaf[known]] - 1]
         sizes = np.zeros(len(keys))
         sizes[known] = np.exp2(KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
         return log_odds, known, sizes
@@ -346,12 +365,21 @@ def code_order(octree: SemanticOctree, indices: Int64Array | None = None) -> Int
 
 MAX_BRICKS = 1 << 24
 """Maximum number of bricks in an octree that is built from a stream: 1.1e9 cells."""
-MAX_BYTES = 1 << 32
-"""Maximum size of the values of an octree that is built from a stream [byte]."""
+MAX_BYTES = 1 << 34
+"""Maximum size of an octree that is built from a stream [byte]."""
+LEAF_BYTES = 64
+"""Memory for each leaf of a leaf table besides its log-odds, while the table is made [byte]."""
+TABLE_BYTES = 16
+"""Largest size of the hash table for each brick [byte]."""
 
 
-def octree_from_streams(streams: TreeStreams, resolution: float, num_classes: int) -> SemanticOctree:
-    """Return the octree of a depth-first stream. Raises ValueError where the stream is malformed or too large."""
+def octree_from_streams(
+    streams: TreeStreams, resolution: float, num_classes: int, most_bytes: int = MAX_BYTES
+) -> SemanticOctree:
+    """Return the octree of a depth-first stream.
+
+    Raises ValueError where the stream is malformed, and where its octree would take more than ``most_bytes``.
+    """
     bricks = brick_masks(streams)
     num_own = int(np.bitwise_count(streams.masks).sum())
     if num_own != streams.own_values.size or class_bits(streams.masks)[:, num_classes:].any():
@@ -360,10 +388,14 @@ def octree_from_streams(streams: TreeStreams, resolution: float, num_classes: in
     num_bricks = int(bricks.spans.sum())
     if num_bricks > MAX_BRICKS:
         raise ValueError(f"the stream has more than {MAX_BRICKS} bricks")
+    per_brick = storage.BRICK_BYTES + octree.bricks.masks.itemsize * octree.bricks.masks.shape[1] + TABLE_BYTES
+    num_bytes = num_bricks * per_brick
+    if num_bytes > most_bytes:
+        raise ValueError(f"the stream's {num_bricks} bricks take more than {most_bytes} bytes")
     class_masks = np.zeros((bricks.codes.size, mask_bytes(num_classes)), np.uint64)
     num_rows = packets.read_class_masks(bricks, read_only(streams.masks), class_masks)
-    if num_rows * storage.ROW_BYTES > MAX_BYTES:
-        raise ValueError(f"the values of the stream take more than {MAX_BYTES} bytes")
+    if num_bytes + num_rows * storage.ROW_BYTES > most_bytes:
+        raise ValueError(f"the values of the stream take more than {most_bytes} bytes")
     octree.reserve(bricks=num_bricks, rows=num_rows)
     packets.fill_bricks(
         octree.bricks, bricks, class_masks, num_classes, read_only(streams.values), read_only(streams.masks),

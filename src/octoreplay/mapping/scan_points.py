@@ -10,12 +10,19 @@ from octoreplay.config.sensor import SensorConfig
 from octoreplay.records import BoolArray, CloudFrame, DepthFrame, Float64Array, Frame, UInt8Array
 
 
+def range_of(frame: Frame, sensor: SensorConfig) -> tuple[float, float]:
+    """Return the least and the largest distance of a scan's measured points [m]: its sensor's own, else the model's."""
+    least = sensor.min_range if frame.min_range is None else float(frame.min_range)
+    return least, sensor.max_range if frame.max_range is None else float(frame.max_range)
+
+
 def scan_points(
     frame: Frame, sensor: SensorConfig, *, max_range: float, max_points: int
 ) -> tuple[Float64Array, UInt8Array]:
     """Return the measured points (P, 3) float64 of a scan in the sensor's frame [m], and their class ids (P,) uint8.
 
-    Points are left out where the sensor model ignores them, beyond ``max_range`` [m], and inside robots' bodies. About
+    Points are left out where the sensor model ignores them, beyond ``max_range`` [m] or the sensor's own, and inside
+    robots' bodies. About
     ``max_points`` of the scan's points are used, evenly spread. A scan without labels has class 1 everywhere; 0 is a
     point without a usable label.
     """
@@ -31,7 +38,9 @@ def scan_points(
         class_ids = np.ones(len(points), np.uint8)
     distance = np.linalg.norm(points, axis=1)
     with np.errstate(invalid="ignore"):
-        used = (distance >= max(sensor.min_range, 1e-6)) & (distance <= max_range)
+        used = (distance >= max(range_of(frame, sensor)[0], 1e-6)) & (distance <= max_range)
+        if frame.max_range is not None:
+            used &= distance <= frame.max_range
     used &= ~_in_bodies(frame, points)
     return points[used], class_ids[used]
 

@@ -13,6 +13,7 @@ from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import casting, ends, evidence, storage
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.scan_points import range_of
 from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.records import (
     CloudFrame,
@@ -183,9 +184,9 @@ class ScanCaster:
         classes = read_only(np.ones(depth.shape, np.uint8)) if frame.class_image is None else frame.class_image
         ends.depth_to_runs(
             depth, frame.depth_unit, np.ascontiguousarray(classes),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution, self._sensor.min_range,
-            self._sensor.max_range, *values, _confidences(frame), _boxes(frame), *self._scratch_rows(depth.shape[1]),
-            *self._runs.outputs,
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution,
+            *range_of(frame, self._sensor), *values, _confidences(frame), _boxes(frame),
+            *self._scratch_rows(depth.shape[1]), *self._runs.outputs,
         )  # fmt: skip
 
     def _scratch_rows(self, size: int) -> tuple[Float32Array, Float64Array, Int32Array]:
@@ -221,7 +222,7 @@ class ScanCaster:
         classes = read_only(np.ones(len(points), np.uint8)) if class_ids is None else class_ids
         ends.points_to_runs(
             np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-            self._sensor.min_range, self._sensor.max_range, _confidences(frame), _boxes(frame),
+            *range_of(frame, self._sensor), _confidences(frame), _boxes(frame),
             *self._scratch_rows(ends.BLOCK)[1:], *self._runs.outputs,
         )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,14 @@ class Snapshot:
         self._source = octree
         self._whole: SemanticOctree | None = None
         self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the content for ``pickle``."""
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the content from ``pickle``."""
+        vars(self).update(state, _lock=Lock())
 
     def save(self, codes: Int64Array) -> None:
         """Save the bricks ``codes`` (n,) int64, each given once; those that were saved before are skipped."""

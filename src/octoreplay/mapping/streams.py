@@ -176,6 +176,16 @@ def leaf_values(streams: TreeStreams, is_vector: BoolArray, num_classes: int) ->
     return values
 
 
+def chosen_leaves(streams: TreeStreams, is_vector: BoolArray, chosen: BoolArray) -> TreeStreams:
+    """Return the values of the leaves where ``chosen`` (L,) is True, with all words; ``is_vector`` (L,) as above."""
+    chosen_vectors = chosen[is_vector]
+    num_own = np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)
+    return TreeStreams(
+        streams.words, streams.values[chosen], streams.masks[chosen_vectors],
+        streams.own_values[np.repeat(chosen_vectors, num_own)],
+    )  # fmt: skip
+
+
 def class_bits(masks: UInt8Array) -> BoolArray:
     """Return the bits (V, 8 B) of masks (V, B)."""
     return np.unpackbits(masks, axis=1, bitorder="little").view(np.bool_)

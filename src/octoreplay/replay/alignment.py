@@ -16,6 +16,7 @@ import numpy as np
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.subteam import subteam
+from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.sightings import Sightings
@@ -59,6 +60,8 @@ class RobotFrame:
         whose frame the team's is or whose pose was given; None for such a robot.
     origin : str
         Phrase on the origin of the pose.
+    evidence : str
+        Numbers behind the accepted pair that gave the pose (docs/frames.md); empty without such a pair.
     partner : str or None
         Robot through whose pair the pose was found; None where it was given or is the team's frame.
     is_given : bool
@@ -69,6 +72,7 @@ class RobotFrame:
     T_team_map: Float64Array
     covariance: Float64Array | None
     origin: str
+    evidence: str
     partner: str | None
     is_given: bool
 
@@ -119,6 +123,21 @@ class Alignment:
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 
+    def as_table(self) -> Table:
+        """Return the robots' frames as a table, one row per robot, those of the first team first.
+
+        The columns are team (position in ``teams``), the texts and flags of RobotFrame, T_team_map as x, y, z [m], qx,
+        qy, qz, qw, and the standard deviations sigma_x, sigma_y, sigma_z [m], sigma_rx, sigma_ry, sigma_rz [rad].
+        """
+        rows = [(index, frame) for index, team in enumerate(self.teams) for frame in team]
+        poses = np.array([numbers_of(frame.T_team_map) for _, frame in rows]).reshape(-1, 7)
+        sigmas = np.array([frame.sigma or (np.nan,) * 6 for _, frame in rows]).reshape(-1, 6)
+        first = {"team": np.array([index for index, _ in rows], dtype=np.int64)}
+        frames = Table.from_records(RobotFrame, [frame for _, frame in rows], first)
+        numbers = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), poses.T, strict=True))
+        names = [f"sigma_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
+        return Table({**frames.columns, **numbers, **dict(zip(names, sigmas.T, strict=True))})
+
     @property
     def left_out(self) -> tuple[str, ...]:
         """Robots whose frames nothing relates to the first team."""
@@ -148,7 +167,8 @@ class Alignment:
             pair = self.best_refused(robot_id)
             first, second = self.robot_ids[pair.first], self.robot_ids[pair.second]
             reason = self.refusal(pair) or "accepted, and they are a component of their own"
-            sentences.append(f"{robot_id} is not connected; its best pair is {first} and {second}: {reason}")
+            best = f"its best pair is {first} and {second}: {reason}"
+            sentences.append(f"{robot_id} is not connected; {best} (docs/frames.md has remedies)")
         return tuple(sentences)
 
     def refusal(self, pair: PairAlignment) -> str:
@@ -236,14 +256,14 @@ def align_robots(
     placement = place_robots(maps, aligned, {index: T @ placed[index] for index, T in given.items()}, dof=dof)
     for refusal in placement.refusals:
         given.pop(refusal.index, None)
-    qualities = {(pair.first, pair.second): _quality(pair, dof, priors) for pair in aligned.pairs}
+    pairs = {(pair.first, pair.second): pair for pair in aligned.pairs}
 
     def frames(team: Sequence[PlacedRobot]) -> tuple[RobotFrame, ...]:
         first = team[0].anchor
         # Without a given pose the team's frame is the map frame of the first robot.
         T_team_own = np.eye(4) if first in given else placed[first]
         return tuple(
-            _robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, qualities) for robot in team
+            _robot_frame(robot, robot_ids, T_team_own, placed[robot.index], given, pairs, priors, dof) for robot in team
         )
 
     return Alignment(
@@ -346,7 +366,7 @@ def _aligned_robot(robot: RobotConfig, frame: RobotFrame) -> Any:
         robot,
         T_team_map=numbers_of(frame.T_team_map),
         T_team_map_sigma=frame.sigma,
-        T_team_map_from=frame.origin,
+        T_team_map_from=f"{frame.origin} ({frame.evidence})" if frame.evidence else frame.origin,
     )
 
 
@@ -391,7 +411,7 @@ def _candidates(
 
 def _robot_frame(
     robot: PlacedRobot, robot_ids: Sequence[str], T_team_own: Float64Array, T_map_own: Float64Array,
-    given: Mapping[int, Float64Array], qualities: Mapping[tuple[int, int], str],
+    given: Mapping[int, Float64Array], pairs: Mapping[tuple[int, int], PairAlignment], priors: Priors, dof: int,
 ) -> RobotFrame:  # fmt: skip
     """The frame of a placed robot; ``T_team_own`` maps the frame that it is placed in to the team's."""
     T = T_team_own @ robot.T_team_map @ inverse(T_map_own)
@@ -400,22 +420,25 @@ def _robot_frame(
         is_given = robot.index in given
         verified = " and verified by its overlaps" if robot.is_verified else ""
         origin = f"given in the team file{verified}" if is_given else TEAM_ORIGIN
-        return RobotFrame(robot_id, T, None, origin, None, is_given)
+        return RobotFrame(robot_id, T, None, origin, "", None, is_given)
     turn = np.kron(np.eye(2), T_team_own[:3, :3])
     # From the origin of the map to that of the map frame.
     arm = T[:3, 3] - (T_team_own @ robot.T_team_map)[:3, 3]
     covariance = about_point(turn @ robot.covariance @ turn.T, arm)
     partner = robot_ids[robot.partner]
     first, second = sorted((robot.index, robot.partner))
-    origin = f"aligned with {partner}, {qualities[first, second]}"
+    pair = pairs[first, second]
+    origin = f"aligned with {partner}"
+    if agreeing := priors.agreeing(pair):
+        origin += f"; agrees with {' and '.join(agreeing)}"
     if robot.index in given:
         origin += f"; the given pose differs by {difference(*pose_difference(T, given[robot.index]))}"
-    return RobotFrame(robot_id, T, covariance, origin, partner, False)
+    return RobotFrame(robot_id, T, covariance, origin, _evidence(pair, dof), partner, False)
 
 
-def _quality(pair: PairAlignment, dof: int, priors: Priors) -> str:
-    """Number by which a pair is ranked, and the known places that agree with it, as text."""
+def _evidence(pair: PairAlignment, dof: int) -> str:
+    """Numbers behind the verdict on a pair, as text."""
     agreement = pair.verification
-    number = f"L {agreement.score:.0f}" if dof == 4 else f"q {agreement.least_same:.3f}"
-    agreeing = priors.agreeing(pair)
-    return f"{number}; agrees with {' and '.join(agreeing)}" if agreeing else number
+    same, contra = agreement.obstacles.share_same, agreement.obstacles.share_contra
+    shares = f"overlap {100 * agreement.overlap:.1f} %, q {same:.3f}, q_c {contra:.3f}"
+    return f"L {agreement.score:.0f}, {shares}" if dof == 4 else shares

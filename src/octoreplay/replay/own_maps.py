@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.run import RunConfig
-from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.io.robots.sightings import Sightings, read_sightings
 from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
 from octoreplay.mapping.octree import SemanticOctree
@@ -69,7 +69,7 @@ def own_evidence(config: ResolvedRun, robot: ResolvedRobot) -> OwnEvidence:
     caster, increments = ScanCaster(sensor, region, num_classes), clamped_increments(sensor)
     alone = dataclasses.replace(robot, T_team_map=_OWN_FRAME, T_team_map_sigma=None, T_team_map_from=None)
     reach = sensor_reach(sensor, region)
-    with RobotLog(alone, config.time, config.classes, reach=reach) as log:
+    with SensorLogs(alone, config.time, config.classes, reach=reach) as log:
         for frame in log.frames():
             add_scan(octree, caster.cast(frame), increments, 0)
             measured.add_scan(frame, sensor)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,18 +17,75 @@ import numpy.typing as npt
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import OutputError
-from octoreplay.io.results.result_writer import ResultWriter, view_points
+from octoreplay.io.results.map_views import view_points
+from octoreplay.io.results.occupancy_grid import Grid, grid_of
+from octoreplay.io.results.octomap_trees import binary_tree
+from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping import codec
+from octoreplay.mapping.consensus import scaled_map
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import CENTRAL, FrameCounts, MapState
+from octoreplay.records import CENTRAL, FrameCounts, LeafTable, MapState
 from octoreplay.replay.joining import Joining
 from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.warnings import team_frame_warnings
-from octoreplay.run_metrics import LinkTotals, RunSummary, TickMetrics
+from octoreplay.run_metrics import LinkTotals, RunSummary, TickMetrics, log_sent_bytes
+
+_log = logging.getLogger(__name__)
 
 STATES_PER_KEY_FRAME = 12
 """Number of stored states of a robot from one key frame to the next."""
+
+
+MAPS_AT_ONCE = 4
+"""Number of maps whose stored forms wait for the writer at the same time; those of a large team may exceed its maps."""
+
+_NOT_STATE = ("_config", "_writer", "_threads", "_queue")
+"""Attributes of a recorder that do not change from tick to tick."""
+
+
+def _view(octree: SemanticOctree, _: int, config: ResolvedRun) -> npt.NDArray[Any]:
+    """Points of the occupied leaves of a map as the robot holds it."""
+    prior = config.map.prior(octree.num_classes)
+    return view_points(octree.leaves(prior, occupied_only=True), config.classes)
+
+
+def _posterior(octree: SemanticOctree, num_robots: int, config: ResolvedRun) -> LeafTable:
+    """Leaves of the posterior of the robots that a map is the mean of."""
+    shown = octree if num_robots == 1 else scaled_map(octree, float(num_robots))
+    return shown.leaves(config.map.prior(octree.num_classes))
+
+
+def _grid(octree: SemanticOctree, num_robots: int, config: ResolvedRun) -> Grid | None:
+    """Occupancy grid of a map, None where nothing lies in its heights."""
+    leaves, output = _posterior(octree, num_robots, config), config.output
+    low = -math.inf if output.grid_low is None else output.grid_low
+    high = math.inf if output.grid_high is None else output.grid_high
+    leaves = leaves.taken(leaves.between(low, high))
+    return grid_of(leaves, config.map.resolution) if len(leaves) else None
+
+
+def _octomap(octree: SemanticOctree, num_robots: int, config: ResolvedRun) -> bytes | None:
+    """Nodes of the OctoMap tree of a map, None for an empty one."""
+    leaves = _posterior(octree, num_robots, config)
+    return binary_tree(leaves, config.map.resolution) if len(leaves) else None
+
+
+class _Form(NamedTuple):
+    """Form of the maps for other programs: its period in the configuration, its encoder and its method to write."""
+
+    period: str
+    encode: Callable[[SemanticOctree, int, ResolvedRun], Any]
+    write: str
+
+
+_SHOWN: Mapping[str, _Form] = {
+    "view": _Form("view_every", _view, "write_view"),
+    "cubes": _Form("markers_every", _view, "write_cubes"),
+    "occupancy grid": _Form("grid_every", _grid, "write_grid"),
+    "OctoMap tree": _Form("octomap_every", _octomap, "write_octomap"),
+}
+"""Forms of the maps for other programs by name."""
 
 
 class _StateSeries:
@@ -40,8 +99,11 @@ class _StateSeries:
 
     def encode(
         self, tick: Tick, names: Sequence[str], octrees: Sequence[SemanticOctree], num_robots: Sequence[int]
-    ) -> list[MapState]:
-        """Next states: octrees of one tick, the means of ``num_robots``; ``names`` are the same in all ticks."""
+    ) -> Iterator[list[MapState]]:
+        """Yield the next states, those of some octrees at a time: octrees of one tick, the means of ``num_robots``.
+
+        ``names`` are the same in all ticks.
+        """
         sequence = self._num_stored
 
         def encode(index: int) -> MapState:
@@ -59,11 +121,11 @@ class _StateSeries:
                 num_robots[index],
             )  # fmt: skip
 
-        states = list(self._threads.map(encode, range(len(names))))
+        for first in range(0, len(names), MAPS_AT_ONCE):
+            yield list(self._threads.map(encode, range(len(names))[first : first + MAPS_AT_ONCE]))
         self._num_stored += 1
         self._octrees = tuple(octrees)
         self.last_tick = tick.number
-        return states
 
 
 class _WriteQueue:
@@ -116,7 +178,7 @@ class Recorder:
         self._queue = _WriteQueue(threads)
         self._maps = _StateSeries(threads)
         self._evidence = _StateSeries(threads)
-        self._view_tick = -1
+        self._shown_ticks = dict.fromkeys(_SHOWN, -1)
         self._num_averaged = np.ones(len(config.robots), np.int64)
         self._num_settling = 0
         self._peak = 0.0
@@ -124,6 +186,7 @@ class Recorder:
         self._bytes = np.zeros(3)
         self._num_published = 0
         self._sent_bytes = 0
+        self._log_sent_bytes = 0
         self._links = LinkTotals()
 
     def __enter__(self) -> Self:
@@ -133,6 +196,15 @@ class Recorder:
         # An error on the way out would hide the first one.
         with contextlib.suppress(OutputError):
             self._queue.wait()
+
+    def state(self) -> dict[str, Any]:
+        """Wait until all ticks are written; return what ``restore`` needs to continue after the last one."""
+        self._queue.wait()
+        return {name: value for name, value in vars(self).items() if name not in _NOT_STATE}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue a new recorder after the last tick of a ``state``."""
+        vars(self).update(state)
 
     def frame_warnings(self) -> tuple[str, ...]:
         """Sentences on the frames of the robots with evidence after the last tick; empty before the first tick."""
@@ -166,8 +238,9 @@ class Recorder:
             self._store_maps(tick, self._writer)
         if self._config.output.evidence_every and self._is_due(tick, self._config.output.evidence_every):
             self._store_evidence(tick, self._writer)
-        if self._is_due(tick, self._config.output.view_every):
-            self._write_views(tick, self._writer)
+        for name, every in self._shown_periods().items():
+            if self._is_due(tick, every):
+                self._write_shown(name, tick, self._writer)
         self._queue.start()
 
     def finish(
@@ -189,8 +262,9 @@ class Recorder:
                 self._store_maps(tick, self._writer)
             if self._evidence.last_tick < tick.number:
                 self._store_evidence(tick, self._writer)
-            if self._view_tick < tick.number:
-                self._write_views(tick, self._writer)
+            for name in self._shown_periods():
+                if self._shown_ticks[name] < tick.number:
+                    self._write_shown(name, tick, self._writer)
             self._queue.start()
             self._queue.wait()
         means = self._bytes / max(self._num_published, 1)
@@ -208,6 +282,7 @@ class Recorder:
             mean_octree_bytes=float(means[1]),
             mean_grid_bytes=float(means[2]),
             total_sent_bytes=self._sent_bytes,
+            log_sent_bytes=self._log_sent_bytes,
             links=self._links.totals(),
             frame_counts=counts,
             warnings=warnings,
@@ -229,6 +304,7 @@ class Recorder:
                 self._num_published += 1
         self._links.add(metrics.links)
         self._sent_bytes += sum(robot.sent_bytes for robot in metrics.robots)
+        self._log_sent_bytes += log_sent_bytes([metrics])
 
     def _count_averaged(self, graph: CommunicationGraph) -> None:
         """Update N of each active robot: the robots that reach it, or the team where evidence goes by origin.
@@ -252,21 +328,46 @@ class Recorder:
     def _store_maps(self, tick: Tick, writer: ResultWriter) -> None:
         """Store all maps, the centralised map included."""
         num_robots = (*self._num_averaged.tolist(), 1)
-        for state in self._maps.encode(tick, (*tick.graph.robot_ids, CENTRAL), (*tick.maps, tick.oracle), num_robots):
-            self._queue.add(writer.write_state, state)
+        names = (*tick.graph.robot_ids, CENTRAL)
+        for states in self._maps.encode(tick, names, (*tick.maps, tick.oracle), num_robots):
+            self._write_each(writer.write_state, ((state,) for state in states))
 
     def _store_evidence(self, tick: Tick, writer: ResultWriter) -> None:
         """Store every robot's evidence."""
-        for state in self._evidence.encode(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence)):
-            self._queue.add(writer.write_evidence, state)
+        for states in self._evidence.encode(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence)):
+            self._write_each(writer.write_evidence, ((state,) for state in states))
 
-    def _write_views(self, tick: Tick, writer: ResultWriter) -> None:
-        """Store every robot's map for viewing."""
+    def _shown_periods(self) -> dict[str, float]:
+        """Period [s] of each form of the maps that is stored for other programs."""
+        periods = {name: getattr(self._config.output, form.period) for name, form in _SHOWN.items()}
+        return {name: every for name, every in periods.items() if every is not None}
 
-        def points_of(octree: SemanticOctree) -> npt.NDArray[Any]:
-            return view_points(octree.leaves(self._config.map.prior(octree.num_classes), occupied_only=True), classes)
+    def _write_shown(self, name: str, tick: Tick, writer: ResultWriter) -> None:
+        """Store every robot's map in a form for other programs; maps that the form cannot hold are left out."""
+        form = _SHOWN[name]
 
-        classes = self._config.classes
-        for robot_id, points in zip(tick.graph.robot_ids, self._threads.map(points_of, tick.maps), strict=True):
-            self._queue.add(writer.write_view, robot_id, tick.stamp_ns, points, tick.metrics.frame_of(robot_id))
-        self._view_tick = tick.number
+        def encode(robot: tuple[str, SemanticOctree, int]) -> Any:
+            robot_id, octree, num_robots = robot
+            try:
+                return form.encode(octree, num_robots, self._config)
+            except ValueError as error:
+                # A map that cannot be encoded must not end a long run.
+                _log.warning("warning: robot '%s': no %s is stored: %s", robot_id, name, error)
+                return None
+
+        robots = list(zip(tick.graph.robot_ids, tick.maps, self._num_averaged.tolist(), strict=True))
+        for first in range(0, len(robots), MAPS_AT_ONCE):
+            some = robots[first : first + MAPS_AT_ONCE]
+            rows = (
+                (robot_id, tick.stamp_ns, content, tick.metrics.frame_of(robot_id))
+                for (robot_id, *_), content in zip(some, self._threads.map(encode, some), strict=True)
+                if content is not None
+            )
+            self._write_each(getattr(writer, form.write), rows)
+        self._shown_ticks[name] = tick.number
+
+    def _write_each(self, write: Callable[..., None], rows: Iterable[tuple[Any, ...]]) -> None:
+        """Start calls of ``write`` with the arguments of each row, after waiting for the calls before."""
+        for row in rows:
+            self._queue.add(write, *row)
+        self._queue.start()

@@ -165,7 +165,13 @@ def refine_team(
 
 
 def _check_frames(config: ResolvedRun) -> None:
-    """Raise ConfigError where nothing relates the map frames of two robots."""
+    """Raise ConfigError where nothing relates the map frames of two robots, and for a robot with ``sensors``."""
+    several = next((robot.robot_id for robot in config.robots if robot.sensors), None)
+    if several is not None:
+        raise ConfigError(
+            f"robot '{several}' has several sensors, whose poses cannot be corrected together; give it the keys of one "
+            f"of them in place of sensors"
+        )
     if frames_warning([(robot, robot.frame) for robot in config.robots if robot.frame is not None]) is not None:
         names = ", ".join(robot.robot_id for robot in config.robots if robot.T_team_map is None)
         raise ConfigError(
@@ -276,6 +282,8 @@ def _pose_stamps(log: RobotLog, poses: PoseSource, *, uses_log_time: bool) -> In
                 found.update(entry.stamp_ns for entry in transforms.transforms)
     if poses.trajectory is not None:
         found.update(poses.trajectory.stamps_ns.tolist())
+    if log.robot.pose is not None:
+        found.add(log.first_stamp_ns - log.robot.clock_offset_ns)
     return np.array(sorted(found), np.int64)
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from octoreplay.config.fields import MAX_TICKS
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import InputError
@@ -25,10 +26,13 @@ from octoreplay.replay.robots.robot import REPLAY, MapSizes, Phase, Publication,
 from octoreplay.replay.robots.team import make_team
 from octoreplay.replay.settling import NO_SETTLING, Settling
 from octoreplay.replay.tick import Tick, falls_due
-from octoreplay.replay.timeline import Bodies, FrameSource, Timeline
+from octoreplay.replay.timeline import Bodies, FrameSource, Position, Timeline
 
-MAX_TICKS = 10_000_000
-"""Largest number of ticks of one run: a day at 100 Hz is 8.6 million."""
+_STATE = (
+    "is_symmetric", "num_frames_off", "team", "joining", "_network", "_links", "_measurer", "_graph", "_num_ticks",
+    "_settling", "_reopened",
+)  # fmt: skip
+"""Attributes of a session that change from tick to tick."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -68,6 +72,8 @@ class Session:
         True while every link of all graphs so far carried both ways with the same weight.
     joining : Joining or None
         Frames that robots find during the run; None where they begin in the team's frame.
+    num_frames_off : list of dict
+        Number of frames of each robot that were left out because the schedule had the robot off, by sensor_index.
 
     Raises
     ------
@@ -89,6 +95,7 @@ class Session:
         self.config = config
         self.stop_reason = ""
         self.is_symmetric = True
+        self.num_frames_off = [dict.fromkeys(range(len(robot.views)), 0) for robot in config.robots]
         robot_ids = [robot.robot_id for robot in config.robots]
         check_budget(config.effective_packet, config.classes.num_classes)
         check_team_graph(config.network, config.consensus, robot_ids)
@@ -107,38 +114,68 @@ class Session:
             self._measurer.regroup(self.joining.frames.components)
         self._period_ns = round(config.network.publish_period * 1e9)
         self._graph = self._network.at(0.0, [False] * len(robot_ids), self.team.positions())
+        self._num_ticks = 0
+        self._settling: Settling | None = None
+        # Transform of each robot whose log was opened again.
+        self._reopened: dict[int, tuple[float, ...]] = {}
 
     def ticks(self) -> Iterator[Tick]:
-        """The team after every tick, settling included."""
-        start_ns = self._timeline.first_stamp_ns
-        if start_ns is None:
-            raise InputError("no robot has a frame that can be used")
-        number = 0
-        while not self._timeline.exhausted or number == 0 or self._may_join(number):
+        """The team after every tick, settling included; after ``restore``, every further tick."""
+        start_ns = self._start_ns()
+        while self._settling is None and self._has_scans():
             self._check_next_frame(start_ns)
-            stamp_ns = start_ns + number * self._period_ns
+            number, stamp_ns = self._num_ticks, start_ns + self._num_ticks * self._period_ns
             self._join(number)
             self._integrate(number, stamp_ns)
             yield self._exchange(number, stamp_ns)
-            number += 1
         # The scans of the last period are integrated, but not published yet.
-        yield from self._settle(number, start_ns)
+        yield from self._settle(start_ns)
 
-    def _settle(self, number: int, start_ns: int) -> Iterator[Tick]:
+    def _settle(self, start_ns: int) -> Iterator[Tick]:
         """Ticks over the last graph with gamma ramped to 0, until no log-odds changes (Alg. 1's stopping rule)."""
         if self.config.consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
-        largest = max(robot.largest_log_odds() for robot in self.team.robots)
-        settling = Settling(self._graph, self.config, self._links.longest_transmission, largest)
-        for phase in settling.phases():
+        if self._settling is None:
+            largest = max(robot.largest_log_odds() for robot in self.team.robots)
+            self._settling = Settling(self._graph, self.config, self._links.longest_transmission, largest)
+        for phase in self._settling.phases():
+            number = self._num_ticks
             tick = self._exchange(number, start_ns + number * self._period_ns, phase)
-            settling.note(tick.metrics.max_change)
+            self._settling.note(tick.metrics.max_change)
             yield tick
             # Frees the versions of maps in its messages.
             del tick
-            number += 1
-        self.stop_reason = settling.stop_reason
+        self.stop_reason = self._settling.stop_reason
+
+    # --- state between ticks ------------------------------------------------------------------------------------------
+
+    @property
+    def shared(self) -> dict[str, object]:
+        """Objects that the state refers to, but does not contain, by name."""
+        return {"config": self.config, "threads": self._threads, "packet_codec": self._packet_codec}
+
+    def state(self) -> dict[str, Any]:
+        """Return what ``restore`` needs to continue after the last tick; the next tick changes it."""
+        return {"position": self._timeline.position, **{name: getattr(self, name) for name in _STATE}}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue a new session after the tick of a ``state``; reads the logs up to there again.
+
+        Raises InputError where the logs hold fewer frames than were used.
+        """
+        position: Position = state["position"]
+        for name in _STATE:
+            setattr(self, name, state[name])
+        if self._bodies is not None and self._settling is None:
+            for number in range(self._num_ticks):
+                self._advance_bodies(self._start_ns() + number * self._period_ns)
+        if self._reopen is not None:
+            for index, T_team_map in self._reopened.items():
+                self._timeline.rewind(index, self._reopen(index, T_team_map))
+        self._each(lambda index: self._timeline.skip_to(index, position), range(len(self.team.robots)))
+
+    # --- one tick -----------------------------------------------------------------------------------------------------
 
     def _exchange(self, number: int, stamp_ns: int, phase: Phase = REPLAY) -> Tick:
         """The rest of a tick after its scans: publish, deliver, iterate, measure."""
@@ -157,6 +194,7 @@ class Session:
             if not settling:
                 self.joining.search(robots, is_last=self._timeline.exhausted)
         self._packet_codec.end_tick()
+        self._num_ticks = number + 1
         poses = (
             RobotPose(robot.robot_id, robot.T_team_sensor, metrics.frame_of(robot.robot_id))
             for robot in robots
@@ -178,7 +216,9 @@ class Session:
             return
         for index in moved:
             self.team.change_frame(index)
-            self._timeline.rewind(index, self._reopen(index, self.joining.frames.T_frame_map(index)))
+            self.num_frames_off[index] = dict.fromkeys(self.num_frames_off[index], 0)
+            self._reopened[index] = self.joining.frames.T_frame_map(index)
+            self._timeline.rewind(index, self._reopen(index, self._reopened[index]))
         # What is on the air is in a frame that one of its ends has left.
         self._links.lose(set(moved))
         self._measurer.regroup(self.joining.frames.components)
@@ -193,13 +233,16 @@ class Session:
         for index in schedule.forgets(before, elapsed).nonzero()[0].tolist():
             self.team.restart(index)
             self._measurer.forget()
-        if self._bodies is not None:
-            self._bodies.advance(stamp_ns - self._period_ns, stamp_ns)
+        self._advance_bodies(stamp_ns)
 
         def integrate(index: int) -> None:
-            frames = self._timeline.frames_before(index, stamp_ns)
-            kept = (frame for frame in frames if schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, elapsed))
-            scans = (self._with_bodies(index, frame) for frame in kept)
+            def is_on(frame: Frame) -> bool:
+                is_kept = schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, elapsed)
+                self.num_frames_off[index][frame.sensor_index] += not is_kept
+                return is_kept
+
+            frames = filter(is_on, self._timeline.frames_before(index, stamp_ns))
+            scans = (self._with_bodies(index, frame) for frame in frames)
             self.team.robots[index].integrate(scans, self._of_thread.caster, number)
 
         self._each(integrate, range(len(self.team.robots)))
@@ -207,6 +250,11 @@ class Session:
         active = self._timeline.active(stamp_ns - self._period_ns if leaves else None)
         in_one_frame = None if self.joining is None else self.joining.frames.in_one_frame
         self._graph = self._network.at(elapsed, active, self.team.positions(), in_one_frame)
+
+    def _advance_bodies(self, stamp_ns: int) -> None:
+        """Read the boxes of the robots' bodies up to the stamp of a tick."""
+        if self._bodies is not None:
+            self._bodies.advance(stamp_ns - self._period_ns, stamp_ns)
 
     def _with_bodies(self, index: int, frame: Frame) -> Frame:
         """A robot's frame with the boxes of the other robots."""
@@ -279,9 +327,18 @@ class Session:
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 
-    def _may_join(self, number: int) -> bool:
-        """True where robots may still find each other's frames after the last scan."""
-        return self.joining is not None and self._reopen is not None and self.joining.is_open(number)
+    def _start_ns(self) -> int:
+        """Stamp of the first tick. Raises InputError without frames."""
+        start_ns = self._timeline.first_stamp_ns
+        if start_ns is None:
+            raise InputError("no robot has a frame that can be used")
+        return start_ns
+
+    def _has_scans(self) -> bool:
+        """True before the first tick, while scans are left, and while robots may still find each other's frames."""
+        if not self._timeline.exhausted or self._num_ticks == 0:
+            return True
+        return self.joining is not None and self._reopen is not None and self.joining.is_open(self._num_ticks)
 
     def _check_next_frame(self, start_ns: int) -> None:
         """Raise InputError where the next frame is more ticks away than a run may have."""

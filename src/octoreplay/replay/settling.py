@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from octoreplay.config.consensus import ConsensusConfig
+from octoreplay.config.fields import MAX_TICKS
 from octoreplay.config.network import LinkConfig
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
@@ -55,28 +56,34 @@ class Settling:
         self._consensus = config.consensus
         self._num_finer = num_finer_ticks(config, largest)
         self._quiet_ticks = num_quiet_ticks(graph, config, longest_transmission)
-        self._most = num_settle_ticks(graph, config, longest_transmission, self._num_finer)
+        self._most = min(num_settle_ticks(graph, config, longest_transmission, self._num_finer), MAX_TICKS)
         self._tolerance = config.consensus.settle_tolerance
         if config.effective_flow_bits:
             # No flow is below the quantum.
             self._tolerance = min(self._tolerance, config.consensus.effective_quantum)
         self._num_quiet = 0
+        self._num_ticks = 0
 
     def phases(self) -> Iterator[Phase]:
-        """Phase of each settling tick.
+        """Phase of each settling tick that is left.
 
         In tick n the factor of gamma is 1 - n / settle, and 0 after the ramp. Flows have 2 n bits more, until every
         step is the quantum.
         """
-        for n in range(1, self._most + 1):
+        while self._num_ticks < self._most and not self._has_converged():
+            self._num_ticks += 1
+            n = self._num_ticks
             if n <= self._num_finer:
                 # Coarse flows rest before the maps agree.
                 self._num_quiet = 0
             extra_bits = BITS_PER_TICK * min(n, self._num_finer)
             yield Phase(max(0.0, 1.0 - n / self._consensus.settle), extra_bits, is_settling=True)
-            if self._num_quiet >= self._quiet_ticks and n >= self._num_finer:
-                self.stop_reason = CONVERGED
-                return
+        if self._has_converged():
+            self.stop_reason = CONVERGED
+
+    def _has_converged(self) -> bool:
+        """True where enough ticks in a row changed nothing."""
+        return self._num_ticks >= self._num_finer and self._num_quiet >= self._quiet_ticks
 
     def note(self, max_change: float) -> None:
         """Note the largest change of a log-odds in the last tick."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.io.robots.read_ahead import ReadAhead
-from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.mapping.sensor import sensor_reach
 from octoreplay.records import FrameCounts
 
@@ -23,7 +24,7 @@ class TeamSources:
     def __init__(self, config: ResolvedRun) -> None:
         self._config = config
         self._reach = sensor_reach(config.sensor, config.map)
-        self._logs: list[RobotLog] = []
+        self._logs: list[SensorLogs] = []
         self._sources: list[ReadAhead] = []
         # Each robot's log and its thread, which end before the robot is read again.
         self._opened = [ExitStack() for _ in config.robots]
@@ -52,8 +53,13 @@ class TeamSources:
 
     @property
     def counts(self) -> dict[str, FrameCounts]:
-        """Frames of each robot by outcome, in the present source."""
+        """Messages of each robot by outcome, in the present source."""
         return {log.robot_id: log.counts for log in self._logs}
+
+    def leave_out(self, num_frames_off: Sequence[Mapping[int, int]]) -> None:
+        """Count frames of each robot as left out because it was off, by sensor; call it after the replay."""
+        for log, num_off in zip(self._logs, num_frames_off, strict=True):
+            log.leave_out(num_off)
 
     def reopen(self, index: int, T_team_map: tuple[float, ...]) -> ReadAhead:
         """Replace a robot's source by one that begins again, with another ``T_team_map`` (7 numbers)."""
@@ -65,9 +71,9 @@ class TeamSources:
         self._sources[index] = self._read(index)
         return self._sources[index]
 
-    def _open(self, index: int, robot: ResolvedRobot) -> RobotLog:
+    def _open(self, index: int, robot: ResolvedRobot) -> SensorLogs:
         """Open a robot's log."""
-        log = RobotLog(robot, self._config.time, self._config.classes, reach=self._reach)
+        log = SensorLogs(robot, self._config.time, self._config.classes, reach=self._reach)
         return self._opened[index].enter_context(log)
 
     def _read(self, index: int) -> ReadAhead:

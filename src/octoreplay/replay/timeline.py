@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+from octoreplay.errors import InputError
 from octoreplay.records import Frame
 
 
@@ -25,6 +26,13 @@ class Bodies(Protocol):
         """Return a robot's frame with the boxes of all other robots at its stamp added."""
 
 
+class Position(NamedTuple):
+    """Frames of each robot (N,) that were taken: their number, and the stamp of the last one (None: none)."""
+
+    num_taken: tuple[int, ...]
+    last_ns: tuple[int | None, ...]
+
+
 class Timeline:
     """Frames of all robots up to a common time. It holds one frame of each robot ahead.
 
@@ -34,6 +42,7 @@ class Timeline:
     def __init__(self, logs: Sequence[FrameSource]) -> None:
         self._streams = [log.frames() for log in logs]
         self._next: list[Frame | None] = [next(stream, None) for stream in self._streams]
+        self._num_taken = [0] * len(self._streams)
         self._last_ns: list[int | None] = [None] * len(self._streams)
         stamps = [frame.stamp_ns for frame in self._next if frame is not None]
         self.first_stamp_ns = min(stamps, default=None)
@@ -43,6 +52,22 @@ class Timeline:
         """Continue a robot with another source, from its first frame on."""
         self._streams[robot_index] = source.frames()
         self._next[robot_index] = next(self._streams[robot_index], None)
+        self._num_taken[robot_index] = 0
+
+    @property
+    def position(self) -> Position:
+        """The present position."""
+        return Position(tuple(self._num_taken), tuple(self._last_ns))
+
+    def skip_to(self, robot_index: int, position: Position) -> None:
+        """Skip the frames of a robot up to a position. Raises InputError where the log holds fewer frames."""
+        while self._num_taken[robot_index] < position.num_taken[robot_index]:
+            if self._take(robot_index) is None:
+                raise InputError(
+                    f"the logs hold {self._num_taken[robot_index]} frames of a robot of which the interrupted run used"
+                    f" {position.num_taken[robot_index]}; run with --restart to start from the beginning"
+                )
+        self._last_ns[robot_index] = position.last_ns[robot_index]
 
     @property
     def exhausted(self) -> bool:
@@ -68,6 +93,14 @@ class Timeline:
     def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
         """Remaining frames of a robot with stamps below ``stamp_ns``."""
         while (frame := self._next[robot_index]) is not None and frame.stamp_ns < stamp_ns:
+            self._take(robot_index)
+            yield frame
+
+    def _take(self, robot_index: int) -> Frame | None:
+        """Take the next frame of a robot; None at the end."""
+        frame = self._next[robot_index]
+        if frame is not None:
+            self._num_taken[robot_index] += 1
             self._last_ns[robot_index] = frame.stamp_ns
             self._next[robot_index] = next(self._streams[robot_index], None)
-            yield frame
+        return frame

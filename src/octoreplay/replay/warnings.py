@@ -7,7 +7,12 @@ from collections.abc import Mapping, Sequence
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import RULES
 from octoreplay.mapping.contradiction import LABEL_LIMIT, MIN_OVERLAP, contradicting_pairs
+from octoreplay.records import MIN_GAP_NS, FrameCounts
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
+
+_LONG_GAP = 10
+"""Least length of a part that is reported, in mean distances of a robot's used images or clouds."""
+_MAX_GAPS_SHOWN = 3
 
 
 def rule_warnings(config: ResolvedRun, is_symmetric: bool) -> tuple[str, ...]:
@@ -29,7 +34,8 @@ def _flow_warnings(config: ResolvedRun) -> tuple[str, ...]:
         return ()
     sentence = (
         f"flow_bits {config.effective_flow_bits} with packets that do not hold the maps exactly: the maps do not come"
-        " to rest; leave flow_bits out, or use content 'float32' without top_classes, budget and prune_tolerance"
+        " to rest; leave --flow-bits out, or use --content float32 without --top-classes, --budget and"
+        " --prune-tolerance"
     )
     return (sentence,)
 
@@ -52,7 +58,7 @@ def _sum_warnings(config: ResolvedRun, ids: Sequence[str], is_symmetric: bool) -
     if not found:
         return ()
     others = [
-        f"'{other.name}'"
+        other.name
         for other in RULES.values()
         if other.survives_losses
         and (other.survives_restarts or not has_restarts)
@@ -60,8 +66,8 @@ def _sum_warnings(config: ResolvedRun, ids: Sequence[str], is_symmetric: bool) -
     ]
     sentence = (
         f"rule '{rule.name}' keeps the team's sum only when both ends of a link receive a map in the same tick; with"
-        f" {', '.join([*found[:-2], ' and '.join(found[-2:])])} it drifts from the mean; rule {' or '.join(others)}"
-        " does not"
+        f" {', '.join([*found[:-2], ' and '.join(found[-2:])])} it drifts from the mean; use --rule"
+        f" {' or '.join(others)}"
     )
     return (sentence,)
 
@@ -70,7 +76,45 @@ def map_warnings(num_known_cells: int) -> tuple[str, ...]:
     """Sentences on the maps at the end of a run, which know a number of cells together."""
     if num_known_cells > 0:
         return ()
-    return ("the maps are empty: no ray passes the mapped region; check bounds, max_range, body_box and the poses",)
+    checks = "check --bounds, --max-range, the poses, and body_box in the team file"
+    return (f"the maps are empty: no ray passes the mapped region; {checks}",)
+
+
+def coverage_warnings(counts: Mapping[str, FrameCounts]) -> tuple[str, ...]:
+    """Sentences on the robots of which nothing was mapped for a long part of the run, from cut or late logs on.
+
+    A part is long from MIN_GAP_NS on, if it is also ten times the mean distance of the robot's other images or clouds.
+    """
+    spans = [of_robot.used_span for of_robot in counts.values() if of_robot.used_span is not None]
+    if not spans:
+        return ()
+    start_ns, end_ns = min(start for start, _ in spans), max(end for _, end in spans)
+    sentences = []
+    for robot_id, of_robot in counts.items():
+        gaps, least_ns = [(start_ns, end_ns)], MIN_GAP_NS
+        if of_robot.used_span is not None:
+            first_ns, last_ns = of_robot.used_span
+            gaps = [(start_ns, first_ns), *of_robot.gaps, (last_ns, end_ns)]
+            least_ns = max(least_ns, _LONG_GAP * _mean_distance_ns(of_robot))
+        gaps = [(start, end) for start, end in gaps if end - start >= least_ns]
+        if gaps:
+            total = sum(end - start for start, end in gaps) / 1e9
+            shown = ", ".join(f"{start / 1e9:.3f} s to {end / 1e9:.3f} s" for start, end in gaps[:_MAX_GAPS_SHOWN])
+            more = ", ..." if len(gaps) > _MAX_GAPS_SHOWN else ""
+            parts = "1 part" if len(gaps) == 1 else f"{len(gaps)} parts"
+            what = f"no image or cloud was mapped for {total:.1f} s, in {parts} of the run"
+            sentences.append(f"{robot_id}: {what}: stamps {shown}{more};"
+                             " compare the counts of its messages with 'octoreplay info'")  # fmt: skip
+    return tuple(sentences)
+
+
+def _mean_distance_ns(counts: FrameCounts) -> int:
+    """Mean distance of a robot's used images or clouds [ns], without gaps where it has others."""
+    first_ns, last_ns = counts.used_span or (0, 0)
+    num_short = counts.used - 1 - len(counts.gaps)
+    if num_short > 0:
+        return (last_ns - first_ns - sum(end - start for start, end in counts.gaps)) // num_short
+    return (last_ns - first_ns) // max(counts.used - 1, 1)
 
 
 def team_frame_warnings(metrics: TickMetrics, num_cells: Mapping[str, int]) -> tuple[str, ...]:

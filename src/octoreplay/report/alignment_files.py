@@ -1,4 +1,4 @@
-"""Alignments as CSV and JSON files (docs/frames.md)."""
+"""Alignments as CSV files, and for JSON (docs/frames.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.output_file import write_whole
 from octoreplay.records import Float64Array
 from octoreplay.registration.pairs import PairAlignment
 from octoreplay.replay.alignment import Alignment, RobotFrame
@@ -24,13 +24,10 @@ PAIR_COLUMNS = (
 """Columns of the CSV file, one row for each pair."""
 
 
-def write_alignment(alignment: Alignment, *, csv_path: Path | None, json_path: Path | None) -> list[Path]:
-    """Write an alignment as CSV and JSON and return the files. Raises OutputError."""
-    if csv_path is not None:
-        write_whole(csv_path, alignment_csv(alignment))
-    if json_path is not None:
-        write_whole(json_path, alignment_json(alignment))
-    return [path for path in (csv_path, json_path) if path is not None]
+def write_alignment(alignment: Alignment, path: Path) -> list[Path]:
+    """Write the pairs of an alignment as CSV and return the file. Raises OutputError."""
+    write_whole(path, alignment_csv(alignment))
+    return [path]
 
 
 def alignment_csv(alignment: Alignment) -> str:
@@ -44,19 +41,17 @@ def alignment_csv(alignment: Alignment) -> str:
     return text.getvalue()
 
 
-def alignment_json(alignment: Alignment) -> str:
-    """Return an alignment as JSON text: its components with frames and covariances, all pairs, and the sentences."""
-    return json_text(
-        {
-            "components": [[_frame(frame) for frame in team] for team in alignment.teams],
-            "left_out": alignment.left_out,
-            "pairs": [
-                _pair(alignment, pair) | {"information": _position_first(pair.information)} for pair in alignment.pairs
-            ],
-            "problems": alignment.problems,
-            "notes": alignment.notes,
-        }
-    )
+def alignment_content(alignment: Alignment) -> dict[str, Any]:
+    """Return an alignment for JSON: its components with frames and covariances, all pairs, and the sentences."""
+    return {
+        "components": [[_frame(frame) for frame in team] for team in alignment.teams],
+        "left_out": alignment.left_out,
+        "pairs": [
+            _pair(alignment, pair) | {"information": _position_first(pair.information)} for pair in alignment.pairs
+        ],
+        "problems": alignment.problems,
+        "notes": alignment.notes,
+    }
 
 
 def _frame(frame: RobotFrame) -> dict[str, Any]:
@@ -67,6 +62,7 @@ def _frame(frame: RobotFrame) -> dict[str, Any]:
         "T_team_map_sigma": frame.sigma,
         "covariance": None if frame.covariance is None else _position_first(frame.covariance),
         "from": frame.origin,
+        "evidence": frame.evidence,
         "partner": frame.partner,
     }
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from octoreplay.records import Float64Array
 from octoreplay.registration.pairs import PairAlignment
-from octoreplay.replay.alignment import Alignment, RobotFrame
+from octoreplay.replay.alignment import Alignment
 from octoreplay.report.tables import share, styled_table, worst_pair
 from octoreplay.run_metrics import PAIR_SHARES, PairMetrics
 
@@ -30,7 +32,8 @@ def alignment_tables(alignment: Alignment) -> RenderableType:
     parts: list[RenderableType] = [pairs_table(alignment)]
     teams = [team for team in alignment.teams if len(team) > 1]
     for number, team in enumerate(teams, start=1):
-        parts += ["", frames_table(team, f"Frames of component {number}" if len(teams) > 1 else "Frames")]
+        frames = (FrameRow(frame.robot_id, frame.T_team_map, frame.sigma, frame.origin) for frame in team)
+        parts += ["", frames_table(frames, f"Frames of component {number}" if len(teams) > 1 else "Frames")]
     return Group(*parts)
 
 
@@ -79,25 +82,33 @@ def pairs_table(alignment: Alignment) -> RenderableType:
     return Group(table, f"and {len(hidden)} more pairs, of which {accepted} are accepted; --csv writes all")
 
 
-def frames_table(team: Sequence[RobotFrame], title: str) -> Table:
+class FrameRow(NamedTuple):
+    """Row of a table of frames: T_team_map (4, 4), its ``RobotFrame.sigma``, and a phrase on its origin."""
+
+    robot_id: str
+    T_team_map: Float64Array
+    sigma: Sequence[float] | None
+    origin: str
+
+
+def frames_table(frames: Iterable[FrameRow], title: str) -> Table:
     """Return a table of the robots' frames: position [m] and angles [degrees], each with its standard deviation."""
     table = styled_table(title)
     table.add_column("robot", no_wrap=True)
     for name in ("x [m]", "y [m]", "z [m]", "yaw [\u00b0]", "tilt [\u00b0]", "\u00b1 xyz [m]", "\u00b1 yaw [\u00b0]"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("from", overflow="fold")
-    for frame in team:
-        T, sigma = frame.T_team_map, frame.sigma
+    for robot_id, T, sigma, origin in frames:
         # Adding 0 turns -0 into 0.
         yaw = round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0
         tilt = math.degrees(math.acos(min(1.0, max(-1.0, float(T[2, 2])))))
         spread = ("-", "-") if sigma is None else (f"{math.hypot(*sigma[:3]):.2f}", f"{math.degrees(sigma[5]):.2f}")
         table.add_row(
-            frame.robot_id,
+            robot_id,
             *(f"{round(float(value), 2) + 0.0:.2f}" for value in T[:3, 3]),
             f"{yaw:.1f}",
             f"{tilt:.1f}",
             *spread,
-            frame.origin,
+            origin,
         )
     return table

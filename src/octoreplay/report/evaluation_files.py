@@ -1,4 +1,4 @@
-"""Evaluations as CSV and JSON files (docs/evaluation.md)."""
+"""Evaluations as CSV files, and for JSON (docs/evaluation.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from octoreplay.evaluate.records import MAP_SCORES, SCORES, EvaluatedTick, Evaluation, MapScores
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.output_file import write_whole
 from octoreplay.records import CENTRAL
 from octoreplay.run_metrics import PAIR_SHARES
 
@@ -52,8 +52,8 @@ def evaluation_csv(evaluation: Evaluation) -> str:
     return text.getvalue()
 
 
-def evaluation_json(evaluation: Evaluation) -> str:
-    """Return an evaluation as JSON text: the fields of its records, null for missing values.
+def evaluation_content(evaluation: Evaluation) -> dict[str, Any]:
+    """Return an evaluation for JSON: the fields of its records.
 
     Each tick has ``mean``, ``least`` and ``largest`` over the robots beside its ``maps``.
     """
@@ -69,15 +69,12 @@ def evaluation_json(evaluation: Evaluation) -> str:
         }
         for tick in evaluation.ticks
     ]
-    return json_text({**vars(evaluation), "ticks": ticks})
+    return {**vars(evaluation), "ticks": ticks}
 
 
-def write_evaluation(evaluation: Evaluation, *, csv_path: Path | None = None, json_path: Path | None = None) -> None:
-    """Write ``evaluation_csv`` and ``evaluation_json`` to the given paths. Raises OutputError."""
-    if csv_path is not None:
-        write_whole(csv_path, evaluation_csv(evaluation))
-    if json_path is not None:
-        write_whole(json_path, evaluation_json(evaluation))
+def write_evaluation(evaluation: Evaluation, path: Path) -> None:
+    """Write ``evaluation_csv`` to a file. Raises OutputError."""
+    write_whole(path, evaluation_csv(evaluation))
 
 
 def _map_fields(evaluation: Evaluation, scores: MapScores) -> dict[str, Any]:

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from octoreplay.evaluate.records import EvaluatedTick, Evaluation
-from octoreplay.report.figures import BLUE, GREEN, ORANGE, legend_below, new_figure, over_log_time, save_figures, style
+from octoreplay.report.figures import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    legend_below,
+    new_figure,
+    over_log_time,
+    plain,
+    save_figures,
+    style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +81,8 @@ def _classes_figure(evaluation: Evaluation) -> Figure:
     axes.bar(places - 0.2, _robots_iou(evaluation).mean(axis=0), 0.4, color=BLUE, label="robots, mean")
     if final.central is not None:
         axes.bar(places + 0.2, evaluation.iou(final.central), 0.4, color=ORANGE, label="centralised map")
-    axes.set_xticks(places, evaluation.class_names, rotation=45 if len(places) > 6 else 0, ha="right", fontsize=8)
+    names = [plain(name) for name in evaluation.class_names]
+    axes.set_xticks(places, names, rotation=45 if len(places) > 6 else 0, ha="right", fontsize=8)
     return _finished(figure, axes)
 
 

@@ -1,187 +1,317 @@
-"""Export of a stored map as a PLY file."""
+"""Export of stored maps to the files of other tools."""
 
 from __future__ import annotations
 
+import datetime
+import logging
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from octoreplay.config.class_tables.palette import PALETTE
-from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.results import ply
-from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import (
-    MAP_KINDS,
-    MEAN,
-    POSTERIOR,
-    BoolArray,
-    ClassTable,
-    Float64Array,
-    FloatArray,
-    LeafTable,
-    UInt8Array,
-)
+from octoreplay.errors import ConfigError, InputError, OutputError
+from octoreplay.io.file_sets import write_together
+from octoreplay.io.output_file import mark_written
+from octoreplay.io.results import glb, las, npz, octomap_trees, ply
+from octoreplay.io.results.occupancy_grid import OCCUPIED, grid_files, grid_of
+from octoreplay.log_odds import best_labels
+from octoreplay.mapping.merged_faces import merged_faces
+from octoreplay.records import MAP_KINDS, POSTERIOR, BoolArray, ClassTable, FilePath, Int64Array, LeafTable, UInt8Array
+from octoreplay.report.cell_colors import COLORS, LeafColors, check_one_frame, default_color, leaf_colors
 from octoreplay.result import Result, StoredMap, open_result
 
-COLORS = ("label", "robot", "disagreement", "probability")
-_OF_ALL_ROBOTS = ("robot", "disagreement")
-"""Colours that are computed from the maps of all robots."""
-FREE_COLOR = (225, 225, 225)
+_log = logging.getLogger(__name__)
 
-_RAMP = np.array(
-    [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142], [31, 158, 137], [53, 183, 121],
-     [109, 205, 89], [180, 222, 44], [253, 231, 37]], dtype=np.float64,
-)  # fmt: skip
-"""Matplotlib's viridis at ten even steps, from dark (low) to yellow (high)."""
+SPLITS = ("class", "robot")
+"""Properties by which a map is divided into several files."""
 
 
-def export_ply(
-    result_path: Path, output: Path, robot: str | None = None, at: float | None = None, what: str = "points",
-    color: str = "label", *, free: bool = False, map_kind: str = POSTERIOR,
-) -> int:  # fmt: skip
-    """Write a map of a result as a PLY file and return the number of leaves in it.
+_MOST_OCCUPIED = 0.5
+"""Share of the known cells of a grid above which the ground is probably in it."""
 
-    The comments of the file name the options.
+
+class _Content(NamedTuple):
+    """Content of one file: leaves with colours (L, 3) and robots (L,), and what describes them."""
+
+    leaves: LeafTable
+    colors: UInt8Array
+    robots: Int64Array
+    comments: Sequence[str]
+    classes: ClassTable
+    resolution: float
+    day: datetime.date
+
+    def taken(self, chosen: BoolArray) -> _Content:
+        """Return the content with the leaves where ``chosen`` (L,) is True."""
+        return self._replace(leaves=self.leaves.taken(chosen), colors=self.colors[chosen], robots=self.robots[chosen])
+
+
+_Files = dict[Path, tuple[bytes, int]]
+"""Contents of files, and the number of leaves or of known cells in each."""
+
+
+def _encode_ply(path: Path, content: _Content, what: str) -> _Files:
+    """PLY file."""
+    encode = ply.voxels_file if what == "voxels" else ply.points_file
+    return {path: (encode(content.leaves, content.colors, content.comments), len(content.leaves))}
+
+
+def _encode_npz(path: Path, content: _Content, _: str) -> _Files:
+    """NumPy archive."""
+    archive = npz.archive_file(content.leaves, content.colors, content.classes, content.resolution)
+    return {path: (archive, len(content.leaves))}
+
+
+def _encode_glb(path: Path, content: _Content, _: str) -> _Files:
+    """GLB file."""
+    faces = merged_faces(content.leaves, content.colors, content.resolution)
+    return {path: (glb.mesh_file(*faces, content.comments), len(content.leaves))}
+
+
+def _encode_las(path: Path, content: _Content, _: str) -> _Files:
+    """LAS or LAZ file."""
+    is_compressed = path.suffix.lower() == ".laz"
+    points = las.points_file(
+        content.leaves, content.colors, content.classes, content.robots, content.day, compressed=is_compressed
+    )
+    return {path: (points, len(content.leaves))}
+
+
+def _encode_tree(path: Path, content: _Content, _: str) -> _Files:
+    """OctoMap file."""
+    is_binary = path.suffix.lower() == ".bt"
+    tree = octomap_trees.tree_file(content.leaves, content.colors, content.resolution, binary=is_binary)
+    return {path: (tree, len(content.leaves))}
+
+
+def _encode_grid(path: Path, content: _Content, _: str) -> _Files:
+    """Occupancy grid and its image; warns where the ground seems to be in it."""
+    grid = grid_of(content.leaves, content.resolution)
+    share = np.count_nonzero(grid.cells == OCCUPIED) / max(grid.num_known, 1)
+    if share > _MOST_OCCUPIED:
+        _log.warning(
+            "warning: %s: %.0f %% of the known cells are occupied, as with the ground in the grid; leave it out with"
+            " --heights LOW HIGH, such as --heights 0.2 1.5", path, 100 * share,
+        )  # fmt: skip
+    return {name: (data, grid.num_known) for name, data in grid_files(path, grid).items()}
+
+
+class _Format(NamedTuple):
+    """Format of a suffix: its encoder, whether it needs free leaves, and the properties that it can be split by."""
+
+    encode: Callable[[Path, _Content, str], _Files]
+    has_free: bool = False
+    splits: tuple[str, ...] = SPLITS
+
+
+_FORMATS: Mapping[str, _Format] = {
+    ".ply": _Format(_encode_ply),
+    ".npz": _Format(_encode_npz),
+    ".glb": _Format(_encode_glb),
+    ".laz": _Format(_encode_las),
+    ".las": _Format(_encode_las),
+    ".bt": _Format(_encode_tree, has_free=True, splits=("robot",)),
+    ".ot": _Format(_encode_tree, has_free=True, splits=("robot",)),
+    ".yaml": _Format(_encode_grid, has_free=True, splits=("robot",)),
+}
+SUFFIXES = tuple(_FORMATS)
+"""Suffixes of the formats."""
+
+
+def export_map(
+    result_path: FilePath, output: FilePath, robot: str | None = None, at: float | None = None,
+    what: str = "points", color: str | None = None, *, free: bool = False, map_kind: str = POSTERIOR,
+    heights: tuple[float, float] = (-math.inf, math.inf), split: str | None = None,
+) -> dict[Path, int]:  # fmt: skip
+    """Write a map of a result; return the files with the number of leaves in each, of a grid of known cells.
+
+    The suffix of ``output`` chooses the format:
+
+    - ``.ply``: leaf centres as points, or leaves as cubes; its comments name the options
+    - ``.npz``: NumPy arrays (``io.results.npz``)
+    - ``.glb``: surface of the leaves, with equal neighbouring faces merged (glTF 2.0)
+    - ``.laz``, ``.las``: leaf centres with the label as classification (LAS 1.4); needs the extra ``las``
+    - ``.bt``: OctoMap's OcTree, occupied and free leaves; ``.ot``: ColorOcTree with log-odds and colours
+    - ``.yaml``: two-dimensional occupancy grid of ROS and nav2, with a ``.pgm`` image beside it
 
     Parameters
     ----------
-    result_path, output : Path
-        Result file and PLY file.
+    result_path, output : path
+        Result file and file to write.
     robot : str, optional
         Robot of the map. None is the first robot; with color 'robot' it is the overlay of all robots' maps.
     at : float, optional
         Time since the run's start in seconds, None for the end.
     what : str
-        'points' (leaf centres) or 'voxels' (cubes).
-    color : str
-        - 'label': colour of the most probable class; free leaves are grey
-        - 'robot': mean colour of the robots whose map knows the leaf's centre
-        - 'probability': probability of the label, from 1 / (C + 1), dark, to 1, yellow
-        - 'disagreement': largest ||h_j - h|| over the other robots at the leaf's centre, from 0, dark, to the largest
-          in the file, yellow (an unknown cell counts as the prior)
+        For PLY, 'points' (leaf centres) or 'voxels' (cubes).
+    color : str, optional
+        One of ``cell_colors.COLORS``: 'label', 'height', 'robot', 'seen-by', 'disagreement', 'contradiction' or
+        'probability'. None is 'label', or 'height' for a map with a single class.
     free : bool
-        True to write free leaves too.
+        True to write free leaves too. OctoMap trees and grids always have them.
     map_kind : str
-        'posterior' for labels and probabilities of the team's posterior h_0 + N (h - h_0), 'mean' for those of h
-        (``StoredMap``); the disagreement is that of h.
+        'posterior' or 'mean' (``StoredMap``), for labels and probabilities; the disagreement is that of the mean.
+    heights : (float, float)
+        Lowest and highest z of the map [m]; leaves that overlap this range are written.
+    split : str, optional
+        'class' for a file of each class, 'robot' for a file of each robot's map. They are ``NAME-CLASS_ID-CLASS`` and
+        ``NAME-ROBOT`` with the suffix of ``output``, and get their names when all of them are complete.
 
     Raises
     ------
     ConfigError
-        ``what``, ``color`` or ``map_kind`` is unknown.
+        An option or the suffix is unknown, options exclude each other, or an optional package is missing.
     InputError
         The result cannot be read, has no such map, or has maps in several frames that the options put together.
     OutputError
-        The PLY file cannot be written.
+        A file cannot be written, or its format cannot hold the map.
     """
-    if what not in ("points", "voxels"):
-        raise ConfigError(f"what: '{what}' is not one of points, voxels")
-    if color not in COLORS:
-        raise ConfigError(f"color: '{color}' is not one of {', '.join(COLORS)}")
-    if map_kind not in MAP_KINDS:
-        raise ConfigError(f"map: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
+    output = Path(output)
+    kind = _checked_format(output, what, color, map_kind, heights, split, robot)
     with open_result(result_path) as result:
         at_ns = None if at is None else result.time_ns(at)
-        together = robot is None and color == "robot"
-        chosen = result.robots if together else (result.robots[0] if robot is None else robot,)
-        shown = [result.map(robot_id, at_ns=at_ns) for robot_id in chosen]
-        if together or color in _OF_ALL_ROBOTS:
-            _check_one_frame(result, at_ns)
-        leaves = _leaves(shown, map_kind, free)
-        colors, scale = _colors(result, shown, leaves, color, at_ns)
-        comments = _comments(result, shown, color, scale, map_kind)
-    write = ply.write_voxels if what == "voxels" else ply.write_points
-    write(output, leaves, colors, comments)
-    return len(leaves)
+        with_free = free or kind.has_free
+        contents = _contents(result, robot, at_ns, color, map_kind, heights, split, with_free=with_free)
+        parts = dict(_parts(output, contents, result.class_table, split))
+    files = _encoded(kind, parts, what)
+    write_together({path: data for path, (data, _) in files.items()})
+    mark_written(output)
+    return {path: count for path, (_, count) in files.items()}
 
 
-def _check_one_frame(result: Result, at_ns: int | None) -> None:
-    """Raise InputError where the robots' maps are in several frames."""
-    maps = [result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
-    if len({stored.frame_id for stored in maps}) > 1:
-        frames = ", ".join(f"{stored.robot_id} in {stored.frame_id}" for stored in maps)
-        raise InputError(
-            f"{result.path}: the robots' maps are in different frames ({frames}); name a robot and color 'label' or"
-            " 'probability', or a later time"
-        )
+def _encoded(kind: _Format, parts: Mapping[Path, _Content], what: str) -> _Files:
+    """Files of all parts; OutputError for a map that the format cannot hold."""
+    files: _Files = {}
+    for path, content in parts.items():
+        try:
+            files |= kind.encode(path, content, what)
+        except ValueError as error:
+            raise OutputError(f"{path}: {error}; export a PLY or NPZ file") from error
+    return files
 
 
-def _leaves(maps: list[StoredMap], map_kind: str, free: bool) -> LeafTable:
-    """Leaves of some maps; a leaf of several maps is taken from the first one."""
+def _checked_format(
+    output: Path, what: str, color: str | None, map_kind: str, heights: tuple[float, float], split: str | None,
+    robot: str | None,
+) -> _Format:  # fmt: skip
+    """Format of the output; ConfigError for options that are unknown or exclude each other."""
+    suffix = output.suffix.lower().replace(".yml", ".yaml")
+    kind = _FORMATS.get(suffix)
+    if kind is None:
+        raise ConfigError(f"{output}: the name of the output must end in one of {', '.join(SUFFIXES)}")
+    for name, value, choices in (
+        ("what", what, ("points", "voxels")), ("color", color, COLORS), ("map", map_kind, MAP_KINDS),
+        ("split", split, SPLITS),
+    ):  # fmt: skip
+        if value is not None and value not in choices:
+            raise ConfigError(f"{name}: '{value}' is not one of {', '.join(choices)}")
+    if not heights[0] < heights[1]:
+        raise ConfigError(f"heights: the lowest, {heights[0]:g}, must be below the highest, {heights[1]:g}")
+    if split is not None and split not in kind.splits:
+        raise ConfigError(f"{output}: a {suffix} file holds occupied and free space together; split it by robot only")
+    if split == "robot" and robot is not None:
+        raise ConfigError(f"split: 'robot' writes the maps of all robots; leave out robot '{robot}'")
+    return kind
+
+
+def _contents(
+    result: Result, robot: str | None, at_ns: int | None, color: str | None, map_kind: str,
+    heights: tuple[float, float], split: str | None, *, with_free: bool,
+) -> dict[tuple[str, ...], _Content]:  # fmt: skip
+    """Contents of the files by the robots of their maps; InputError where there is no leaf to write."""
+    color = color or default_color(result.class_table)
+    groups: list[tuple[str, ...]]
+    if split == "robot":
+        groups = [(robot_id,) for robot_id in result.robots]
+    elif robot is None and color == "robot":
+        check_one_frame(result, at_ns)
+        groups = [result.robots]
+    else:
+        groups = [(robot or result.robots[0],)]
+    contents = {ids: _content(result, ids, at_ns, color, map_kind, heights, with_free=with_free) for ids in groups}
+    _check_leaves(result, contents, heights)
+    return contents
+
+
+def _content(
+    result: Result, robot_ids: Sequence[str], at_ns: int | None, color: str, map_kind: str,
+    heights: tuple[float, float], *, with_free: bool,
+) -> _Content:  # fmt: skip
+    """Content of the file of some robots' maps."""
+    shown = [result.map(robot_id, at_ns=at_ns) for robot_id in robot_ids]
+    leaves, owners = _leaves(shown, map_kind)
+    keep = leaves.between(*heights)
+    if not with_free:
+        keep &= best_labels(leaves.log_odds) > 0
+    leaves = leaves.taken(keep)
+    colors = leaf_colors(result, shown, leaves, color, at_ns)
+    indices = np.array([_index(result, stored) for stored in shown], np.int64)
+    day = datetime.datetime.fromtimestamp(shown[0].stamp_ns // 10**9, datetime.UTC).date()
+    return _Content(
+        leaves, colors.colors, indices[owners[keep]], _comments(result, shown, color, colors, map_kind),
+        result.class_table, shown[0].resolution, day,
+    )  # fmt: skip
+
+
+def _index(result: Result, stored: StoredMap) -> int:
+    """Index of a map's robot in the team; the number of robots for the centralised map."""
+    ids = result.robots
+    return ids.index(stored.robot_id) if stored.robot_id in ids else len(ids)
+
+
+def _check_leaves(result: Result, contents: Mapping[tuple[str, ...], _Content], heights: tuple[float, float]) -> None:
+    """Raise InputError where there is no leaf to write."""
+    if any(len(content.leaves) for content in contents.values()):
+        return
+    if heights != (-math.inf, math.inf):
+        low, high = heights
+        raise InputError(f"{result.path}: the map holds nothing from {low:g} m to {high:g} m; give other heights")
+    names = ", ".join(robot_id for ids in contents for robot_id in ids)
+    raise InputError(f"{result.path}: the map of {names} holds no occupied leaf; use --free, or a later time")
+
+
+def _parts(
+    output: Path, contents: Mapping[tuple[str, ...], _Content], classes: ClassTable, split: str | None
+) -> Iterator[tuple[Path, _Content]]:
+    """Content of each file to write; files without a leaf are left out."""
+    for ids, content in contents.items():
+        if split == "class":
+            labels = best_labels(content.leaves.log_odds)
+            for class_id, name in enumerate(("free", *classes.names)):
+                if (labels == class_id).any():
+                    # File systems may refuse characters of a class name; the number keeps names apart.
+                    part = f"{class_id}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
+                    yield _named(output, part), content.taken(labels == class_id)
+        elif len(content.leaves):
+            yield _named(output, ids[0]) if split else output, content
+
+
+def _named(output: Path, part: str) -> Path:
+    """Path of a part of the output."""
+    return output.with_name(f"{output.stem}-{part}{output.suffix}")
+
+
+def _leaves(maps: Sequence[StoredMap], map_kind: str) -> tuple[LeafTable, Int64Array]:
+    """Leaves of some maps, and the position of the map of each; a leaf of several maps is taken from the first one."""
     tables = [stored.leaves(map_kind=map_kind) for stored in maps]
+    owners = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    if len(tables) == 1:
+        return tables[0], owners
     centers = np.concatenate([table.centers for table in tables])
     sizes = np.concatenate([table.sizes for table in tables])
     log_odds = np.concatenate([table.log_odds for table in tables])
-    keep = np.ones(len(sizes), dtype=np.bool_)
-    if len(tables) > 1:
-        # Centres lie on multiples of half the resolution, so that rounding gives equal leaves equal keys.
-        keys = np.column_stack([np.rint(centers / (maps[0].resolution / 2)), np.rint(sizes / maps[0].resolution)])
-        _, first = np.unique(keys.astype(np.int64), axis=0, return_index=True)
-        keep[:] = False
-        keep[first] = True
-    if not free:
-        keep &= best_labels(log_odds) > 0
-    return LeafTable(centers[keep], sizes[keep], log_odds[keep])
+    # Centres lie on multiples of half the resolution, so that rounding gives equal leaves equal keys.
+    keys = np.column_stack([np.rint(centers / (maps[0].resolution / 2)), np.rint(sizes / maps[0].resolution)])
+    _, first = np.unique(keys.astype(np.int64), axis=0, return_index=True)
+    keep = np.zeros(len(sizes), dtype=np.bool_)
+    keep[first] = True
+    return LeafTable(centers, sizes, log_odds).taken(keep), owners[keep]
 
 
-def _colors(
-    result: Result, shown: list[StoredMap], leaves: LeafTable, color: str, at_ns: int | None
-) -> tuple[UInt8Array, str]:
-    """Colours (L, 3) of the leaves, and the meaning of the scale."""
-    if color == "label":
-        return _label_colors(result.class_table, leaves), "the classes' own"
-    if color == "probability":
-        least = 1.0 / (result.class_table.num_classes + 1)
-        values = (label_probabilities(leaves.log_odds) - least) / (1.0 - least)
-        return _ramp(values), f"dark {least:.3f}, yellow 1"
-    ids = {stored.robot_id: stored for stored in shown}
-    maps = [ids.get(robot_id) or result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
-    if color == "robot":
-        known = np.column_stack([stored.query(leaves.centers, map_kind=MEAN).known for stored in maps])
-        return _robot_colors(known), ", ".join(f"{m.robot_id} {_robot_color(i)}" for i, m in enumerate(maps))
-    values = _disagreement(shown[0], maps, leaves.centers)
-    largest = float(values.max(initial=0.0))
-    return _ramp(values / largest if largest > 0 else values), f"dark 0, yellow {largest:.6g}"
-
-
-def _label_colors(class_table: ClassTable, leaves: LeafTable) -> UInt8Array:
-    """Colours (L, 3) of the labels; free is grey."""
-    palette = np.concatenate([np.array([FREE_COLOR], dtype=np.uint8), class_table.colors])
-    return palette.take(best_labels(leaves.log_odds), axis=0)
-
-
-def _robot_color(index: int) -> tuple[int, int, int]:
-    """Colour of a robot by its index."""
-    return PALETTE[index % len(PALETTE)]
-
-
-def _robot_colors(known: BoolArray) -> UInt8Array:
-    """Mean colour (L, 3) of the robots that know a leaf, from (L, N)."""
-    palette = np.array([_robot_color(index) for index in range(known.shape[1])], dtype=np.float64)
-    count = np.maximum(known.sum(axis=1, keepdims=True), 1)
-    mean: Float64Array = known.astype(np.float64) @ palette / count
-    return (mean + 0.5).astype(np.uint8)
-
-
-def _disagreement(own: StoredMap, maps: list[StoredMap], points: Float64Array) -> FloatArray:
-    """Largest distance (P,) float64 between one robot's log-odds and another's at points."""
-    h = own.query(points, map_kind=MEAN).log_odds.astype(np.float64)
-    largest = np.zeros(len(points))
-    for other in maps:
-        if other is not own:
-            difference = other.query(points, map_kind=MEAN).log_odds - h
-            np.maximum(largest, np.linalg.norm(difference, axis=1), out=largest)
-    return largest
-
-
-def _ramp(values: FloatArray) -> UInt8Array:
-    """Colours (L, 3) of values (L,) in 0..1."""
-    place = np.clip(values, 0.0, 1.0) * (len(_RAMP) - 1)
-    steps = np.arange(len(_RAMP))
-    return np.rint(np.column_stack([np.interp(place, steps, _RAMP[:, k]) for k in range(3)])).astype(np.uint8)
-
-
-def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, map_kind: str) -> list[str]:
+def _comments(result: Result, shown: Sequence[StoredMap], color: str, colors: LeafColors, map_kind: str) -> list[str]:
     """Comments of the file: map, time, classes and colours."""
     last = shown[0]
     names = ", ".join(f"{c.class_id} {c.name}" for c in result.class_table.classes)
@@ -192,6 +322,6 @@ def _comments(result: Result, shown: list[StoredMap], color: str, scale: str, ma
         f"resolution {last.resolution:g} m, log-odds: {kinds}",
         f"frame: {last.frame_id}",
         f"classes: 0 free, {names}",
-        f"color: {color} ({scale})",
+        f"color: {color} ({colors.scale})",
     ]
     return ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in lines]

@@ -4,85 +4,49 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from octoreplay.records import ClassTable, Color, UInt8Array
-from octoreplay.report.figures import BLUE, GREEN, GREY, ORANGE, over_log_time
+from octoreplay.report.figures import GREY
+from octoreplay.report.log_time import PlottedRun
 from octoreplay.report.map_view import BACKGROUND, opacities
-from octoreplay.report.plots import log_seconds, over_robots
+from octoreplay.report.run_figures import run_figure
 from octoreplay.run_metrics import TickMetrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAPER_RATIO = 4.0
 """Ratio of uniform grid to octree in the paper, 'more than four times'."""
 
+_FIGURES = {"total_distance": "phi", "agreement": "agreement", "packet_size": "packets"}
+"""Figures over time by the name of their file."""
 _INK = "#333333"
 _COLOR_STEP = 4
 _LEGEND_HEIGHT = 0.9
 """Height of the legend below the pictures in inches."""
 
 
-def distance_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Return a figure of Phi over time on a logarithmic axis, with lines at ``moments`` in seconds."""
-    figure, [axes] = over_log_time("Total distance in local map estimates", ["\u03a6"])
-    values = np.array([tick.total_distance for tick in metrics])
-    axes.plot(log_seconds(metrics), np.where(values > 0, values, np.nan), color=BLUE, linewidth=1.6)
-    if (values > 0).any():
-        axes.set_yscale("log")
-    _mark(axes, moments)
-    return figure
+def paper_figures(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> dict[str, Figure]:
+    """Return the figures over time by file name, with lines at ``moments`` in seconds.
 
-
-def agreement_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Return a figure over time of the worst robot's agreement with the oracle and of the label disagreement."""
-    figure, [upper, lower] = over_log_time(
-        "Agreement of the team", ["agreement with the oracle,\nworst robot", "cells with\ndifferent labels"]
-    )
-    times = log_seconds(metrics)
-    for name, label, color in (
-        ("agreement", "all cells", BLUE),
-        ("agreement_occupied", "occupied cells", ORANGE),
-    ):
-        values = [min((getattr(robot, name) for robot in tick.robots if robot.active), default=np.nan)
-                  for tick in metrics]  # fmt: skip
-        upper.plot(times, values, color=color, linewidth=1.6, label=label)
-    upper.legend(frameon=False, fontsize=9, loc="lower right")
-    lower.plot(times, [tick.label_disagreement for tick in metrics], color=GREEN, linewidth=1.6)
-    for axes in (upper, lower):
-        axes.yaxis.set_major_formatter("{x:.0%}")
-        axes.set_ylim(0.0, 1.02)
-        _mark(axes, moments)
-    return figure
-
-
-def packet_figure(metrics: Sequence[TickMetrics], moments: Sequence[float]) -> Any:
-    """Return a figure of the bytes of a published map as uniform grid and as octree, and of their ratio."""
-    from matplotlib.ticker import EngFormatter
-
-    figure, [upper, lower] = over_log_time(
-        "Size of a published map, mean and standard deviation over robots", ["bytes", "uniform grid /\noctree"]
-    )
-    times = log_seconds(metrics)
-    means = {}
-    for name, label, color in (("grid_bytes", "uniform grid", ORANGE), ("octree_bytes", "octree", BLUE)):
-        mean, deviation = over_robots(metrics, name)
-        upper.plot(times, mean, color=color, linewidth=1.6, label=label)
-        upper.fill_between(times, mean - deviation, mean + deviation, color=color, alpha=0.25, linewidth=0)
-        means[name] = mean
-    upper.set_ylim(bottom=0.0)
-    upper.yaxis.set_major_formatter(EngFormatter(unit="B"))
-    upper.legend(frameon=False, fontsize=9, loc="upper left")
-    lower.plot(times, means["grid_bytes"] / means["octree_bytes"], color=BLUE, linewidth=1.6)
-    lower.axhline(PAPER_RATIO, color=GREY, linewidth=1.2, linestyle="--")
-    lower.annotate(
+    They are those of ``run_figures``; that of the packets also has the ratio of uniform grid to octree in the paper.
+    """
+    runs = [PlottedRun("paper", metrics)]
+    figures = {f"{name}.png": run_figure(what, runs) for name, what in _FIGURES.items()}
+    ratio = figures["packet_size.png"].axes[1]
+    ratio.axhline(PAPER_RATIO, color=GREY, linewidth=1.2, linestyle="--")
+    ratio.annotate(
         "the paper: more than four", (1.0, PAPER_RATIO), (0, 3), xycoords=("axes fraction", "data"),
-        textcoords="offset points", ha="right", fontsize=9, color=_INK,
+        textcoords="offset points", ha="right", fontsize="small", color=_INK,
     )  # fmt: skip
-    lower.set_ylim(bottom=0.0)
-    for axes in (upper, lower):
-        _mark(axes, moments)
-    return figure
+    for figure in figures.values():
+        for axes in figure.axes:
+            for moment in moments:
+                axes.axvline(moment, color=GREY, linewidth=0.8, linestyle=":")
+    return figures
 
 
 def maps_picture(pictures: Mapping[str, UInt8Array], classes: ClassTable, largest: float) -> bytes:
@@ -144,16 +108,10 @@ def _explain_opacity(axes: Any, classes: ClassTable, largest: float) -> None:
     axes.set_yticks([])
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    axes.set_title(r"deviation: largest $\|h_i - h_j\|$ of two robots", fontsize=11, color=_INK)
+    axes.set_title("deviation: largest \u2016h\u1d62 - h\u2c7c\u2016 of two robots", fontsize=11, color=_INK)
 
 
 def _unit(color: Color) -> tuple[float, float, float]:
     """Colour with channels 0..1, as in matplotlib."""
     red, green, blue = (value / 255.0 for value in color)
     return red, green, blue
-
-
-def _mark(axes: Any, moments: Sequence[float]) -> None:
-    """Draw thin lines at some times."""
-    for moment in moments:
-        axes.axvline(moment, color=GREY, linewidth=0.8, linestyle=":")

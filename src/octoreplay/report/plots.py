@@ -1,4 +1,4 @@
-"""Metrics as CSV and as figures over time: disagreement, packet sizes, contradiction of evidence."""
+"""Metrics as CSV, and the figures of one run in a folder."""
 
 from __future__ import annotations
 
@@ -6,29 +6,21 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from octoreplay.errors import InputError
-from octoreplay.io.text_files import write_whole
-from octoreplay.report.contradiction_plots import contradiction_figure
-from octoreplay.report.figures import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    label_in_bytes,
-    legend_below,
-    over_log_time,
-    save_figures,
-)
+from octoreplay.io.output_file import write_whole
+from octoreplay.report.figures import save_figures
+from octoreplay.report.log_time import PlottedRun
+from octoreplay.report.run_figures import run_figure
 from octoreplay.run_metrics import PAIR_SHARES, TickMetrics
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+_FIGURES = {
+    "disagreement.png": "phi", "agreement.png": "agreement", "packet_size.png": "packets",
+    "contradiction.png": "contradiction",
+}  # fmt: skip
+"""Figures of a folder by the name of their file."""
 _TEAM_COLUMNS = (
     "tick", "stamp_ns", "settling", "total_distance_published", "total_distance", "total_distance_all",
     "distance_per_leaf",
@@ -90,16 +82,14 @@ def write_metrics_csv(metrics: Sequence[TickMetrics], path: Path) -> None:
 
 
 def write_figures(metrics: Sequence[TickMetrics], folder: Path) -> list[Path]:
-    """Write ``disagreement.png``, ``packet_size.png`` and, where robots share known space, ``contradiction.png``.
+    """Write figures of one run: disagreement, agreement, packets and, where robots share known space, contradiction.
 
     The folder is made if missing. Returns the paths. Raises OutputError, and InputError without any tick.
     """
-    if not metrics:
-        raise InputError("the result has no tick to draw, since the run was interrupted before its first one")
-    figures = {"disagreement.png": _disagreement_figure(metrics), "packet_size.png": _packet_figure(metrics)}
-    if any(tick.pairs for tick in metrics):
-        figures["contradiction.png"] = contradiction_figure(metrics, log_seconds(metrics))
-    return save_figures(figures, folder)
+    run = PlottedRun("the result", metrics)
+    has_pairs = any(tick.pairs for tick in metrics)
+    chosen = {name: what for name, what in _FIGURES.items() if what != "contradiction" or has_pairs}
+    return save_figures({name: run_figure(what, [run]) for name, what in chosen.items()}, folder)
 
 
 def _cells(record: Any, names: Sequence[str]) -> list[str]:
@@ -114,76 +104,3 @@ def _cell(value: Any) -> str:
     if value != value:
         return ""
     return str(int(value)) if isinstance(value, bool | np.bool_) else str(value)
-
-
-def log_seconds(metrics: Sequence[TickMetrics]) -> Any:
-    """Return the time of each tick in seconds since the first one."""
-    return np.array([tick.stamp_ns - metrics[0].stamp_ns for tick in metrics]) / 1e9
-
-
-def _mark_settling(axes: Axes, metrics: Sequence[TickMetrics], times: Any) -> None:
-    """Draw a grey band over the settling ticks."""
-    first = next((index for index, tick in enumerate(metrics) if tick.settling), None)
-    if first is not None:
-        start = times[first - 1] if first else times[0]
-        axes.axvspan(start, times[-1], color=GREY, alpha=0.15, linewidth=0, label="settling, no new scans")
-
-
-def _disagreement_figure(metrics: Sequence[TickMetrics]) -> Figure:
-    """Figure of Phi over time, on a logarithmic axis."""
-    figure, [axes] = over_log_time("Disagreement of the team", ["\u03a6"])
-    times = log_seconds(metrics)
-    links = np.array([tick.total_distance for tick in metrics])
-    pairs = np.array([tick.total_distance_all for tick in metrics])
-    published = np.array([tick.total_distance_published for tick in metrics])
-    axes.plot(
-        times, np.where(published > 0, published, np.nan), ":", color=GREY, linewidth=1.4,
-        label="\u03a6 over the links, before the iterations",
-    )  # fmt: skip
-    axes.plot(times, np.where(links > 0, links, np.nan), color=BLUE, linewidth=1.6, label="\u03a6 over the links")
-    # On a complete graph the two lines are equal except for rounding.
-    if not np.allclose(links, pairs, rtol=1e-3):
-        axes.plot(
-            times, np.where(pairs > 0, pairs, np.nan), "--", color=ORANGE, linewidth=1.4, label="\u03a6 over all pairs"
-        )
-    if (pairs > 0).any():
-        axes.set_yscale("log")
-        # Values below this are consensus; the axis shows the rise and the fall.
-        axes.set_ylim(bottom=pairs.max() * 1e-9)
-    _mark_settling(axes, metrics, times)
-    legend_below(figure)
-    return figure
-
-
-def _packet_figure(metrics: Sequence[TickMetrics]) -> Figure:
-    """Figure of the bytes of a published map: as sent, as octree and as uniform grid."""
-    figure, [axes] = over_log_time("Size of a published map (mean and standard deviation over robots)", ["bytes"])
-    times = log_seconds(metrics)
-    least = np.inf
-    for name, label, color in (
-        ("grid_bytes", "uniform grid", ORANGE),
-        ("octree_bytes", "octree", BLUE),
-        ("packet_bytes", "octree, as sent", GREEN),
-    ):
-        mean, deviation = over_robots(metrics, name)
-        axes.plot(times, mean, color=color, linewidth=1.6, label=label)
-        axes.fill_between(times, np.maximum(mean - deviation, 1), mean + deviation, color=color, alpha=0.2, linewidth=0)
-        least = min([least, *mean[mean > 0]])
-    if np.isfinite(least):
-        # On a linear axis both octree curves would lie on the x axis.
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=least / 2)
-        label_in_bytes(axes)
-    _mark_settling(axes, metrics, times)
-    legend_below(figure)
-    return figure
-
-
-def over_robots(metrics: Sequence[TickMetrics], name: str) -> tuple[Any, Any]:
-    """Return mean and standard deviation per tick over the robots that published; NaN where none did."""
-    means, deviations = [], []
-    for tick in metrics:
-        values = [getattr(robot, name) for robot in tick.robots if robot.grid_bytes > 0]
-        means.append(np.mean(values) if values else np.nan)
-        deviations.append(np.std(values) if values else np.nan)
-    return np.array(means), np.array(deviations)

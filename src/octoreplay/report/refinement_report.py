@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
 from octoreplay.evaluate.trajectories import TrajectoryErrors
-from octoreplay.io.text_files import write_whole
+from octoreplay.io.output_file import write_whole
 from octoreplay.replay.refinement import Refinement
-from octoreplay.report.figures import COLORS, GREY, legend_below, new_figure, style
+from octoreplay.report.figures import COLORS, GREY, legend_below, new_figure, picture_of, style
 from octoreplay.report.tables import share, styled_table
 
 
@@ -42,6 +42,26 @@ def refinement_table(refinement: Refinement, errors: TrajectoryErrors | None) ->
     return table
 
 
+def refinement_content(refinement: Refinement, errors: TrajectoryErrors | None) -> dict[str, Any]:
+    """Return a repair of drift for JSON: the robots' tests, the trajectory errors, and the numbers of submaps."""
+    robots = [
+        {
+            "robot_id": trajectory.robot_id,
+            "is_accepted": score.is_accepted,
+            "reason": score.reason,
+            "mean_shift": float(trajectory.shifts.mean()),
+            "largest_shift": float(trajectory.shifts.max()),
+            "contradiction_before": score.before.share,
+            "contradiction_after": score.after.share,
+            "entropy_before": score.entropy_before,
+            "entropy_after": score.entropy_after,
+        }
+        for trajectory, score in zip(refinement.trajectories, refinement.scores, strict=True)
+    ]
+    numbers = {name: getattr(refinement, name) for name in ("num_submaps", "num_edges", "num_rejected")}
+    return {"robots": robots, "trajectory_errors": errors, **numbers}
+
+
 def _change(before: str, after: str, *, is_known: bool = True) -> str:
     """Text of a value before and after."""
     return f"{before} -> {after}" if is_known else "-"
@@ -68,6 +88,4 @@ def write_trajectory_figure(refinement: Refinement, path: Path) -> None:
     above.set_aspect("equal", adjustable="datalim")
     below.set_ylim(bottom=0)
     legend_below(figure, above, columns=min(6, math.ceil((len(refinement.trajectories) + 1) / 2) + 1))
-    picture = io.BytesIO()
-    figure.savefig(picture, metadata={"Software": None})
-    write_whole(path, picture.getvalue())
+    write_whole(path, picture_of(figure))

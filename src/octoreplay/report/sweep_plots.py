@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from octoreplay.errors import OutputError
-from octoreplay.report.figures import COLORS, new_figure, save_figures, style
+from octoreplay.io.output_file import writing
+from octoreplay.report.figures import COLORS, LINES, MARKERS, new_figure, plain, save_figures, style
+from octoreplay.report.zoom import zoom_shares, zoom_values
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,11 @@ _TITLES = {
 """Title and label of the y axis of each drawn column."""
 
 _LOGARITHMIC = ("total_distance_all_log_end", "total_distance_all", "packet_bytes", "sent_bytes_per_second")
+_SHARES = ("agreement", "agreement_occupied", "mean_iou", "coverage")
+"""Columns of shares with 1 as the best value."""
 _HATCHES = ("", "///", "...", "xxx")
+_CROWDED = 0.25
+"""Part of the largest value in which all values lie where bars from 0 would look alike."""
 
 
 def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis], folder: Path) -> list[Path]:
@@ -54,14 +59,12 @@ def write_sweep_figures(rows: Sequence[Mapping[str, Any]], varied: Sequence[Axis
         for column in _TITLES
         if any(math.isfinite(row.get(column, math.nan)) for row in good)
     }
-    try:
+    with writing(folder):
         for column in _TITLES:
             if f"{column}.png" not in drawn:
                 (folder / f"{column}.png").unlink(missing_ok=True)
         if not drawn and folder.exists():
             folder.rmdir()
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     return save_figures(drawn, folder) if drawn else []
 
 
@@ -118,6 +121,7 @@ def _figure(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> 
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     scale = _scale(rows, column)
+    is_crowded = scale == "linear" and _is_crowded(rows, column)
     for axes, panel in zip(grid.flat, panels, strict=False):
         of_panel = [row for row in rows if tuple(_label(row, axis) for axis in layout.panels) == panel]
         names = ", ".join(f"{'+'.join(axis)} {label}" for axis, label in zip(layout.panels, panel, strict=True))
@@ -128,8 +132,10 @@ def _figure(rows: Sequence[Mapping[str, Any]], layout: _Layout, column: str) -> 
         if numeric:
             _draw_lines(axes, numeric, along, series, spreads)
         else:
-            _draw_bars(axes, along, series, spreads)
+            _draw_groups(axes, along, series, spreads, is_zoomed=is_crowded)
         axes.set_yscale(scale)
+    if scale == "linear" and (is_crowded or numeric):
+        (zoom_shares if column in _SHARES else zoom_values)(grid.flat[0], [[row[column] for row in rows]])
     _leave_room(grid.flat[0], rows, column, scale)
     if layout.series:
         handles, names_of = grid.flat[0].get_legend_handles_labels()
@@ -173,6 +179,12 @@ def _scale(rows: Sequence[Mapping[str, Any]], column: str) -> str:
     return "log" if column in _LOGARITHMIC and values and max(values) > 20 * min(values) else "linear"
 
 
+def _is_crowded(rows: Sequence[Mapping[str, Any]], column: str) -> bool:
+    """True where all values are so close together that bars from 0 would look alike."""
+    values = [row[column] for row in rows if math.isfinite(row[column])]
+    return len(set(values)) > 1 and max(values) - min(values) < _CROWDED * max(values)
+
+
 def _leave_room(axes: Any, rows: Sequence[Mapping[str, Any]], column: str, scale: str) -> None:
     """Set the limits of the y axis so that the least bar is visible, and 0..1 where all values are 0."""
     values = [row[column] for row in rows if math.isfinite(row[column])]
@@ -194,31 +206,40 @@ def _draw_lines(
             _write_note(axes, x, spread, index)
         axes.errorbar(
             [x for x, _ in points], [spread.mean for _, spread in points], yerr=_ranges([s for _, s in points]),
-            label=name, color=COLORS[index % len(COLORS)], linewidth=1.6, marker="os^Dv"[index % 5], markersize=4,
-            linestyle=("-", "--", ":", "-.")[index // len(COLORS) % 4], elinewidth=1, capsize=2,
+            label=name, color=COLORS[index % len(COLORS)], linewidth=1.6, marker=MARKERS[index % len(MARKERS)],
+            markersize=4, linestyle=LINES[index % len(LINES)], elinewidth=1, capsize=2,
         )  # fmt: skip
     if len(numbers) <= 8:
         axes.set_xticks(sorted(numbers))
 
 
-def _draw_bars(
-    axes: Any, along: Sequence[str], series: Sequence[str], spreads: Mapping[tuple[str, str], _Spread]
-) -> None:
-    """Draw a group of bars per label, with one bar per series."""
+def _draw_groups(
+    axes: Any, along: Sequence[str], series: Sequence[str], spreads: Mapping[tuple[str, str], _Spread], *,
+    is_zoomed: bool,
+) -> None:  # fmt: skip
+    """Draw a group per label with one bar per series, or one point where the axis does not begin at 0."""
     width = 0.8 / len(series)
     for index, name in enumerate(series):
         places = [(n, spreads[label, name]) for n, label in enumerate(along) if (label, name) in spreads]
         for n, spread in places:
             _write_note(axes, n + (index - (len(series) - 1) / 2) * width, spread, 0)
+        x = [n + (index - (len(series) - 1) / 2) * width for n, _ in places]
+        means, ranges = [spread.mean for _, spread in places], _ranges([spread for _, spread in places])
+        color = COLORS[index % len(COLORS)]
+        if is_zoomed:
+            axes.errorbar(
+                x, means, yerr=ranges, label=name, color=color, linestyle="", marker=MARKERS[index % len(MARKERS)],
+                markersize=6, elinewidth=1, capsize=2,
+            )  # fmt: skip
+            continue
         axes.bar(
-            [n + (index - (len(series) - 1) / 2) * width for n, _ in places], [spread.mean for _, spread in places],
-            0.9 * width, label=name, color=COLORS[index % len(COLORS)],
-            hatch=_HATCHES[index // len(COLORS) % len(_HATCHES)], edgecolor="white", linewidth=0,
-            yerr=_ranges([spread for _, spread in places]),
-            error_kw={"elinewidth": 1, "capsize": 2, "ecolor": "#444444"},
+            x, means, 0.9 * width, label=name, color=color, hatch=_HATCHES[index % len(_HATCHES)], edgecolor="white",
+            linewidth=0, yerr=ranges, error_kw={"elinewidth": 1, "capsize": 2, "ecolor": "#444444"},
         )  # fmt: skip
     is_long = sum(len(label) + 2 for label in along) > 90
-    axes.set_xticks(range(len(along)), along, **({"rotation": 30, "ha": "right"} if is_long else {}))
+    axes.set_xticks(
+        range(len(along)), [plain(label) for label in along], **({"rotation": 30, "ha": "right"} if is_long else {})
+    )
     axes.set_xlim(-0.6, len(along) - 0.4)
 
 

@@ -1,45 +1,39 @@
-"""Tables for the terminal: results of a run, its inputs, answers to queries and descriptions of logs."""
+"""Tables for the terminal: results of a run, and written files."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, NamedTuple
 
-import numpy as np
 from rich import box
-from rich.columns import Columns
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
-from rich.text import Text
 
-from octoreplay.config.resolved import MapFrame, ResolvedRobot, ResolvedRun
-from octoreplay.config.robot import RobotConfig
-from octoreplay.io.robots.team_clocks import instant
-from octoreplay.log_odds import best_labels, label_probabilities
+from octoreplay.evaluate.verdict import RunVerdict, run_verdict
 from octoreplay.mapping.contradiction import contradicting_pairs
-from octoreplay.records import ClassTable, FrameCounts, LeafTable
+from octoreplay.records import FrameCounts
+from octoreplay.report.console import EscapingConsole
 from octoreplay.run_metrics import (
     MIN_COMPARED_CELLS,
     PAIR_SHARES,
     LinkMetrics,
     PairMetrics,
+    RobotMetrics,
     RunSummary,
     TickMetrics,
     ranked_pairs,
 )
 
-if TYPE_CHECKING:
-    from octoreplay.io.robots.describe import LogDescription, LogSummary
-    from octoreplay.result import PointQuery
-
-_CAUSES = {
-    "no_label": "no label", "no_pose": "no pose", "late": "late",
-    "undecodable": "unreadable",
+_OUTCOMES = {
+    "used": "used", "no_label": "no label", "no_pose": "no pose", "late": "late", "duplicate": "same stamp",
+    "undecodable": "unreadable", "unusable": "no pose in it", "unpaired": "no image", "unmapped": "image not mapped",
+    "superseded": "older path", "off": "robot off", "not_selected": "not selected", "not_read": "not read",
 }  # fmt: skip
-"""Causes of frames that were not mapped: fields of FrameCounts and their headings."""
+"""Outcomes of messages (docs/logs.md) and their headings."""
 
 MAX_PAIRS = 8
 """Largest number of rows of the table of pairs."""
@@ -78,16 +72,22 @@ def seconds(value: float) -> str:
     return f"{whole // 60} min {whole % 60:02d} s"
 
 
-def results(summary: RunSummary) -> RenderableType:
-    """Return the results of a run as tables: team, robots, contradicting pairs, lossy links, frames not mapped."""
-    parts: list[RenderableType] = [_team_table(summary), _robots_table(summary.last)]
+def results(summary: RunSummary, *, num_warnings: int = 0, is_verbose: bool = False) -> RenderableType:
+    """Return the results of a run as tables: verdict, team, robots, contradicting pairs, lossy links, unused messages.
+
+    Robots with equal maps are one row, and of many pairs MAX_PAIRS are shown, unless ``is_verbose``.
+    """
+    parts: list[RenderableType] = [
+        verdict_table(run_verdict(summary), num_warnings),
+        _team_table(summary),
+        _robots_table(summary.last, is_verbose=is_verbose),
+    ]
     if contradicting_pairs(summary.last.pairs):
-        parts.append(pairs_table(summary.last.pairs))
+        parts.append(pairs_table(summary.last.pairs, None if is_verbose else MAX_PAIRS))
     if any(getattr(link, f"num_{fate}") for link in summary.links for fate in _FATES):
         parts.append(_links_table(summary.links))
-    if any(counts.skipped for counts in summary.frame_counts.values()):
-        parts.append(_frames_table(summary.frame_counts))
-    return _spaced(parts)
+    parts += _messages_tables(summary.frame_counts)
+    return spaced(parts)
 
 
 def worst_pair(pairs: Sequence[PairMetrics], name: str) -> str:
@@ -100,10 +100,51 @@ def worst_pair(pairs: Sequence[PairMetrics], name: str) -> str:
     return f"{share(getattr(pair, name))} of {num_cells:,} occupied cells, {pair.first} and {pair.second}"
 
 
-def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
-    """Return a table of the pairs that contradict each other most, and of how many pairs they are."""
+def verdict_table(verdict: RunVerdict, num_warnings: int) -> Table:
+    """Return what matters most about a run: agreement, correctness, cost, and the number of its warnings."""
+    table = styled_table("Verdict")
+    table.show_header = False
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for name, sentences in verdict_rows(verdict):
+        table.add_row(name, sentences)
+    table.add_row("warnings", f"{num_warnings}, at the end, with remedies" if num_warnings else "none")
+    return table
+
+
+def verdict_rows(verdict: RunVerdict) -> list[tuple[str, str]]:
+    """Return names and sentences of the verdict on a run: agreed, correct, cost."""
+    per_second = "-" if math.isnan(verdict.sent_bytes_per_second) else f"{size(verdict.sent_bytes_per_second)}/s"
+    cost = f"{per_second} sent by each robot, mean; {size(verdict.total_sent_bytes)} in total"
+    return [("agreed", _agreed(verdict)), ("correct", _correct(verdict)), ("cost", cost)]
+
+
+def _agreed(verdict: RunVerdict) -> str:
+    """Sentence on the agreement of the team."""
+    if verdict.has_agreed is None:
+        return "one robot: nothing to compare" if verdict.num_robots == 1 else "the maps are empty: nothing to compare"
+    if verdict.num_frames > 1:
+        return f"no: the robots are in {verdict.num_frames} frames"
+    answer = "yes" if verdict.has_agreed else "no"
+    return f"{answer}: {share(verdict.label_disagreement)} of the known cells have different labels"
+
+
+def _correct(verdict: RunVerdict) -> str:
+    """Sentences on what the evidence says about the maps."""
+    agreement = f"{share(verdict.agreement)} of the cells have the label of all evidence, worst robot"
+    if verdict.num_robots == 1:
+        return agreement
+    if verdict.is_consistent is None or verdict.worst_pair is None:
+        return f"not known: no two robots share {MIN_COMPARED_CELLS} occupied cells\n{agreement}"
+    answer = "plausible" if verdict.is_consistent else "doubtful"
+    clear = f"{share(verdict.clear_contradiction)} clear contradiction"
+    return f"{answer}: {clear}, worst pair {' and '.join(verdict.worst_pair)}\n{agreement}"
+
+
+def pairs_table(pairs: Sequence[PairMetrics], num_rows: int | None = MAX_PAIRS) -> Table:
+    """Return a table of the ``num_rows`` pairs that contradict each other most (None: all), and of their number."""
     ranked = ranked_pairs(pairs, "clear_contradiction")
-    rows = ranked[:MAX_PAIRS]
+    rows = ranked[:num_rows]
     table = styled_table(f"Contradiction of evidence, {len(rows)} of {len(ranked)} pairs")
     table.add_column("pair", overflow="fold")
     for name in ("shared\ncells", "of these\noccupied", "contra-\ndiction", "clear", "labels"):
@@ -116,62 +157,15 @@ def pairs_table(pairs: Sequence[PairMetrics]) -> Table:
     return table
 
 
-def chosen_inputs(config: ResolvedRun) -> Table:
-    """Return a table of the robots, logs and topics of a run."""
-    table = styled_table("Robots and topics")
-    table.add_column("robot", no_wrap=True)
-    table.add_column("log", overflow="fold")
-    table.add_column("topics and frames", overflow="fold")
-    for robot in config.robots:
-        logs = "\n".join(log.name or str(log) for log in robot.logs)
-        table.add_row(robot.robot_id, logs, "\n".join(_choices(robot, robot.frame)))
-    return table
+def are_equal(rows: Sequence[Sequence[str]]) -> bool:
+    """Return True for several robots with the same texts, which a table shows as one."""
+    return len(rows) > 1 and len(set(map(tuple, rows))) == 1
 
 
-def class_list(class_table: ClassTable) -> RenderableType:
-    """Return a list of the classes with their colours."""
-    items = [
-        Text.assemble(("\u25a0 ", "rgb({},{},{})".format(*entry.color)), entry.name) for entry in class_table.classes
-    ]
-    return Group(Text("Classes", style="bold"), Columns(items, padding=(0, 2)))
-
-
-def point_answers(names: Sequence[str], points: Sequence[tuple[float, float, float]], answer: PointQuery) -> Table:
-    """Return a table of the most probable classes at points; ``names`` are free, then the classes."""
-    table = styled_table("")
-    table.add_column("x, y, z [m]", no_wrap=True)
-    table.add_column("label", no_wrap=True)
-    table.add_column("probability", justify="right", no_wrap=True)
-    table.add_column("next")
-    table.add_column("leaf", justify="right", no_wrap=True)
-    for index, point in enumerate(points):
-        where = ", ".join(f"{value:g}" for value in point)
-        if not answer.known[index]:
-            table.add_row(where, "unknown", "", "", "")
-            continue
-        row = answer.probabilities[index]
-        order = sorted(range(len(names)), key=lambda k: (-row[k], k))
-        rest = ", ".join(f"{names[k]} {share(row[k])}" for k in order[1:3])
-        table.add_row(where, names[order[0]], share(row[order[0]]), rest, f"{answer.sizes[index]:g} m")
-    return table
-
-
-def box_answer(names: Sequence[str], leaves: LeafTable) -> Table:
-    """Return a table of the volume of each class in some leaves; ``names`` are free, then the classes."""
-    labels, volumes = best_labels(leaves.log_odds), leaves.sizes**3
-    probabilities = label_probabilities(leaves.log_odds)
-    table = styled_table("")
-    table.add_column("label", no_wrap=True)
-    for heading in ("leaves", "volume", "mean probability"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for class_id, name in enumerate(names):
-        chosen = labels == class_id
-        if chosen.any():
-            mean = np.average(probabilities[chosen], weights=volumes[chosen])
-            table.add_row(name, f"{chosen.sum():,}", f"{number(volumes[chosen].sum())} m\u00b3", share(mean))
-    if not len(leaves):
-        table.add_row("unknown", "", "", "")
-    return table
+def caption_equal(table: Table, num_robots: int) -> str:
+    """Add the caption of a table in which equal robots are one row or column; return the heading of that row."""
+    table.caption, table.caption_justify = "The robots' maps agree; -v shows each robot.", "left"
+    return f"all {num_robots}"
 
 
 def made_files(files: Mapping[Path, str]) -> Table:
@@ -185,18 +179,12 @@ def made_files(files: Mapping[Path, str]) -> Table:
     return table
 
 
-def description(logs: LogDescription) -> RenderableType:
-    """Return a description of logs as tables: topics, robots, classes and missing inputs."""
-    parts: list[RenderableType] = [_log_table(log) for log in logs.logs if log.error is None]
-    if logs.robots:
-        parts.append(_robot_spans(logs))
-    parts.append(_readiness(logs))
-    return _spaced(parts)
-
-
 def terminal(*, stderr: bool = False, file: IO[str] | None = None, width: int | None = None) -> Console:
-    """Return a console of at most 100 columns, 160 in a pipe, without markup and emoji codes."""
-    console = Console(stderr=stderr, file=file, width=width, markup=False, emoji=False, highlight=False)
+    """Return a console of at most 100 columns, 160 in a pipe, without markup and emoji codes.
+
+    It escapes all text, so that names in logs and results cannot control the terminal.
+    """
+    console = EscapingConsole(stderr=stderr, file=file, width=width, markup=False, emoji=False, highlight=False)
     # A pipe has no width, and text for programs should not be cut.
     console.width = min(console.width, 100) if console.is_terminal or width or "COLUMNS" in os.environ else 160
     return console
@@ -223,7 +211,7 @@ def styled_table(title: str) -> Table:
     )
 
 
-def _spaced(parts: Sequence[RenderableType]) -> Group:
+def spaced(parts: Sequence[RenderableType]) -> Group:
     """Parts with an empty line between them."""
     lines: list[RenderableType] = []
     for part in parts:
@@ -244,6 +232,13 @@ def _team_table(summary: RunSummary) -> Table:
     settling = f", and {summary.num_settling_ticks} settling" if summary.num_settling_ticks else ""
     table.add_row("ticks", f"{summary.num_ticks - summary.num_settling_ticks}{settling}")
     table.add_row("stopped", summary.stop_reason)
+    totals: Counter[str] = Counter()
+    for counts in summary.frame_counts.values():
+        for outcomes in counts.outcomes.values():
+            totals.update(outcomes)
+    if totals:
+        parts = [f"{totals[name]:,} {heading}" for name, heading in _OUTCOMES.items() if totals[name]]
+        table.add_row("messages", f"{totals.total():,} in the logs: {', '.join(parts)}")
     table.add_row("known cells", f"{last.num_known_cells:,}")
     table.add_row(
         "disagreement \u03a6",
@@ -258,8 +253,8 @@ def _team_table(summary: RunSummary) -> Table:
     worst = [min((getattr(robot, name) for robot in robots), default=math.nan) for name in _AGREEMENTS]
     table.add_row("agreement, worst robot", f"{share(worst[0])} of all cells, {share(worst[1])} of occupied cells")
     if len(last.robots) > 1:
-        table.add_row("contradiction, worst pair", worst_pair(last.pairs, "contradiction"))
         table.add_row("clear contradiction", worst_pair(last.pairs, "clear_contradiction"))
+        table.add_row("any contradiction", worst_pair(last.pairs, "contradiction"))
         table.add_row("label contradiction", worst_pair(last.pairs, "label_contradiction"))
         if summary.frame_origins:
             table.add_row("frames", _frame_origins(summary.frame_origins))
@@ -297,19 +292,49 @@ def _joined(summary: RunSummary) -> str:
 _AGREEMENTS = ("agreement", "agreement_occupied")
 
 
-def _robots_table(last: TickMetrics) -> Table:
-    """Table of the robots after the last tick."""
+class _Column(NamedTuple):
+    """Column of the table of robots: field of RobotMetrics, and whether it describes the contents of the map."""
+
+    heading: str
+    name: str
+    text: Callable[[float], str]
+    is_content: bool
+
+
+_ROBOT_COLUMNS = (
+    _Column("scans", "num_scans", "{:,}".format, False),
+    _Column("agreement\nall cells", "agreement", share, True),
+    _Column("\noccupied", "agreement_occupied", share, True),
+    _Column("leaves", "num_leaves", "{:,}".format, False),
+    _Column("volume", "observed_volume", lambda value: f"{number(value)} m\u00b3", True),
+    _Column("entropy", "entropy_bits", "{:.3f} bit".format, True),
+    _Column("packet", "packet_bytes", size, False),
+)
+
+
+def _robots_table(last: TickMetrics, *, is_verbose: bool) -> Table:
+    """Table of the robots after the last tick; one row for robots with equal maps unless ``is_verbose``."""
     table = styled_table("Robots, after the last tick")
     table.add_column("robot", no_wrap=True)
-    for name in ("scans", "agreement\nall cells", "\noccupied", "leaves", "volume", "entropy", "packet"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for robot in last.robots:
-        table.add_row(
-            robot.robot_id, f"{robot.num_scans:,}", share(robot.agreement), share(robot.agreement_occupied),
-            f"{robot.num_leaves:,}", f"{number(robot.observed_volume)} m\u00b3", f"{robot.entropy_bits:.3f} bit",
-            size(robot.packet_bytes),
-        )  # fmt: skip
+    for column in _ROBOT_COLUMNS:
+        table.add_column(column.heading, justify="right", no_wrap=True)
+    contents = [
+        tuple(column.text(getattr(robot, column.name)) for column in _ROBOT_COLUMNS if column.is_content)
+        for robot in last.robots
+    ]
+    groups = [(robot.robot_id, [robot]) for robot in last.robots]
+    if not is_verbose and are_equal(contents):
+        groups = [(caption_equal(table, len(last.robots)), list(last.robots))]
+    for name, robots in groups:
+        table.add_row(name, *(_range(column, robots) for column in _ROBOT_COLUMNS))
     return table
+
+
+def _range(column: _Column, robots: Sequence[RobotMetrics]) -> str:
+    """Smallest and largest value of a column; one value where their texts are equal."""
+    values = [getattr(robot, column.name) for robot in robots]
+    ends = dict.fromkeys(column.text(value) for value in (min(values), max(values)))
+    return " -\n".join(ends)
 
 
 _FATES = ("lost", "dropped", "late", "stale", "gaps", "damaged")
@@ -331,85 +356,22 @@ def _links_table(links: Sequence[LinkMetrics]) -> Table:
     return table
 
 
-def _log_table(log: LogSummary) -> RenderableType:
-    """Time span of a log, and a table of its topics."""
-    span = "empty"
-    if log.start_ns is not None and log.end_ns is not None:
-        span = f"{instant(log.start_ns)}, {seconds((log.end_ns - log.start_ns) / 1e9)}"
-    title = Text.assemble((str(log.path), "bold"), f"\n{span}, {log.num_messages:,} messages")
-    table = styled_table("")
-    longest = max((len(topic.name) for topic in log.topics), default=0)
-    table.add_column("topic", overflow="fold", min_width=min(longest, 32))
-    table.add_column("type", no_wrap=True)
-    table.add_column("count", justify="right", no_wrap=True)
-    table.add_column("rate", justify="right", no_wrap=True)
-    table.add_column("content", overflow="fold")
-    for topic in log.topics:
-        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.3g} Hz"
-        kind = topic.type_name.replace("/msg/", "/")
-        kind = kind if topic.encoding in ("", "cdr", "ros1") else f"{kind} ({topic.encoding})"
-        table.add_row(topic.name, kind, f"{topic.num_messages:,}", rate, topic.detail)
-    damage = [Text(f"damaged: {log.damage}", style="yellow")] if log.damage else []
-    return Group(title, *damage, table)
-
-
-def _robot_spans(logs: LogDescription) -> Table:
-    """Table of the robots found in logs: topics, frames and time span."""
-    table = styled_table("Robots")
-    table.add_column("robot", no_wrap=True)
-    table.add_column("topics and frames", overflow="fold")
-    table.add_column("start", justify="right", no_wrap=True)
-    table.add_column("length", justify="right", no_wrap=True)
-    first = min((robot.span_ns[0] for robot in logs.robots if robot.span_ns is not None), default=0)
-    for robot in logs.robots:
-        begin, length = "-", "-"
-        if robot.span_ns is not None:
-            start, end = robot.span_ns
-            begin, length = f"+{(start - first) / 1e9:.1f} s", seconds((end - start) / 1e9)
-        table.add_row(robot.robot.robot_id, "\n".join(_choices(robot.robot, robot.frame)), begin, length)
-    return table
-
-
-def _readiness(logs: LogDescription) -> RenderableType:
-    """Common time of the robots, classes, and missing inputs."""
-    lines: list[RenderableType] = []
-    if len(logs.robots) > 1:
-        shared = "none" if logs.overlap_ns is None else seconds((logs.overlap_ns[1] - logs.overlap_ns[0]) / 1e9)
-        lines.append(Text(f"common time of all robots: {shared}"))
-    if logs.class_table is not None:
-        lines.append(class_list(logs.class_table))
-    missing = [f"{robot.robot.robot_id}: {item}" for robot in logs.robots for item in robot.missing]
-    missing += logs.missing
-    if not missing:
-        lines.append(Text("nothing is missing for a run", style="green"))
-    lines += [Text(f"missing for a run: {item}", style="yellow") for item in missing]
-    return Group(*lines)
-
-
-def _frames_table(counts: Mapping[str, FrameCounts]) -> Table:
-    """Table of frames per robot: mapped, and not mapped by cause."""
-    table = styled_table("Frames")
-    table.add_column("robot", no_wrap=True)
-    table.add_column("mapped", justify="right")
-    causes = [cause for cause in _CAUSES if any(getattr(count, cause) for count in counts.values())]
-    for cause in causes:
-        table.add_column(_CAUSES[cause], justify="right")
-    for robot_id, count in counts.items():
-        table.add_row(robot_id, f"{count.used:,}", *(f"{getattr(count, cause):,}" for cause in causes))
-    return table
-
-
-def _choices(robot: RobotConfig, frame: MapFrame | None) -> list[str]:
-    """Lines with the topics and frames of a robot's configuration, and how its poses reach the map frame."""
-    names = {
-        "depth_topic": "depth", "cloud_topic": "cloud", "label_topic": "labels", "camera_info_topic": "camera",
-        "pose_topic": "pose", "label_info_topic": "names", "fix_topic": "fixes", "tags_topic": "tags",
-        "map_frame": "map frame", "sensor_frame": "sensor frame",
-    }  # fmt: skip
-    width = max(len(name) for name in names.values())
-    values = {name: value for field, name in names.items() if (value := getattr(robot, field))}
-    if frame is not None and frame.origin:
-        values["map frame"] += f" ({frame.origin})"
-    if isinstance(robot, ResolvedRobot) and robot.frame_origin:
-        values["team frame"] = robot.frame_origin
-    return [f"{name:<{width}}  {value}" for name, value in values.items()]
+def _messages_tables(counts_by_robot: Mapping[str, FrameCounts]) -> list[Table]:
+    """Table of messages by robot, topic and outcome, of the topics with unused ones; empty without such topics."""
+    rows = {
+        (robot_id, topic): outcomes
+        for robot_id, counts in counts_by_robot.items()
+        for topic, outcomes in counts.outcomes.items()
+        if set(outcomes) - {"used", "not_read"}
+    }
+    if not rows:
+        return []
+    table = styled_table("Messages")
+    shown = [name for name in _OUTCOMES if any(name in outcomes for outcomes in rows.values())]
+    for name in ("robot", "topic"):
+        table.add_column(name, overflow="fold")
+    for name in ("in log", *(_OUTCOMES[name] for name in shown)):
+        table.add_column(name, justify="right")
+    for (robot_id, topic), outcomes in rows.items():
+        table.add_row(robot_id, topic, f"{sum(outcomes.values()):,}", *(f"{outcomes.get(n, 0):,}" for n in shown))
+    return [table]

@@ -10,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from octoreplay.errors import printable
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.evaluate.comparison import MapDifference, Point, ResultComparison, SettingDifference
 from octoreplay.report.tables import styled_table
@@ -40,8 +41,11 @@ def check_verdict(rows: Sequence[CheckRow]) -> str:
     return f"failed: {len(failed)} of {_count(len(rows), 'check')}: {', '.join(failed)}"
 
 
-def comparison(found: ResultComparison) -> Iterator[RenderableType]:
-    """Yield the tables of a comparison: files, maps, differing boxes, labels and settings."""
+def comparison(found: ResultComparison, *, is_verbose: bool = False) -> Iterator[RenderableType]:
+    """Yield the tables of a comparison: files, maps, differing boxes, labels and settings.
+
+    Of many pairs of labels the most frequent are shown, unless ``is_verbose``.
+    """
     yield _files(found)
     if found.maps:
         yield _maps(found)
@@ -49,7 +53,7 @@ def comparison(found: ResultComparison) -> Iterator[RenderableType]:
     if differing:
         yield _places(differing)
     if any(one.label_changes for one in found.maps):
-        yield _label_changes(found.maps)
+        yield _label_changes(found.maps, None if is_verbose else _MOST_CHANGES)
     if found.settings:
         yield _settings(found.settings)
 
@@ -106,7 +110,7 @@ def _files(found: ResultComparison) -> Group:
     """Paths of the two results, and whether their logs are the same."""
     files = (("A", found.a, found.is_complete_a), ("B", found.b, found.is_complete_b))
     lines = [
-        Text(f"{name}: {path}{'' if is_complete else ' (interrupted run)'}", overflow="fold")
+        Text(printable(f"{name}: {path}{'' if is_complete else ' (interrupted run)'}"), overflow="fold")
         for name, path, is_complete in files
     ]
     verdicts = {True: "the same", False: "different", None: "not comparable, since their fingerprint methods differ"}
@@ -116,10 +120,10 @@ def _files(found: ResultComparison) -> Group:
 def _maps(found: ResultComparison) -> Table:
     """Table of the maps that both results have."""
     table = styled_table("Maps, in finest cells")
-    table.add_column("map", no_wrap=True)
-    for name in ("time A", "time B", "in both", "only A", "only B", "other label", "largest\ndifference"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column(f"over\n{found.tolerance:g}", justify="right", no_wrap=True)
+    table.add_column("map", overflow="fold")
+    for name in ("time A", "time B", "in both", "only A", "only B", "other\nlabel", "largest\ndifference"):
+        table.add_column(name, justify="right", overflow="fold")
+    table.add_column(f"over\n{found.tolerance:g}", justify="right", overflow="fold")
     for one in found.maps:
         table.add_row(
             one.robot_id, f"{one.seconds_a:.1f} s", f"{one.seconds_b:.1f} s", f"{one.num_cells_both:,}",
@@ -141,7 +145,7 @@ def _places(differing: Sequence[MapDifference]) -> Table:
     return table
 
 
-def _label_changes(maps: Sequence[MapDifference]) -> Table:
+def _label_changes(maps: Sequence[MapDifference], num_rows: int | None) -> Table:
     """Table of the pairs of different labels, summed over all maps."""
     counts: Counter[tuple[str, str]] = Counter()
     for one in maps:
@@ -151,9 +155,9 @@ def _label_changes(maps: Sequence[MapDifference]) -> Table:
     table.add_column("in B", no_wrap=True)
     table.add_column("cells, in all maps", justify="right", no_wrap=True)
     pairs = counts.most_common()
-    for (label_a, label_b), num_cells in pairs[:_MOST_CHANGES]:
+    for (label_a, label_b), num_cells in pairs[:num_rows]:
         table.add_row(label_a, label_b, f"{num_cells:,}")
-    if rest := pairs[_MOST_CHANGES:]:
+    if rest := pairs[len(pairs) if num_rows is None else num_rows :]:
         table.add_row(f"{len(rest)} others", "", f"{sum(num_cells for _, num_cells in rest):,}")
     return table
 

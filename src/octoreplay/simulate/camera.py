@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import InputError
-from octoreplay.records import CameraModel, Float32Array, Float64Array, UInt8Array
+from octoreplay.records import BoolArray, CameraModel, Float32Array, Float64Array, UInt8Array
 from octoreplay.simulate.world import World
 
 NO_LABEL = 255
 """Raw label of a pixel without a measurement."""
 
 
+_FAR = 1000.0
 _PATCH_EDGE = 2.0
 _PATCH_GRID = (64, 64, 16)
 
@@ -43,19 +44,41 @@ class MeshCamera:
 
         ``T_world_camera`` (4, 4) is the pose of the optical frame: z forward, x right, y down.
         """
+        depth, labels, _ = self._cast(T_world_camera)
+        beyond = ~(depth <= max_depth)
+        depth[beyond] = 0.0
+        labels[beyond] = NO_LABEL
+        return depth, labels
+
+    def take_surfaces(self, T_world_camera: Float64Array) -> tuple[Float64Array, UInt8Array, Float32Array]:
+        """Return the surfaces in view: points (H, W, 3) [m] and unit normals (H, W, 3) in the world, and labels (H, W).
+
+        Normals point to the camera's side. Where a ray hits nothing the label is NO_LABEL and the point is far away.
+        """
+        depth, labels, normals = self._cast(T_world_camera)
+        depth[~np.isfinite(depth)] = _FAR
+        points = self.points(depth, T_world_camera)
+        towards = ((T_world_camera[:3, 3] - points) * normals).sum(axis=-1, keepdims=True)
+        return points, labels, np.where(towards < 0, -normals, normals).astype(np.float32)
+
+    def is_occluded(self, points: Float64Array, direction: Float64Array) -> BoolArray:
+        """Return True (H, W) where a surface lies in a direction (3,) from points (H, W, 3)."""
+        rays = np.empty((*points.shape[:2], 6), dtype=np.float32)
+        rays[..., :3] = points
+        rays[..., 3:] = direction
+        hidden: BoolArray = self._scene.test_occlusions(self._tensor(rays)).numpy()
+        return hidden
+
+    def _cast(self, T_world_camera: Float64Array) -> tuple[Float32Array, UInt8Array, Float32Array]:
+        """Depth (H, W) along z, infinite where nothing is hit, labels (H, W) and unit normals (H, W, 3)."""
         # The z component of each ray is 1, so that the returned distance is the depth along z.
         directions = self._rays @ T_world_camera[:3, :3].T
         rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
         rays[..., :3] = T_world_camera[:3, 3]
         rays[..., 3:] = directions
         hits = self._scene.cast_rays(self._tensor(rays))
-        depth = hits["t_hit"].numpy()
         ids = np.minimum(hits["primitive_ids"].numpy(), np.uint32(len(self._labels) - 1))
-        labels = self._labels[ids]
-        beyond = ~(depth <= max_depth)
-        depth[beyond] = 0.0
-        labels[beyond] = NO_LABEL
-        return depth, labels
+        return hits["t_hit"].numpy(), self._labels[ids], hits["primitive_normals"].numpy()
 
     def points(self, depth: Float32Array, T_world_camera: Float64Array) -> Float64Array:
         """Return the world coordinates (H, W, 3) [m] of a depth image's pixels."""

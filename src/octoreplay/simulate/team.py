@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from octoreplay import interrupts
 from octoreplay.config.frames_file import dump_frames
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.sensor import MapConfig
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
+from octoreplay.io import output_file
 from octoreplay.io.datasets.pose_files import write_tum
-from octoreplay.io.robots.robot_log_writer import MAP_FRAME, OPTICAL_IN_BODY, RobotLogWriter, fix_topic, topics
-from octoreplay.records import CameraModel, ClassTable, Float64Array, Int64Array
+from octoreplay.io.robots.robot_log_writer import MAP_FRAME, RobotLogWriter, fix_topic, topics
+from octoreplay.records import CameraModel, ClassTable, FilePath, Float64Array, Int64Array
+from octoreplay.simulate.body_poses import T_BODY_CAMERA, body_poses, midway, pose_errors
 from octoreplay.simulate.camera import LabelPatches, MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
+from octoreplay.simulate.colour import COLOUR_FORMATS, ColourCamera
 from octoreplay.simulate.exploration import Exploration, explore
 from octoreplay.simulate.odometry import HEIGHT_FACTOR, drift_corrections, own_frame, position_fixes
 from octoreplay.simulate.village import make_village
@@ -30,10 +33,6 @@ START_NS = 1_700_000_000_000_000_000
 """Stamp of a simulation's first message, constant so that equal settings give equal bytes."""
 
 _ODOMETRY_RATE = 20.0
-_POSE_CORRELATION_TIME = 10.0
-_BASE_HEIGHT = 0.13
-_CAMERA_POSITION = (0.35, 0.0, 0.75)
-_CAMERA_PITCH = 0.08
 
 
 @dataclass(frozen=True)
@@ -71,6 +70,12 @@ class SimulationConfig:
         Standard deviation of a horizontal coordinate of position fixes [m], one each second; None for logs without.
     kinds_per_class : int
         Number of classes that each of the eight classes is divided into.
+    has_labels : bool
+        False for logs without label images and LabelInfo.
+    colour : str or None
+        Form of the colour images: 'raw', 'jpeg' or 'png'; None for logs without colour images.
+    colour_offset : tuple of float
+        Position of the colour camera in the depth camera's optical frame [m]; zeros for images aligned to depth.
     world_size : float
         Edge length of the drivable square [m].
     identical_houses : bool
@@ -93,6 +98,9 @@ class SimulationConfig:
     own_frames: bool = False
     fixes: float | None = None
     kinds_per_class: int = 1
+    has_labels: bool = True
+    colour: str | None = None
+    colour_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_size: float = 70.0
     identical_houses: bool = False
     max_depth: float = 20.0
@@ -114,11 +122,16 @@ class SimulationConfig:
             ("odometry_drift in degrees per 10 m", self.odometry_drift[1], 0.0, 90.0),
             ("fixes", 0.001 if self.fixes is None else self.fixes, 0.001, 1000.0),
             ("kinds_per_class", self.kinds_per_class, 1, MAX_KINDS),
+            *(("colour_offset", value, -5.0, 5.0) for value in self.colour_offset),
             ("world_size", self.world_size, 20.0, 1000.0),
             ("max_depth", self.max_depth, 1.0, 65.0),
         ):
             if not least <= value <= most:
                 raise ConfigError(f"{name}: {value:g} is not between {least:g} and {most:g}")
+        if self.colour not in (None, *COLOUR_FORMATS):
+            raise ConfigError(f"colour: '{self.colour}' is not one of {', '.join(COLOUR_FORMATS)}")
+        if any(self.colour_offset) and self.colour is None:
+            raise ConfigError("colour_offset: needs colour images")
 
     @property
     def camera(self) -> CameraModel:
@@ -156,7 +169,7 @@ class SimulationSummary:
 
 
 def simulate_team(
-    folder: Path, config: SimulationConfig, progress: Callable[[float], None] | None = None
+    folder: FilePath, config: SimulationConfig, progress: Callable[[float], None] | None = None
 ) -> SimulationSummary:
     """Simulate a team and write one log per robot, ``team.yaml``, ``world.npz`` and ``world.ply`` into a folder.
 
@@ -166,23 +179,22 @@ def simulate_team(
     when all of them are complete. Raises OutputError if the folder is not empty or cannot be written, InputError if
     Open3D cannot be loaded.
     """
-    created = _prepare(folder)
-    work = folder / ".partial"
-    try:
-        work.mkdir()
-        num_frames, num_cells = _write_all(work, config, progress or _no_progress)
-        names = sorted(path.name for path in work.iterdir())
-        # The team file is moved last. If it exists, all other files do too.
-        for name in sorted(names, key=lambda name: name == "team.yaml"):
-            (work / name).replace(folder / name)
-        work.rmdir()
-    except BaseException as error:
-        shutil.rmtree(work, ignore_errors=True)
-        if created:
-            shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
-        raise
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; use a new folder")
+    with output_file.locked(folder, is_folder=True):
+        work = folder / ".partial"
+        try:
+            with output_file.writing(folder):
+                _check_empty(folder)
+                # A killed process leaves its folder.
+                output_file.remove_temporary(work)
+                work.mkdir()
+                num_frames, num_cells = _write_all(work, config, progress or _no_progress)
+                interrupts.check()
+                _move_files(work, folder)
+        finally:
+            output_file.remove_temporary(work)
     return SimulationSummary(
         folder,
         folder / "team.yaml",
@@ -197,19 +209,27 @@ def _no_progress(share: float) -> None:
     """Default progress callback."""
 
 
-def _prepare(folder: Path) -> bool:
-    """Create the folder or check that it is empty; True if it was created."""
-    try:
-        if folder.exists():
-            if not folder.is_dir():
-                raise OutputError(f"{folder}: is a file; use a new folder")
-            if any(folder.iterdir()):
-                raise OutputError(f"{folder}: is not empty; use a new folder, or empty this one")
-            return False
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
-    return True
+def _check_empty(folder: Path) -> None:
+    """Raise OutputError for a folder that holds anything but its lock and what a killed process has left."""
+    if {path.name for path in folder.iterdir()} - {output_file.FOLDER_LOCK, ".partial"}:
+        raise OutputError(f"{folder}: is not empty; use a new folder, or empty this one")
+
+
+def _move_files(work: Path, folder: Path) -> None:
+    """Move complete files into their folder. Raises OSError, and then removes those that were moved."""
+    output_file.sync_files(work)
+    # The team file is moved last. If it exists, all other files do too.
+    names = sorted((path.name for path in work.iterdir()), key=lambda name: (name == "team.yaml", name))
+    with interrupts.deferred():
+        try:
+            for name in names:
+                (work / name).replace(folder / name)
+            output_file.sync_folder(folder)
+        except OSError:
+            for name in names:
+                output_file.remove_temporary(folder / name)
+            raise
+        output_file.mark_written(folder)
 
 
 def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float], None]) -> tuple[int, int]:
@@ -238,8 +258,9 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
             work / f"{robot_id}.mcap",
             robot_id,
             config.camera,
-            config.class_table,
+            config.class_table if config.has_labels else None,
             T_body_sensor=T_BODY_CAMERA,
+            T_body_color=recorder.T_body_color,
             start_ns=START_NS,
             map_frame=f"{robot_id}/odom" if config.own_frames else MAP_FRAME,
         ) as log:
@@ -251,8 +272,8 @@ def _write_all(work: Path, config: SimulationConfig, progress: Callable[[float],
             (work / "truth").mkdir(exist_ok=True)
             write_tum(work / "truth" / f"{robot_id}.tum", schedule.stamps_ns, recorder.poses)
     if config.has_pose_truth:
-        (work / "frames.yaml").write_text(dump_frames(frames), encoding="utf-8")
-    (work / "team.yaml").write_text(dump_team(_team(work, config), work), encoding="utf-8")
+        output_file.write_whole(work / "frames.yaml", dump_frames(frames))
+    output_file.write_whole(work / "team.yaml", dump_team(_team(work, config), work))
     return num_frames, num_cells
 
 
@@ -272,14 +293,15 @@ def _team(folder: Path, config: SimulationConfig) -> RunConfig:
                 robot_id=robot_id,
                 logs=(folder / f"{robot_id}.mcap",),
                 depth_topic=depth,
-                label_topic=labels,
+                label_topic=labels if config.has_labels else None,
                 camera_info_topic=camera_info,
                 pose_topic=odometry,
-                label_info_topic=label_info,
+                label_info_topic=label_info if config.has_labels else None,
                 fix_topic=None if config.fixes is None else fix_topic(robot_id),
             )
         )
-    return RunConfig(tuple(robots), classes=config.class_table, map=MapConfig(resolution=config.resolution))
+    classes = config.class_table if config.has_labels else None
+    return RunConfig(tuple(robots), classes=classes, map=MapConfig(resolution=config.resolution))
 
 
 @dataclass(frozen=True)
@@ -350,24 +372,33 @@ class _Recorder:
         if config.patchy_noise > 0:
             rng = np.random.default_rng([config.seed, 7, index])
             self._patches = LabelPatches(config.patchy_noise, config.class_table.num_classes, rng)
+        self._colour: ColourCamera | None = None
+        self.T_body_color: Float64Array | None = None
+        if config.colour is not None:
+            self._colour = ColourCamera(camera, config.class_table, config.seed, index)
+            if any(config.colour_offset):
+                self.T_body_color = T_BODY_CAMERA.copy()
+                self.T_body_color[:3, 3] += T_BODY_CAMERA[:3, :3] @ config.colour_offset
 
     def record(self, log: RobotLogWriter) -> Iterator[int]:
         """Write all poses and images in the order of time; yield each image's stamp."""
-        period_ns = self._schedule.pose_period_ns
+        config, period_ns = self._config, self._schedule.pose_period_ns
         for step, (state, T_map_body) in enumerate(zip(self._states, self.poses, strict=True)):
             recorded = self._recorded[step]
             stamp_ns = START_NS + step * period_ns
             following = self._states[min(step + 1, len(self._states) - 1)]
             speed = float(np.hypot(*(following[:2] - state[:2]))) * 1e9 / period_ns
             log.write_pose(stamp_ns, recorded, speed, float(following[2] - state[2]) * 1e9 / period_ns)
-            if self._config.fixes is not None and step in self._fixes:
-                log.write_fix(
-                    stamp_ns, self._fixes[step].tolist(), self._config.fixes, HEIGHT_FACTOR * self._config.fixes
-                )
+            if config.fixes is not None and step in self._fixes:
+                log.write_fix(stamp_ns, self._fixes[step].tolist(), config.fixes, HEIGHT_FACTOR * config.fixes)
             if step in self._exposures:
                 # Exposed midway between two poses, so that readers have to interpolate.
-                T_map_camera = midway(T_map_body, self.poses[step + 1]) @ T_BODY_CAMERA
-                self._write_image(log, stamp_ns + period_ns // 2, T_map_camera)
+                T_map_exposed = midway(T_map_body, self.poses[step + 1])
+                self._write_image(log, stamp_ns + period_ns // 2, T_map_exposed @ T_BODY_CAMERA)
+                if self._colour is not None:
+                    mount = T_BODY_CAMERA if self.T_body_color is None else self.T_body_color
+                    image = self._colour.take(T_map_exposed @ mount)
+                    log.write_color(stamp_ns + period_ns // 2, image, str(config.colour))
                 yield stamp_ns + period_ns // 2
 
     def _write_image(self, log: RobotLogWriter, stamp_ns: int, T_map_camera: Float64Array) -> None:
@@ -380,62 +411,4 @@ class _Recorder:
             depth = add_depth_noise(depth, self._rng, config.depth_noise)
         if config.label_noise > 0:
             labels = add_label_noise(labels, config.label_noise, config.class_table.num_classes, self._rng)
-        log.write_frame(stamp_ns, depth_to_millimetres(depth), labels)
-
-
-def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
-    """Return poses (T, 4, 4) of a base on the ground at states (T, 3) of x, y [m] and heading [rad]."""
-    poses = np.zeros((len(states), 4, 4))
-    up = terrain.normal(states[:, :2])
-    heading = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))], axis=1)
-    left = np.cross(up, heading)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    poses[:, :3, 0] = np.cross(left, up)
-    poses[:, :3, 1] = left
-    poses[:, :3, 2] = up
-    poses[:, :2, 3] = states[:, :2]
-    poses[:, 2, 3] = terrain.height(states[:, :2]) + _BASE_HEIGHT
-    poses[:, 3, 3] = 1.0
-    return poses
-
-
-def pose_errors(sigma: float, num_poses: int, period: float, rng: np.random.Generator) -> Float64Array:
-    """Draw localisation errors (T, 3) of x, y [m] and heading [rad], one every ``period`` [s].
-
-    They are a stationary first-order Gauss-Markov process with a correlation time of 10 s. Its standard deviation is
-    ``sigma`` in x and y, and ``sigma`` / 10 m in heading, which moves points at 10 m distance by ``sigma`` as well.
-    """
-    correlation = np.exp(-period / _POSE_CORRELATION_TIME)
-    steps = rng.standard_normal((num_poses, 3)) * (sigma, sigma, sigma / 10.0)
-    steps[1:] *= np.sqrt(1.0 - correlation**2)
-    errors: Float64Array = np.empty_like(steps)
-    error = np.zeros(3)
-    for row, step in zip(errors, steps, strict=True):
-        error = correlation * error + step
-        row[:] = error
-    return errors
-
-
-def midway(T_a: Float64Array, T_b: Float64Array) -> Float64Array:
-    """Return the pose (4, 4) halfway between two: mean position and slerp's rotation at one half.
-
-    That rotation is the one nearest to the sum of the two rotation matrices, computed by an SVD.
-    """
-    middle = np.eye(4)
-    u, _, vt = np.linalg.svd(T_a[:3, :3] + T_b[:3, :3])
-    middle[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    middle[:3, 3] = (T_a[:3, 3] + T_b[:3, 3]) / 2
-    return middle
-
-
-def _camera_mount() -> Float64Array:
-    """Transform from the camera's optical frame to the base: ahead of its centre, on a mast, tilted down."""
-    cos, sin = np.cos(_CAMERA_PITCH), np.sin(_CAMERA_PITCH)
-    mount = np.eye(4)
-    mount[:3, :3] = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]) @ OPTICAL_IN_BODY
-    mount[:3, 3] = _CAMERA_POSITION
-    return mount
-
-
-T_BODY_CAMERA = _camera_mount()
-"""Transform (4, 4) from the camera's optical frame to the body of a simulated robot."""
+        log.write_frame(stamp_ns, depth_to_millimetres(depth), labels if config.has_labels else None)

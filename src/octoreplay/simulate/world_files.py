@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
-from octoreplay.errors import OutputError
+from octoreplay.io.output_file import write_whole
 from octoreplay.io.results import ply
 from octoreplay.mapping.surface import CellVotes
 from octoreplay.records import ClassTable, Int32Array, UInt8Array
@@ -42,17 +43,16 @@ def write_ground_truth(path: Path, world: World, resolution: float, class_table:
     Raises OutputError if the file cannot be written.
     """
     keys, class_ids = labelled_cells(world, resolution)
-    try:
-        np.savez_compressed(
-            path,
-            keys=keys,
-            class_ids=class_ids,
-            resolution=np.float64(resolution),
-            class_names=np.array(class_table.names),
-            class_colors=class_table.colors,
-        )
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    archive = io.BytesIO()
+    np.savez_compressed(
+        archive,
+        keys=keys,
+        class_ids=class_ids,
+        resolution=np.float64(resolution),
+        class_names=np.array(class_table.names),
+        class_colors=class_table.colors,
+    )
+    write_whole(path, archive.getvalue())
     return len(class_ids)
 
 
@@ -74,4 +74,4 @@ def write_mesh(path: Path, world: World, class_table: ClassTable) -> None:
     for channel, name in enumerate(("red", "green", "blue")):
         faces[name] = colors[:, channel]
     names = ", ".join(f"{c.class_id} {c.name}" for c in class_table.classes)
-    ply.write_mesh(path, vertices, faces, [f"labels: {names}"])
+    write_whole(path, ply.mesh_file(vertices, faces, [f"labels: {names}"]))

@@ -12,7 +12,7 @@ from typing import Any
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
-from octoreplay.io.text_files import write_whole
+from octoreplay.io.output_file import write_whole
 from octoreplay.replay.run import replay_team
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.study.folder import table_csv

@@ -7,7 +7,6 @@ import csv
 import hashlib
 import io
 import json
-import os
 import re
 import shutil
 import uuid
@@ -18,10 +17,11 @@ from typing import Any
 
 from octoreplay._version import __version__
 from octoreplay.errors import OutputError
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.output_file import FOLDER_LOCK, locked, write_whole, writing
+from octoreplay.io.text_files import json_text
 from octoreplay.study.task import Row, from_json, to_json
 
-_LOCK = ".lock"
+_UNFINISHED = "unfinished-"
 _LONGEST_NAME = 150
 
 
@@ -41,7 +41,8 @@ class SweepFolder:
         self._rows = path / "rows"
         self._runs = path / "runs"
         # Workers of a killed sweep may still write. They end when they find their own folder removed.
-        self._unfinished = path / "unfinished" / uuid.uuid4().hex[:12]
+        # Beside the folder of kept results, so that the paths in a result hold when it is moved there.
+        self._unfinished = path / f"{_UNFINISHED}{uuid.uuid4().hex[:12]}"
 
     @classmethod
     @contextmanager
@@ -50,27 +51,11 @@ class SweepFolder:
 
         Raises OutputError if another sweep has locked it, or if the folder holds other files than a sweep's.
         """
-        import fcntl
-
         folder = cls(path)
-        with _writing(path):
-            path.mkdir(parents=True, exist_ok=True)
-            if {entry.name for entry in path.iterdir()} - {_LOCK} and not folder._is_sweep():
-                raise OutputError(f"{path}: is not empty and holds no sweep; use another folder")
-            lock = (path / _LOCK).open("a+", encoding="utf-8")
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                lock.seek(0)
-                owner = lock.read().strip() or "unknown"
-                raise OutputError(
-                    f"{path}: is in use by another sweep (process {owner}); wait for it, or use another folder"
-                ) from None
-            with _writing(path):
-                lock.truncate(0)
-                lock.write(str(os.getpid()))
-                lock.flush()
+        with locked(path, is_folder=True):
+            with writing(path):
+                if {entry.name for entry in path.iterdir()} - {FOLDER_LOCK} and not folder._is_sweep():
+                    raise OutputError(f"{path}: is not empty and holds no sweep; use another folder")
                 folder._begin()
             try:
                 yield folder
@@ -122,25 +107,19 @@ class SweepFolder:
             self.describe({"octoreplay": __version__})
         for folder in (self._rows, self._runs):
             folder.mkdir(exist_ok=True)
-        shutil.rmtree(self._unfinished.parent, ignore_errors=True)
-        self._unfinished.mkdir(parents=True)
-        for partial in self._rows.glob("*.partial"):
-            partial.unlink()
+        self._remove_unfinished()
+        self._unfinished.mkdir()
 
     def _end(self) -> None:
         """Remove unfinished results and empty subfolders."""
-        shutil.rmtree(self._unfinished.parent, ignore_errors=True)
+        self._remove_unfinished()
         with contextlib.suppress(OSError):
             self._runs.rmdir()
 
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn OSError into OutputError."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    def _remove_unfinished(self) -> None:
+        """Remove unfinished results, of this sweep and of killed ones."""
+        for folder in self.path.glob(f"{_UNFINISHED}*"):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def table_csv(columns: Sequence[str], rows: Sequence[Row]) -> str:

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +19,14 @@ from octoreplay.config.presets import with_options
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.output_file import write_whole
+from octoreplay.io.text_files import json_text
 from octoreplay.records import UInt8Array
 from octoreplay.replay.run import Progress
-from octoreplay.report import map_view, paper_plots, plots
+from octoreplay.report import map_view, paper_plots
 from octoreplay.report.figures import save_figures
+from octoreplay.report.log_time import has_published, over_robots
+from octoreplay.report.map_figure import AZIMUTH, ELEVATION
 from octoreplay.result import Result, StoredMap, open_result
 from octoreplay.run_metrics import TickMetrics
 from octoreplay.simulate.team import SimulationConfig
@@ -39,7 +41,6 @@ PRESET = "paper"
 LEAST_DURATION = 6.0
 """Shortest duration [s] with which maps have been exchanged after a third of the run."""
 
-_AZIMUTH, _ELEVATION = math.radians(74.0), math.radians(42.0)
 _WIDTH, _HEIGHT = 1600, 1000
 _PERCENTILE = 99.0
 
@@ -140,11 +141,7 @@ def write_paper(folder: Path, simulation: SimulationConfig) -> PaperNumbers:
         numbers = _numbers(result, simulation, moments, largest)
         village = make_village(simulation.world_size, simulation.seed)
         pictures = _pictures(result, seconds, overlays, largest, village)
-        figures = {
-            "total_distance.png": paper_plots.distance_figure(result.metrics, seconds),
-            "agreement.png": paper_plots.agreement_figure(result.metrics, seconds),
-            "packet_size.png": paper_plots.packet_figure(result.metrics, seconds),
-        }
+        figures = paper_plots.paper_figures(result.metrics, seconds)
         picture = paper_plots.maps_picture(pictures, result.class_table, largest)
     save_figures(figures, folder / FIGURES)
     write_whole(folder / FIGURES / "maps.png", picture)
@@ -180,7 +177,7 @@ def _shown_ticks(result: Result) -> list[TickMetrics]:
 def _numbers(result: Result, simulation: SimulationConfig, moments: tuple[Moment, ...], largest: float) -> PaperNumbers:
     """Numbers of a result."""
     peak = max(result.metrics, key=lambda tick: tick.total_distance)
-    octree, grid = (plots.over_robots(result.metrics, name)[0] for name in ("octree_bytes", "grid_bytes"))
+    octree, grid = (over_robots(result.metrics, name, has_published)[0] for name in ("octree_bytes", "grid_bytes"))
     ratios = (grid / octree)[np.isfinite(grid)]
     return PaperNumbers(
         __version__, simulation, PRESET, peak.total_distance, result.seconds(peak.stamp_ns), float(ratios.mean()),
@@ -192,7 +189,7 @@ def _moment(seconds: float, tick: TickMetrics, shown: map_view.Overlay, relative
     """The numbers of one tick and of the maps shown at it."""
     names = ("octree_bytes", "grid_bytes", "unpruned_bytes", "packet_bytes")
     (octree, octree_std), (grid, grid_std), (unpruned, _), (packet, _) = (
-        (float(mean[0]), float(std[0])) for mean, std in (plots.over_robots([tick], name) for name in names)
+        (float(mean[0]), float(std[0])) for mean, std in (over_robots([tick], name, has_published) for name in names)
     )
     active = [robot for robot in tick.robots if robot.active]
     return Moment(
@@ -208,7 +205,7 @@ def _pictures(
 ) -> dict[str, UInt8Array]:
     """Pictures by title, from one viewpoint: the last map, the earlier map and the true village."""
     colors = result.class_table.colors
-    view = map_view.view_of(village.vertices, _AZIMUTH, _ELEVATION, _WIDTH, _HEIGHT)
+    view = map_view.view_of(village.vertices, AZIMUTH, ELEVATION, _WIDTH, _HEIGHT)
     pictures = {}
     for at, shown in sorted(zip(seconds, overlays, strict=True), key=lambda pair: -pair[0]):
         solidity = map_view.opacities(shown.deviations, largest)

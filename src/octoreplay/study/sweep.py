@@ -6,10 +6,11 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import re
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,11 @@ from typing import Any
 from octoreplay._version import __version__
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team, load_team_file
+from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint, log_files
+from octoreplay.io.output_file import mark_written
+from octoreplay.records import FilePath
 from octoreplay.report.sweep_plots import write_sweep_figures
 from octoreplay.study.folder import SweepFolder
 from octoreplay.study.grid import Combination, Variation, check_variations, combinations, parse_variation
@@ -73,6 +77,14 @@ class Sweep:
         """Rows of the failed runs, with the reason in the column ``error``."""
         return tuple(row for row in self.rows if row["status"] == FAILED)
 
+    def as_table(self) -> Table:
+        """Return the rows as a table with ``columns``; values that a failed run does not have are NaN or empty.
+
+        A varied parameter is a column of numbers where all its values are numbers, else of text.
+        """
+        rows = [{**row, **{name: _value(row[name]) for name in self.names}} for row in self.rows]
+        return Table.from_rows(self.columns, rows)
+
     def result(self, row: Row) -> Path:
         """Path of a run's kept result, in a sweep with ``keep``."""
         return SweepFolder(self.folder).result(_name({name: row[name] for name in ("team", *self.names, "seed")}))
@@ -84,13 +96,13 @@ class Sweep:
 
 
 def run_sweep(
-    teams: str | Path | Sequence[str | Path],
+    teams: FilePath | Sequence[FilePath],
     variations: Sequence[str],
-    output: str | Path,
+    output: FilePath,
     *,
     settings: Mapping[str, Any] | None = None,
     num_seeds: int | None = None,
-    truth: str | Path | None = None,
+    truth: FilePath | None = None,
     keep: bool = False,
     num_jobs: int | None = None,
     num_threads: int = 1,
@@ -117,7 +129,7 @@ def run_sweep(
     parsed = [parse_variation(text) for text in variations]
     check_variations(parsed, fixed, num_seeds)
     check_workers(num_jobs, num_threads, scheduler)
-    paths = _labels([Path(team) for team in ([teams] if isinstance(teams, str | Path) else teams)])
+    paths = _labels([Path(team) for team in ([teams] if isinstance(teams, str | os.PathLike) else teams)])
     bases = {label: load_team_file(path) for label, path in paths.items()}
     truths = {label: None if truth is None else _truth(Path(truth), path) for label, path in paths.items()}
     runs = list(combinations(bases, parsed, fixed, num_seeds))
@@ -133,9 +145,18 @@ def run_sweep(
             _fill(table, execute_locally(left, num_jobs) if scheduler is None else _on_cluster(left, scheduler))
         rows = table.ordered()
         write_sweep_figures(rows, [variation.names for variation in parsed], folder.figures)
+        mark_written(folder.path)
         return Sweep(
             folder.path, folder.table, names, columns, rows, len(tasks) - len(left), tuple(_warnings(runs, num_seeds))
         )  # fmt: skip
+
+
+def _value(text: str) -> int | float | str:
+    """Number of a text, or the text."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
 
 
 def _fill(table: _Table, finished: Generator[tuple[Task, Row]]) -> None:

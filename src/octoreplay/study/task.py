@@ -84,6 +84,8 @@ def from_json(row: Row) -> Row:
 
 def execute_task(task: Task) -> Row:
     """Replay, measure and, if the truth is known, evaluate. If that fails, the row holds the reason."""
+    from octoreplay.io.results.result_writer import partial_path
+
     try:
         return _replay_and_measure(task)
     except OctoreplayError as error:
@@ -91,12 +93,14 @@ def execute_task(task: Task) -> Row:
     except MemoryError:
         return failed("out of memory")
     finally:
-        Path(task.unfinished).unlink(missing_ok=True)
+        for path in (Path(task.unfinished), partial_path(Path(task.unfinished))):
+            path.unlink(missing_ok=True)
 
 
 def _replay_and_measure(task: Task) -> Row:
     """Row of a task; errors are raised."""
     from octoreplay.config.team_file import parse_team
+    from octoreplay.io.output_file import publish, writing
     from octoreplay.replay.run import replay_team
     from octoreplay.result import open_result
     from octoreplay.study.numbers import run_numbers, truth_numbers
@@ -104,7 +108,7 @@ def _replay_and_measure(task: Task) -> Row:
     _compile_first()
     unfinished = Path(task.unfinished)
     config = parse_team(task.team, name=task.name, folder=Path("/"))
-    summary = replay_team(config, unfinished, num_threads=task.num_threads)
+    summary = replay_team(config, unfinished, num_threads=task.num_threads, checkpoint_every=0.0)
     timing = _timing(summary)
     with open_result(unfinished) as result:
         row = run_numbers(summary, result.metrics)
@@ -113,7 +117,8 @@ def _replay_and_measure(task: Task) -> Row:
 
         row |= truth_numbers(evaluate_result(unfinished, truth=Path(task.truth), over_time=False))
     if task.keep:
-        unfinished.replace(task.result)
+        with writing(Path(task.result)):
+            publish(unfinished, Path(task.result))
     lost = "; ".join(f"{robot_id}: {_loss(c)}" for robot_id, c in summary.frame_counts.items() if c.lost_data)
     return {"status": DATA_LOST if lost else OK, "error": lost, **row, **timing}
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,10 +11,11 @@ from typing import Any
 from octoreplay._version import __version__
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import OutputError
+from octoreplay.io.output_file import new_folder, write_whole, writing
 from octoreplay.io.results.result_reader import ResultReader
-from octoreplay.io.results.result_writer import partial_path
 from octoreplay.io.robots.discover import resolve
-from octoreplay.io.text_files import json_text, write_whole
+from octoreplay.io.text_files import json_text
+from octoreplay.replay.checkpoint import can_resume
 from octoreplay.replay.run import Progress, replay_team
 from octoreplay.simulate.team import SimulationConfig, simulate_team
 
@@ -24,24 +23,40 @@ SETTINGS_FILE = "simulation.json"
 """File beside a team's logs with the version, the settings and the size of every file."""
 
 
-def simulated_team(folder: Path, config: SimulationConfig, progress: Callable[[float], None] | None = None) -> Path:
+def simulated_team(
+    folder: Path,
+    config: SimulationConfig,
+    progress: Callable[[float], None] | None = None,
+    *,
+    replaces_others: bool = False,
+) -> Path:
     """Simulate a team into a folder, unless it holds the team already; return the team file.
 
     A team is used again when it is complete and was made with the same settings by the same version. ``progress`` is
-    called with the finished share, 0 to 1, but not for an existing team. The folder appears when it is complete. Raises
-    OutputError where the folder holds something else or cannot be written, InputError where Open3D cannot be loaded.
+    called with the finished share, 0 to 1, but not for an existing team. The folder appears when it is complete. With
+    ``replaces_others`` it takes the place of a simulated team of other settings or another version. Raises OutputError
+    where the folder holds something else or cannot be written, InputError where Open3D cannot be loaded.
     """
-    if not is_simulated(folder, config):
-        with _in_place_of(folder) as work:
-            simulate_team(work, config, progress)
-            write_whole(work / SETTINGS_FILE, json_text(_content(work, config)))
+    if not is_simulated(folder, config, replaces_others=replaces_others):
+        with writing(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+        with new_folder(folder) as new:
+            simulate_team(new.path, config, progress)
+            write_whole(new.path / SETTINGS_FILE, json_text(_content(new.path, config)))
+            new.put()
     return folder / "team.yaml"
 
 
-def is_simulated(folder: Path, config: SimulationConfig) -> bool:
+def holds_team(folder: Path) -> bool:
+    """True where a folder holds a team of ``simulated_team``, of any settings."""
+    return (folder / SETTINGS_FILE).is_file()
+
+
+def is_simulated(folder: Path, config: SimulationConfig, *, replaces_others: bool = False) -> bool:
     """True where a folder holds the team of these settings; False where it is missing or empty.
 
-    Raises OutputError where the folder holds anything else.
+    With ``replaces_others`` also False where it holds a simulated team of other settings. Raises OutputError where the
+    folder holds anything else.
     """
     try:
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
@@ -53,6 +68,8 @@ def is_simulated(folder: Path, config: SimulationConfig) -> bool:
     if not isinstance(stored, dict) or set(stored) != set(present):
         raise OutputError(f"{folder}: exists and holds no simulated team; give another folder, or remove this one")
     for reason in _differences(stored, present):
+        if replaces_others:
+            return False
         raise OutputError(f"{folder}: {reason}; give another folder, or remove this one")
     return True
 
@@ -61,15 +78,12 @@ def replayed_team(config: RunConfig, output: Path, progress: Callable[[Progress]
     """Replay a team into a result, unless it exists already; return the result.
 
     A result is used again when it is complete, of the same configuration and version, and its logs are unchanged. An
-    interrupted replay leaves no file. Raises OutputError where another result exists, and as ``replay_team`` does.
+    interrupted replay is continued. Raises OutputError where another result exists, and as ``replay_team`` does.
     """
     config = resolve(config)
     if not is_replayed(config, output):
-        try:
-            replay_team(config, output, progress=progress)
-        except BaseException:
-            partial_path(output).unlink(missing_ok=True)
-            raise
+        resume = can_resume(output)
+        replay_team(config, output, progress=progress, resume=resume, restart=not resume)
     return output
 
 
@@ -89,22 +103,6 @@ def is_replayed(config: RunConfig, output: Path) -> bool:
             " folder, or remove it"
         )
     return True
-
-
-@contextlib.contextmanager
-def _in_place_of(folder: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces ``folder`` at the end, and is removed after any error."""
-    work = folder.with_name(f".{folder.name}.partial")
-    try:
-        # A killed process leaves its folder.
-        shutil.rmtree(work, ignore_errors=True)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        yield work
-        work.replace(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _content(folder: Path, config: SimulationConfig) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES, decompress, 
 from octoreplay.io.containers.logs import open_log
 from support.log_damage import (
     NUM_MESSAGES,
+    STRINGS,
     mcap_chunks,
     read_all,
     text_of,
@@ -28,6 +29,8 @@ from support.log_damage import (
 )  # fmt: skip
 
 COMPRESSIONS = [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD]
+TIMES = " (log times 0.000 s to 0.000 s)"
+"""Span of the messages of these tests, which are nanoseconds apart."""
 
 
 def times(path: Path) -> list[int]:
@@ -72,7 +75,7 @@ def test_an_mcap_chunk_with_a_wrong_checksum_is_skipped_and_counted(tmp_path, co
     outcome = read_all(path)
     assert [time for _, time, _ in outcome.messages] == without(*lost)
     missing_end = "" if has_summary else "cut after its last message (the end of the file is missing), and "
-    skipped = f"1 damaged chunk with {len(lost)} messages was skipped; everything else is used"
+    skipped = f"1 damaged chunk with {len(lost)} messages{TIMES} was skipped; everything else is used{TIMES}"
     assert outcome.damage == f"{path}: {missing_end}{skipped}"
 
 
@@ -86,7 +89,7 @@ def test_damage_counts_once_when_a_log_is_read_repeatedly(tmp_path, caplog):
         for topics in (["/a"], ["/b"], ["/a", "/b"]):
             list(log.messages(topics))
         num_lost = sum(len(times_of_chunk(chunks[i].records)) for i in (1, 4))
-        assert f": 2 damaged chunks with {num_lost} messages were skipped;" in log.damage
+        assert f": 2 damaged chunks with {num_lost} messages{TIMES} were skipped;" in log.damage
     assert caplog.text == ""
 
 
@@ -274,7 +277,8 @@ def test_a_damaged_chunk_of_a_bag_is_skipped_and_counted(tmp_path, compression, 
     assert lost == list(range(lost[0], lost[-1] + 1))
     assert len(outcome.messages) + len(lost) == NUM_MESSAGES
     no_index = "" if has_index else "the bag has no index, as after a cut, and "
-    skipped = f"1 damaged chunk with {len(lost)} messages was skipped; everything else is used"
+    times = TIMES if has_index else ""
+    skipped = f"1 damaged chunk with {len(lost)} messages{times} was skipped; everything else is used{TIMES}"
     assert outcome.damage == f"{path}: {no_index}{skipped}"
 
 
@@ -377,7 +381,7 @@ def test_damaged_compressed_messages_are_counted(tmp_path):
     with open_log(folder) as log:
         for _ in range(2):
             assert [m.log_time_ns for m in log.messages(["/a", "/b"])] == without(2)
-        assert log.damage == f"{folder}: 1 damaged message was skipped; everything else is used"
+        assert log.damage == f"{folder}: 1 damaged message was skipped; everything else is used{TIMES}"
 
 
 # --- the sentence ----------------------------------------------------------------------------------------------------
@@ -387,7 +391,7 @@ def test_the_damage_sentence_counts_skipped_parts_and_messages():
     damage = Damage()
 
     def sentence() -> str | None:
-        return damage_sentence(Path("x.bag"), damage.clauses)
+        return damage_sentence(Path("x.bag"), damage.clauses, None, None)
 
     assert sentence() is None
     damage.skip_messages("/a", 0)
@@ -403,4 +407,22 @@ def test_the_damage_sentence_counts_skipped_parts_and_messages():
     assert sentence() == (
         "x.bag: cut before its end, and 3 damaged parts with at least 118 messages were skipped, "
         "and 1 damaged message was skipped; everything else is used"
+    )
+
+
+@pytest.mark.parametrize("has_summary", [True, False])
+def test_the_damage_sentence_gives_the_log_times_of_what_is_lost_and_of_the_rest(tmp_path, has_summary):
+    strings = [(1_000_000_000 * (100 + index), text) for index, (_, text) in enumerate(STRINGS)]
+    path = write_strings_mcap(tmp_path / "a.mcap", times_and_texts=strings, compression=CompressionType.NONE)
+    data = path.read_bytes()
+    chunks = mcap_chunks(data)
+    for chunk in chunks[2], chunks[4]:
+        put(path, chunk.end - 12, bytes([data[chunk.end - 12] ^ 0x10]))
+    if not has_summary:
+        path.write_bytes(path.read_bytes()[:-20])
+    first, last = chunks[2].start_ns // 10**9, chunks[4].end_ns // 10**9
+    assert 100 < first < last < 159
+    assert read_all(path).damage.endswith(
+        f" messages (log times {first}.000 s to {last}.000 s) were skipped; everything else is used (log times"
+        " 100.000 s to 159.000 s)"
     )

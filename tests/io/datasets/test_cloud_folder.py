@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
 
-from octoreplay.errors import ConfigError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.datasets.cloud_folder import import_clouds
 from octoreplay.records import ClassTable, SemanticClass
 from support.cloud_folders import (
@@ -18,6 +19,7 @@ from support.cloud_folders import (
     pcd_folder,
     ply_folder,
     pose,
+    save_pcd,
     tum_table,
 )
 from support.stored_messages import read_messages
@@ -230,3 +232,80 @@ def test_the_same_folder_gives_the_same_bytes(tmp_path):
         (tmp_path / name).parent.mkdir()
         import_clouds(folder, tmp_path / name)
     assert (tmp_path / "x/a.mcap").read_bytes() == (tmp_path / "y/a.mcap").read_bytes()
+
+
+def test_clouds_in_one_frame_need_no_poses(tmp_path):
+    for name in ("a", "b"):
+        save_pcd(tmp_path / "in" / f"{name}.pcd", 0, "0 0 0 1 0 0 0")
+    summary = import_clouds(tmp_path / "in", tmp_path / "a.mcap", identity_poses=True)
+    assert (summary.poses, summary.frame, summary.num_frames) == ("the identity", "sensor", 2)
+    found = lidar_poses(tmp_path / "a.mcap")
+    assert [stamp for stamp, _ in found] == [0, 1_000_000_000]
+    np.testing.assert_array_equal([T for _, T in found], [np.eye(4)] * 2)
+    with pytest.raises(ConfigError, match="identity_poses and poses: give one of them"):
+        import_clouds(tmp_path / "in", tmp_path / "b.mcap", identity_poses=True, poses="poses.txt")
+
+
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_pose_graph_gives_poses_by_the_numbers_of_the_clouds(tmp_path, is_given):
+    """Keys of gtsam are above 2^53."""
+    numbers = (97 << 56 | 2, 97 << 56 | 9, 97 << 56 | 10)
+    folder = ply_folder(tmp_path / "in", tuple(f"cloud_{number}" for number in numbers))
+    rows = ["FIX 0"]
+    for index, number in enumerate(numbers[:2]):
+        T = pose(index)
+        quaternion = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        rows.append(" ".join(["VERTEX_SE3:QUAT", str(number), *map(repr, [*T[:3, 3].tolist(), *quaternion])]))
+    rows.append("EDGE_SE3:QUAT 0 1 " + " ".join("0" * 28))
+    path = tmp_path / ("slam.g2o" if is_given else "graph.g2o")
+    path.write_text("\n".join(rows))
+    summary = import_clouds(folder, tmp_path / "a.mcap", rate=1.0, poses=path if is_given else None)
+    assert (summary.poses, summary.num_frames, summary.num_without_pose) == (path.name, 2, 1)
+    for index, (_, T) in enumerate(lidar_poses(tmp_path / "a.mcap")):
+        np.testing.assert_allclose(T, pose(index), atol=1e-9)
+
+
+def test_keyframes_of_hdl_graph_slam_have_their_own_poses_and_times(tmp_path):
+    for index in range(2):
+        save_pcd(tmp_path / "in" / f"{index:06d}" / "cloud.pcd", index, "0 0 0 1 0 0 0")
+        rows = "\n".join(" ".join(map(repr, row)) for row in pose(index).tolist())
+        text = f"stamp 170000000{index} 5\nestimate\n{rows}\nodom\n{rows}\naccum_distance 1\nid {index + 7}\n"
+        (tmp_path / "in" / f"{index:06d}" / "data").write_text(text)
+    (tmp_path / "in" / "map.txt").write_text("")
+    summary = import_clouds(tmp_path / "in", tmp_path / "a.mcap")
+    assert (summary.poses, summary.num_frames) == ("keyframes of hdl_graph_slam", 2)
+    found = lidar_poses(tmp_path / "a.mcap")
+    assert [stamp for stamp, _ in found] == [1_700_000_000_000_000_005, 1_700_000_001_000_000_005]
+    for index, (_, T) in enumerate(found):
+        np.testing.assert_allclose(T, pose(index), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stamp 1 2\n", "expects the rows 'stamp' and 'estimate'"),
+        ("stamp 1\nestimate\n1 0 0 0\n", "expects 'stamp SECONDS NANOSECONDS', and four rows"),
+        ("stamp 1 2\nestimate\n" + "2 0 0 0\n" * 4, "estimate: its upper left 3x3 part is not a rotation"),
+    ],
+)
+def test_damaged_keyframes_are_named(tmp_path, text, message):
+    save_pcd(tmp_path / "in" / "000000" / "cloud.pcd", 0, "0 0 0 1 0 0 0")
+    (tmp_path / "in" / "000000" / "data").write_text(text)
+    with pytest.raises(InputError, match=message):
+        import_clouds(tmp_path / "in", tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("EDGE_SE3:QUAT 0 1", "holds no row VERTEX_SE3:QUAT"),
+        ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0", "line 1: expects an id, a position and a quaternion"),
+        ("VERTEX_SE3:QUAT 1.5 0 0 0 0 0 0 1", "line 1: expects an id, a position and a quaternion"),
+        ("VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1", "none of its 1 vertices has the number of a cloud such as '1.ply'"),
+    ],
+)
+def test_damaged_pose_graphs_are_named(tmp_path, text, message):
+    folder = ply_folder(tmp_path / "in", ("1",))
+    (tmp_path / "graph.g2o").write_text(text)
+    with pytest.raises(InputError, match=message):
+        import_clouds(folder, tmp_path / "a.mcap", rate=1.0)

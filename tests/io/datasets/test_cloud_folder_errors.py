@@ -41,7 +41,7 @@ def remove(pattern: str):
         (spoil("poses.txt", "nan " * 12 + "\n" + "inf " * 12 + "\n" + "nan " * 12),
          r"none of the 3 clouds has a usable pose in poses\.txt \(KITTI\)$"),
         (spoil("poses.txt", "1000 0 0 0 0 0 0 1"), "times are 0.000 to 0.200 s, the poses' 1000.000 to 1000.000 s"),
-        (remove("poses.txt"), "no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one"),
+        (remove("poses.txt"), "no poses found; looked for NAME.pose.txt beside the clouds, and poses.txt and"),
         (spoil("times.txt", "1\n2\n"), r"times\.txt: has 2 times; the folder has 3 frames"),
         (spoil("times.txt", "1\n2\n3000000000"), r"times\.txt: times must be below 2\^31 s"),
         (spoil("velodyne/map.ply", ""), r"velodyne: holds \.bin and \.ply files; keep clouds of one format in it"),

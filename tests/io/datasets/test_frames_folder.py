@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from octoreplay.errors import InputError, OutputError
-from octoreplay.io.datasets.frames_folder import frame_stamps, natural_order, robot_name, unfinished
+from octoreplay.io.datasets.frames_folder import frame_stamps, natural_order, robot_name
+from octoreplay.io.output_file import unfinished
 
 
 def test_numbers_in_names_sort_as_numbers():

@@ -86,9 +86,9 @@ def test_a_tum_row_that_is_not_finite_has_no_pose(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [(["# nothing"], r"a\.txt: holds no poses"),
-     (["1 2 3 4 5 6 7"], r"a\.txt line 1: expects 8 numbers in every row \(TUM: .*\), or 12 \(KITTI: .*\), got 7"),
-     (["1 2 3 0 0 0 1 0", "1 2 3"], r"a\.txt line 2: expects 8 numbers in every row .*, got 3"),
-     ([kitti_row(np.eye(4)), "1 2 3"], r"a\.txt line 2: expects 8 numbers .* or 12 .*, got 3"),
+     (["1 2 3 4 5 6 7"], r"a\.txt line 1: expects 8 numbers \(TUM: .*\), 12 \(KITTI: .*\) or 16 .*, got 7"),
+     (["1 2 3 0 0 0 1 0", "1 2 3"], r"a\.txt line 2: expects 8 numbers as in the rows before, got 3"),
+     ([kitti_row(np.eye(4)), "1 2 3"], r"a\.txt line 2: expects 12 numbers as in the rows before, got 3"),
      ([kitti_row(2 * np.eye(4))], r"a\.txt line 1: its upper left 3x3 part is not a rotation"),
      (["soon 2 3 0 0 0 1 0"], r"a\.txt line 1: 'soon' is not a time"),
      (["1 2 3 a b c d e"], r"a\.txt line 1: expects numbers")],

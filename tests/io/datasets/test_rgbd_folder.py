@@ -221,7 +221,7 @@ def repaint(values: np.ndarray):
     ("spoiler", "message"),
     [
         (damage_picture, r"frame-000005\.depth\.png: is damaged"),
-        (spoil("frame-000005.depth.png", "text"), r"frame-000005\.depth\.png: is not an image"),
+        (spoil("frame-000005.depth.png", "text"), r"frame-000005\.depth\.png: is not a PNG image"),
         (repaint(np.zeros((4, 6, 3), np.uint8)), "16-bit grey PNG, this one has 8 bits in 3"),
         (repaint(np.zeros((4, 7), np.uint16)), "is 7x4 pixels, but the depth images are 6x4"),
         (spoil("frame-000005.pose.txt", "1 2 3"), r"frame-000005\.pose\.txt: expects a 4x4 matrix, got 3 numbers"),
@@ -297,7 +297,7 @@ def test_label_images_of_another_size_or_name_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "text", "message"),
-    [("groundtruth.txt", "1.0 2 3\n", "line 1: expects 8 numbers in every row"),
+    [("groundtruth.txt", "1.0 2 3\n", "holds positions without rotations"),
      ("groundtruth.txt", "soon 1 2 3 0 0 0 1\n", "'soon' is not a time"),
      ("depth.txt", "1.0\n", "line 1: expects a stamp and a file name"),
      ("depth.txt", "# nothing\n", "lists no depth images"),

@@ -20,7 +20,18 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping.codec import encode_packet
 from octoreplay.result import open_result
 from support.octree_factory import octree_of
-from support.result_factory import CLASSES, SECOND, START, state, summary, team, tick_metrics, write_result, write_until
+from support.result_factory import (
+    CLASSES,
+    SECOND,
+    START,
+    state,
+    summary,
+    team,
+    tick_metrics,
+    write_killed,
+    write_result,
+    write_until,
+)
 
 
 class CountedFile:
@@ -121,8 +132,8 @@ def test_states_of_an_older_version_do_not_name_the_number_of_robots(
 ) -> None:
     def fill(writer: ResultWriter) -> None:
         for write in (writer.write_state, writer.write_evidence):
-            write(state("alpha", 0, 1, encode_packet(octree_of({(0, 0, 0): (1.0, 2.0)})), key=True))
-        writer.write_state(state("central", 0, 1, encode_packet(octree_of({})), key=True))
+            write(state("alpha", 0, 1, encode_packet(octree_of({(0, 0, 0): (1.0, 2.0)}, resolution=0.2)), key=True))
+        writer.write_state(state("central", 0, 1, encode_packet(octree_of({}, resolution=0.2)), key=True))
 
     name = "octoreplay_msgs/msg/MapState"
     path = _write_with(monkeypatch, tmp_path, lambda text: text.replace("uint32 num_robots\n", ""), name, fill)
@@ -220,7 +231,7 @@ def test_one_tick_or_time_is_read_without_the_rest(tmp_path: Path) -> None:
                 range((tick - 1) // 10 * 10 + 1, tick + 1)
             )
         with ResultReader(path) as reader:
-            reader._reader._stream = counted = CountedFile(reader._reader._stream)
+            reader._reader._file = counted = CountedFile(reader._reader._file)
             reader.states("alpha", reader.state_stamp("alpha", tick))
             assert counted.num_bytes < num_chunks * 1_500_000 < path.stat().st_size
 
@@ -299,9 +310,10 @@ def test_an_interrupted_result_can_be_read(tmp_path: Path) -> None:
 
 
 def test_a_result_without_ticks_has_no_summary(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        write_until(KeyboardInterrupt, tmp_path / "o.mcap", [])
-    with ResultReader(tmp_path / "o.partial.mcap") as reader, pytest.raises(InputError, match="holds no tick"):
+    with (
+        ResultReader(write_killed(tmp_path / "o.mcap", [])) as reader,
+        pytest.raises(InputError, match="holds no tick"),
+    ):
         reader.summary(reader.metrics())
 
 
@@ -310,7 +322,7 @@ def test_files_that_are_not_results_are_input_errors(tmp_path: Path) -> None:
         ResultReader(tmp_path / "none.mcap")
     for content in (b"", b"not an MCAP", b"\x89MCAP0\r\n" + bytes(100)):
         (tmp_path / "a.mcap").write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.mcap: not a finished MCAP file; give the OUT\.mcap"):
+        with pytest.raises(InputError, match=r"a\.mcap: not a finished MCAP file, or damaged; give the OUT\.mcap"):
             ResultReader(tmp_path / "a.mcap")
     with RosMcapWriter(tmp_path / "log.mcap") as writer:
         clock = message("rosgraph_msgs/msg/Clock", clock=time_message(0))
@@ -320,9 +332,9 @@ def test_files_that_are_not_results_are_input_errors(tmp_path: Path) -> None:
 
 
 def test_a_later_format_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("octoreplay.io.results.result_writer.FORMAT_VERSION", "3")
+    monkeypatch.setattr("octoreplay.io.results.result_writer.FORMAT_VERSION", "4")
     path = write_result(tmp_path)
-    with pytest.raises(InputError, match="result format 3, this version reads 2"):
+    with pytest.raises(InputError, match="result format 4, this version reads 2 and 3"):
         ResultReader(path)
 
 

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,7 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from octoreplay.errors import InputError, OutputError
 from octoreplay.io.results.geometry_messages import quaternion
-from octoreplay.io.results.result_writer import ResultWriter, partial_path, view_points
+from octoreplay.io.results.map_views import view_points
+from octoreplay.io.results.result_reader import ResultReader
+from octoreplay.io.results.result_writer import ResultWriter, partial_path
+from octoreplay.records import FrameCounts
 from support.result_factory import (
     CLASSES,
     SECOND,
@@ -21,6 +25,7 @@ from support.result_factory import (
     summary,
     team,
     tick_metrics,
+    write_killed,
     write_result,
     write_until,
 )
@@ -127,19 +132,40 @@ def test_frames_and_graph_show_where_the_robots_are(tmp_path: Path) -> None:
     assert (turn.x, turn.y) == (0.0, 0.0)
     assert (turn.z, turn.w) == pytest.approx((0.5**0.5, 0.5**0.5))
     assert latest["/alpha/pose"].pose.position.x == 4.0
-    lines, *names = latest["/graph"].markers
+    _, lines, *names = latest["/graph"].markers
     assert [(p.x, p.y, p.z) for p in lines.points] == [(4.0, 2.0, 3.0), (0.0, 2.0, 3.0)]
     assert (lines.type, lines.action) == (5, 0)
     assert [name.text for name in names] == ["alpha", "beta"]
 
 
-def test_a_graph_without_links_deletes_the_old_lines(tmp_path: Path) -> None:
+def test_every_graph_deletes_the_markers_before_it(tmp_path: Path) -> None:
     poses = [pose("alpha", 1.0), pose("beta", 2.0)]
     path = write_result(tmp_path, lambda writer: writer.write_graph(START + 9 * SECOND, [], poses))
     with AnyReader([path]) as reader:
         graph = [c for c in reader.connections if c.topic == "/graph"]
         messages = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(graph)]
-    assert (messages[-1].markers[0].action, messages[-1].markers[0].points) == (2, [])
+    assert {(message.markers[0].action, message.markers[0].header.frame_id) for message in messages} == {(3, "team")}
+    assert [entry.ns for entry in messages[-1].markers[1:]] == ["robots", "robots"]
+
+
+def test_cubes_are_the_occupied_leaves_by_class_and_size(tmp_path: Path) -> None:
+    points = view_points(leaf_table(), CLASSES)
+    path = write_result(tmp_path, lambda writer: writer.write_cubes("alpha", START + SECOND, points, "alpha/map"))
+    with AnyReader([path]) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == "/alpha/markers"]
+        ((_, _, raw),) = reader.messages([connection])
+        clear, *cubes = reader.deserialize(raw, connection.msgtype).markers
+    assert clear.action == 3
+    # The leaves 0 and 2 have one class and size.
+    assert [(cube.type, cube.action, cube.ns, cube.header.frame_id) for cube in cubes] == [
+        (6, 0, "ground", "alpha/map"), (6, 0, "tree", "alpha/map")
+    ]  # fmt: skip
+    assert [cube.scale.x for cube in cubes] == pytest.approx([0.2, 0.4])
+    found = [[(p.x, p.y, p.z) for p in cube.points] for cube in cubes]
+    np.testing.assert_allclose(found[0], leaf_table().centers[[0, 2]], rtol=1e-6)
+    np.testing.assert_allclose(found[1], leaf_table().centers[[1]], rtol=1e-6)
+    color = cubes[0].color
+    assert [color.r * 255, color.g * 255, color.b * 255, color.a] == pytest.approx([10, 20, 30, 1], rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -161,7 +187,7 @@ def test_quaternions_of_half_turns(axis: tuple[int, int, int]) -> None:
 
 def test_metadata_describe_the_run(tmp_path: Path) -> None:
     records = metadata(write_result(tmp_path))
-    assert records["octoreplay"]["format_version"] == "2"
+    assert records["octoreplay"]["format_version"] == "3"
     assert json.loads(records["octoreplay"]["robots"]) == ["alpha", "beta"]
     assert json.loads(records["classes"]["classes"])[1:] == [
         {"id": 1, "name": "ground", "color": [10, 20, 30]},
@@ -198,11 +224,68 @@ def test_the_result_appears_only_when_it_is_complete(tmp_path: Path) -> None:
     assert not partial_path(out).exists()
 
 
-def test_an_error_leaves_no_incomplete_result(tmp_path: Path) -> None:
-    out = tmp_path / "out.mcap"
-    with pytest.raises(ZeroDivisionError):
-        write_until(ZeroDivisionError, out, [tick_metrics(1)])
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_an_error_before_the_first_tick_leaves_nothing(tmp_path: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error):
+        write_until(error, tmp_path / "out.mcap", [])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["alpha.bag", "beta.bag"]
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(InputError("a.bag: gone"), "error: a.bag: gone"), (MemoryError(), "out of memory"), (OSError(5, "x"), "error: ")],
+)
+def test_an_error_after_a_tick_leaves_a_finished_partial_result(tmp_path: Path, error: Exception, reason: str) -> None:
+    partial = tmp_path / "out.partial.mcap"
+
+    def fail() -> None:
+        with ResultWriter(tmp_path / "out.mcap", team(tmp_path)) as writer:
+            writer.write_metrics(tick_metrics(1))
+            raise error
+
+    with pytest.raises(type(error)) as raised:
+        fail()
+    assert raised.value.__notes__ == [f"the finished part is in {partial}"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["alpha.bag", "beta.bag", "out.partial.mcap"]
+    stored = metadata(partial)["summary"]
+    assert stored["complete"] == "false"
+    assert stored["stop_reason"].startswith(reason)
+
+
+def test_an_unfinished_result_is_kept_unless_a_restart_is_asked_for(tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    with pytest.raises(KeyboardInterrupt):
+        write_until(KeyboardInterrupt, out, [tick_metrics(1)])
+    left = (tmp_path / "out.partial.mcap").read_bytes()
+    with pytest.raises(OutputError, match=r"left this unfinished result; continue it with --resume, .* --restart"):
+        ResultWriter(out, team(tmp_path))
+    assert (tmp_path / "out.partial.mcap").read_bytes() == left
+    with ResultWriter(out, team(tmp_path), restart=True) as writer:
+        writer.complete(summary([tick_metrics(1)]))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["alpha.bag", "beta.bag", "out.mcap"]
+
+
+def test_an_unfinished_result_without_a_message_is_replaced(tmp_path: Path) -> None:
+    write_killed(tmp_path / "out.mcap", [])
+    with ResultWriter(tmp_path / "out.mcap", team(tmp_path)) as writer:
+        writer.complete(summary([tick_metrics(1)]))
+    assert not (tmp_path / "out.partial.mcap").exists()
+
+
+def test_the_file_of_another_process_is_not_published(tmp_path: Path) -> None:
+    out, partial = tmp_path / "out.mcap", tmp_path / "out.partial.mcap"
+    out.write_text("old")
+
+    def complete() -> None:
+        with ResultWriter(out, team(tmp_path)) as writer:
+            writer.write_metrics(tick_metrics(1))
+            partial.unlink()
+            partial.write_text("foreign")
+            writer.complete(summary([tick_metrics(1)]))
+
+    with pytest.raises(OutputError, match=r"out\.partial\.mcap was removed during the run"):
+        complete()
+    assert (out.read_text(), partial.read_text()) == ("old", "foreign")
 
 
 def test_an_interrupt_leaves_a_valid_partial_result(tmp_path: Path) -> None:
@@ -226,6 +309,7 @@ def test_partial_names() -> None:
         ("none/out.mcap", "the folder '.*none' does not exist"),
         ("", "is a folder; give a file name"),
         ("alpha.bag", "is an input of robot 'alpha'; name another output"),
+        ("a.partial.mcap", "unfinished results end in .partial.mcap; name another output"),
         ("none/../beta.bag", "is an input of robot 'beta'; name another output"),
     ],
 )
@@ -245,13 +329,22 @@ def test_a_missing_input_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["alpha.bag"]
 
 
-def test_logs_below_the_results_folder_are_stored_relative_to_it(tmp_path: Path) -> None:
+def test_paths_are_stored_relative_to_the_results_folder(tmp_path: Path) -> None:
     config = team(tmp_path)
     (tmp_path / "out").mkdir()
+    done = summary([tick_metrics(1)])
+    first, second = (str(robot.logs[0]) for robot in config.robots)
+    cut = FrameCounts(truncated_files=[f"{first}: cut"], first_missing={"late": second})
+    done = dataclasses.replace(done, frame_counts={"alpha": cut}, warnings=(f"{second}: has no labels",))
     with ResultWriter(tmp_path / "out" / "out.mcap", config) as writer:
-        writer.complete(summary([tick_metrics(1)]))
-    text = metadata(tmp_path / "out" / "out.mcap")["config"]["team_file"]
-    assert str(tmp_path.resolve() / "alpha.bag") in text
+        writer.complete(done)
+    records = metadata(tmp_path / "out" / "out.mcap")
+    assert "log: ../alpha.bag" in records["config"]["team_file"]
+    assert "../beta.bag" in records["inputs"]
+    assert str(tmp_path) not in str(records)
+    with ResultReader(tmp_path / "out" / "out.mcap") as reader:
+        assert [robot.logs[0].resolve() for robot in reader.config.robots] == [r.logs[0] for r in config.robots]
+        assert reader.changed_inputs() == []
 
 
 def test_the_class_table_is_stored(tmp_path: Path) -> None:

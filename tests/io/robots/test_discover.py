@@ -83,6 +83,14 @@ def test_several_robots_of_one_log_are_named_by_namespace(tmp_path):
         resolve(run_of(RobotConfig("c", (path,))))
 
 
+def test_topics_without_a_leading_slash_hold_several_robots(tmp_path):
+    both = [*robot_entries(namespace="a"), *robot_entries(namespace="b", num_frames=4)]
+    entries = sorted((e._replace(topic=e.topic.lstrip("/")) for e in both), key=lambda e: e.log_time_ns)
+    robots = discover([write_mcap(tmp_path / "team.mcap", entries)])
+    assert [(robot.robot_id, robot.pose_topic) for robot in robots] == [("a", "a/odom"), ("b", "b/odom")]
+    assert [count_frames(robot) for robot in robots] == [6, 4]
+
+
 def test_namespaced_robots_that_share_tf(tmp_path):
     entries = sorted(
         [*robot_entries(namespace="a", poses="tf"), *robot_entries(namespace="b", poses="tf")],
@@ -146,8 +154,9 @@ def test_several_depth_images_are_listed_as_lines_to_paste(tmp_path):
     with pytest.raises(ConfigError) as caught:
         discover([path])
     assert str(caught.value) == (
-        f"{path}: robot 'r' has 2 depth images; put one of these lines into its entry of a team file:"
-        "\n    depth_topic: /camera/depth/image_raw\n    depth_topic: /rear/depth/image_raw"
+        f"{path}: robot 'r' has 2 depth images; put one of these lines into its entry of a team file, or each "
+        "into an entry of its sensors:\n    depth_topic: /camera/depth/image_raw\n"
+        "    depth_topic: /rear/depth/image_raw"
     )
     (robot,) = resolve(run_of(RobotConfig("r", (path,), depth_topic=DEPTH))).robots
     assert (robot.depth_topic, robot.camera_info_topic) == (DEPTH, INFO)
@@ -201,7 +210,7 @@ def test_the_map_frame_of_tf_is_the_root_above_the_sensor(tmp_path):
         (INFO, f"there is no CameraInfo for '{DEPTH}'; give intrinsics"),
         (
             "/odom",
-            r"no poses \(.*\) for robot 'r'; give pose_file: .*, or, if the sensor does not move, pose_topic",
+            r"no poses \(.*\) for robot 'r'; 'octoreplay odometry .*r.mcap -o r.tum' .*or pose_topic",
         ),
     ],
 )

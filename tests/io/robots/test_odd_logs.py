@@ -195,4 +195,4 @@ def test_missing_poses_are_reported_with_the_first_message(tmp_path):
     entries = [e for e in robot_entries(num_frames=8) if not (e.topic == "/odom" and e.log_time_ns > START + SECOND)]
     _, counts = read(robot_of(write_mcap(tmp_path / "r.mcap", entries)))
     assert counts == FrameCounts(used=5, no_pose=3)
-    assert counts.first_missing == {"no_pose": f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' at 101.250 s"}
+    assert counts.first_missing == {"no_pose": f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' with the stamp 101.250 s"}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -116,7 +117,7 @@ def test_every_cause_is_counted_and_every_image_once(tmp_path):
     ]
     frames, counts = read_entries(tmp_path, kept + after)
     # 5 and 6 have no pose; the last image has neither label nor pose, and the label is checked first.
-    what = f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' at 103.750 s: 1.750 s before the newest stamp so far"
+    what = f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' with the stamp 102.000 s: 1.750 s before the newest stamp so far"
     assert counts == FrameCounts(used=7, no_label=2, no_pose=2, undecodable=1, late=1)
     assert counts.first_missing["late"] == what
     assert counts.used + counts.skipped == 13
@@ -235,6 +236,18 @@ def test_stamped_poses_need_the_sensor_transform(tmp_path):
     np.testing.assert_allclose(frames[0].T_team_sensor, pose_matrix((5, 0, 1), IDENTITY))
 
 
+def test_a_sensor_that_stands_still_needs_no_poses_in_the_log(tmp_path):
+    entries = [e for e in robot_entries() if e.topic not in ("/odom", "/tf_static")]
+    frames, counts = read_entries(tmp_path, entries, pose_topic=None, pose=(1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8))
+    assert counts == FrameCounts(used=len(frames))
+    assert len(frames) == sum(e.topic == DEPTH for e in entries)
+    for frame in frames:
+        np.testing.assert_allclose(frame.T_team_sensor, pose_matrix((1, 2, 3), (0.0, 0.0, 0.6, 0.8)))
+    mount = (0.0, 0.0, 1.0, *IDENTITY)
+    (frame, *_), _ = read_entries(tmp_path, entries, pose_topic=None, pose=(5.0, 0, 0, *IDENTITY), T_body_sensor=mount)
+    np.testing.assert_allclose(frame.T_team_sensor, pose_matrix((5, 0, 1), IDENTITY))
+
+
 def test_clouds_with_labels(tmp_path):
     entries = [e for e in robot_entries(labels=False) if e.topic in ("/tf_static", "/odom")]
     for index in range(3):
@@ -271,7 +284,11 @@ def test_a_cut_log_is_used_and_reported(tmp_path):
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     frames, counts = read(robot_of(cut))
     all_frames, _ = read(robot_of(whole))
-    assert counts.truncated_files == [f"{cut}: cut before its end; everything else is used"]
+    (damage,) = counts.truncated_files
+    assert re.fullmatch(
+        re.escape(f"{cut}: cut before its end; everything else is used (log times 100.000 s to ") + r"10\d\.\d+ s\)",
+        damage,
+    )
     assert counts.lost_data
     assert 5 < len(frames) < 40
     for frame, reference in zip(frames, all_frames, strict=False):

@@ -112,7 +112,7 @@ def test_duplicate_images_are_counted_and_are_no_loss(tmp_path):
     _, counts = read_entries(tmp_path, shuffled(robot_entries(num_frames=12), 0, 1, 11))
     assert (counts.used, counts.duplicate, counts.late, counts.lost_data) == (12, 1, 2, True)
     assert counts.first_missing["late"] == (
-        f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' at 102.750 s: 2.750 s before the newest stamp so far"
+        f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' with the stamp 100.000 s: 2.750 s before the newest stamp so far"
     )
 
 
@@ -129,7 +129,7 @@ def test_stamps_that_jump_back_are_late(tmp_path):
     _, counts = read_entries(tmp_path, moved)
     assert (counts.used, counts.late) == (8, 4)
     assert counts.first_missing["late"].startswith(
-        f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' at 102.000 s: 59.750 s before"
+        f"{tmp_path / 'r.mcap'}: topic '{DEPTH}' with the stamp 42.000 s: 59.750 s before"
     )
 
 

@@ -32,7 +32,7 @@ from support.log_factory import (
     write_rosbag2,
     write_rows,
 )  # fmt: skip
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 
 TABLE = class_table_from_names({"r": NAMES})
 START = 100 * SECOND
@@ -203,6 +203,7 @@ def test_a_clock_that_was_set_makes_the_whole_log_be_read(tmp_path):
     assert_same_frames(robot, TimeConfig(start=60, duration=5, reorder_window=100), seeks=False)
 
 
+@long
 def test_a_damaged_stamp_at_the_place_where_reading_starts(tmp_path):
     entries = entries_of()
     for index in (40, 41, 57, 58):

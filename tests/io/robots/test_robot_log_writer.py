@@ -197,7 +197,7 @@ def test_clouds_keep_every_field(tmp_path, label_type):
 
 def test_a_cloud_needs_coordinates_only_and_may_be_empty(tmp_path):
     for points, is_dense in ((POINTS[:0], True), (POINTS[:1], True), (POINTS, False)):
-        [(_, cloud)] = read_messages(write_cloud(tmp_path / "r1.mcap", points))["/r1/lidar/points"]
+        [(_, cloud)] = read_messages(write_cloud(tmp_path / f"{len(points)}.mcap", points))["/r1/lidar/points"]
         assert ([f.name for f in cloud.fields], cloud.width) == (["x", "y", "z"], len(points))
         assert cloud.is_dense == is_dense
 

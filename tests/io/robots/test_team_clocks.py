@@ -53,44 +53,44 @@ def test_clocks_that_may_agree(clocks):
             {"a": clock(1_326_898_728, 17.7), "b": clock(0, 60), "c": clock(1, 60)},
             (
                 "the clocks of the robots have different epochs: the stamps of a (2012-01-18T14:58:48Z, 17.7 s) are"
-                " dates, those of b and c (0.000 s, 61.0 s) are times since some start; give clock_offset, or use "
-                "clock: log if the logs were recorded at the same time"
+                " dates, those of b and c (0.000 s, 61.0 s) are times since some start; give clock_offset in the "
+                "team file, or use --clock log if the logs were recorded at the same time"
             ),
         ),
         (
             {"a": clock(DATE, 60), "b": clock(DATE, 60, delay=-DATE)},
             (
                 "the clocks of the robots have different epochs: the stamps of a (2023-11-14T22:13:20Z, 60.0 s) are"
-                " dates, those of b (0.000 s, 60.0 s) are times since some start; give clock_offset, or use clock: "
-                "log if the logs were recorded at the same time"
+                " dates, those of b (0.000 s, 60.0 s) are times since some start; give clock_offset in the team file,"
+                " or use --clock log if the logs were recorded at the same time"
             ),
         ),
         (
             {"a": clock(100, 60), "b": clock(0, 60), "c": clock(159, 60)},
             (
                 "the logs share no time: b (0.000 s, 60.0 s); a and c (100.000 s, 119.0 s); if they were recorded "
-                "at the same time, give clock_offset"
+                "at the same time, give clock_offset in the team file"
             ),
         ),
         (
             {"a": clock(DATE, 600), "b": clock(DATE, 300, delay=-125), "c": clock(DATE, 600, delay=2)},
             (
                 "the clocks of the robots differ: the stamps of b (-125.0 s) differ from the times of recording, "
-                "those of a and c do not; give clock_offset, or use clock: log"
+                "those of a and c do not; give clock_offset in the team file, or use --clock log"
             ),
         ),
         (
             {"a": clock(0, 600), "b": clock(75, 601.5), "c": clock(1, 300), "d": clock(3, 599)},
             (
                 "the clocks of the robots may differ: the log of b begins 75.0 s and ends 76.5 s after that of a; "
-                "if they were recorded at the same time, give clock_offset"
+                "if they were recorded at the same time, give clock_offset in the team file"
             ),
         ),
         (
             {"a": clock(300, 600), "b": clock(0, 600), "c": clock(1, 600)},
             (
                 "the clocks of the robots may differ: the log of a begins 300.0 s and ends 300.0 s after that of b;"
-                " if they were recorded at the same time, give clock_offset"
+                " if they were recorded at the same time, give clock_offset in the team file"
             ),
         ),
     ],
@@ -111,7 +111,7 @@ def test_info_and_run_judge_alike_and_by_the_stamps(tmp_path):
     assert resolve(config).warnings == (sentence,)
     assert resolve(config.with_parameters({"clock": "log"})).warnings == ()
     (again,) = resolve(run_of(*(RobotConfig(i, (second,), DEPTH, pose_topic="/odom") for i in "cd"))).warnings
-    assert again == f"c and d map the same messages of {second}, which count twice"
+    assert again == f"c and d map the same messages of {second}, which count twice; leave one of them out"
 
 
 def test_strict_frames_leave_clocks_a_warning(tmp_path):

@@ -53,8 +53,8 @@ TUM, KITTI = "1 0 0 0 0 0 0 1\n", "1 0 0 0 0 1 0 0 0 0 1 0\n"
     ("text", "sentence"),
     [
         ("", ": holds no poses"),
-        (f"# head\n{TUM}1 2 3\n", " line 3: expects 8 numbers in every row (TUM: time x y z qx qy qz qw), or 12"),
-        (TUM + KITTI, " line 2: expects 8 numbers in every row"),
+        (f"# head\n{TUM}1 2 3\n", " line 3: expects 8 numbers as in the rows before, got 3"),
+        (TUM + KITTI, " line 2: expects 8 numbers as in the rows before, got 12"),
         (f"{TUM}x 0 0 0 0 0 0 1\n", " line 2: 'x' is not a time in seconds"),
         (f"{KITTI}1 0 0 0 0 1 0 0 0 0 1 x\n", " line 2: expects numbers, got '1 0 0 0 0 1 0 0 0 0 1 x'"),
         (f"{KITTI}1 0 0 0 0 1 0 0 0 0 2 0\n", " line 2: its upper left 3x3 part is not a rotation"),

@@ -16,7 +16,7 @@ from octoreplay.records import ClassTable, SemanticClass
 from octoreplay.replay.exchange.messages import HeldMap, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
-from support.long_suite import one_in
+from support.long_suite import long, one_in
 from support.octree_factory import cells_of, octree_of
 
 SOURCE = Source(0, 0)
@@ -187,6 +187,7 @@ BUDGETS = (
 )  # fmt: skip
 
 
+@long
 @pytest.mark.parametrize(("parameters", "seed"), one_in(5, BUDGETS, range(2)), ids=str)
 def test_within_a_budget_the_largest_changes_go_first(parameters, seed):
     random = np.random.default_rng(seed)

@@ -44,7 +44,7 @@ class BagLog(BlockLog):
         index = _index_from_end(self._file, self._size)
         if index is not None:
             return index
-        index = BagPass(self._file, self._size, self._damage).index()
+        index = BagPass(self._file, self._size, self._damage, self._budget).index()
         if not index.blocks:
             raise InputError(f"{self.path}: cannot be read: the bag has no index and holds no complete message")
         return index
@@ -53,10 +53,10 @@ class BagLog(BlockLog):
         """Yield the messages of the wanted connections in a chunk."""
         records = self._records(block)
         if records is None:
-            self._damage.skip_part("chunk", block.offset, block.num_messages)
+            self._damage.skip_part("chunk", block.offset, block.num_messages, block.span_ns)
             return
         count = 0
-        for channel_id, log_time_ns, start, end in walk_messages(records):
+        for channel_id, log_time_ns, start, end in walk_messages(records, self._budget):
             count += 1
             if channel_id in wanted:
                 yield log_time_ns, block.offset, start, end, channel_id, records
@@ -72,10 +72,10 @@ class BagLog(BlockLog):
         if head is None:
             return None
         if block.form == CUT_CHUNK:
-            return cut_records(head, self._bytes_at(head.start, block.offset + block.length - head.start))
+            return cut_records(head, self._bytes_at(head.start, block.offset + block.length - head.start), self._budget)
         if head.end > block.offset + block.length:
             return None
-        return whole_records(head, self._bytes_at(head.start, head.length))
+        return whole_records(head, self._bytes_at(head.start, head.length), self._budget)
 
 
 def _index_from_end(file: IO[bytes], size: int) -> Index | None:

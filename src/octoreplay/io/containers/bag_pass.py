@@ -22,7 +22,7 @@ from octoreplay.io.containers.bag_records import (
 )  # fmt: skip
 from octoreplay.io.containers.block_log import CUT_CHUNK, BlockBuilder, Index
 from octoreplay.io.containers.damage import Damage
-from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES
+from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES, ContentBudget
 from octoreplay.io.messages.decoders import Bytes
 
 _OPERATIONS = range(MESSAGE, CONNECTION + 1)
@@ -37,11 +37,12 @@ _CHUNK_FIELDS = {"op", "compression", "size"}
 class BagPass:
     """Builds the index of a bag in one pass over its records. After damage it resumes at the next intact chunk."""
 
-    def __init__(self, file: IO[bytes], size: int, damage: Damage) -> None:
+    def __init__(self, file: IO[bytes], size: int, damage: Damage, content: ContentBudget) -> None:
         self._file = file
         self._size = size
         self._damage = damage
         self._index = Index()
+        self._content = content
         # Where a search after damage begins. The length of an intact chunk is certain, that of other records is not:
         # it may itself be damaged.
         self._floor = len(MAGIC)
@@ -85,7 +86,7 @@ class BagPass:
     def _read_chunk(self, position: int, head: RecordHead) -> int | None:
         """Add a chunk and return its end; None where it is damaged and no record follows at its end."""
         self._broken_chunk = None
-        records = whole_records(head, self._file.read(head.length))
+        records = whole_records(head, self._file.read(head.length), self._content)
         if records is not None:
             self._add_chunk(records, position, head.end - position, "")
             self._floor = head.end
@@ -101,7 +102,7 @@ class BagPass:
         """Add the block of a chunk, its connections and the numbers of its messages."""
         builder = BlockBuilder(self._index.tally)
         end = 0
-        for head_start, start, end in walk(records):
+        for head_start, start, end in self._content.counted(walk(records)):
             message = message_head(records, head_start, start - 4)
             if message is not None:
                 builder.add(*message)
@@ -124,7 +125,7 @@ class BagPass:
         head = read_head(self._file, position, self._size)
         if head is not None and head.operation == CHUNK and head.end > self._size:
             length = min(self._size - position, MAX_CHUNK_BYTES)
-            self._add_chunk(cut_records(head, self._file.read(length)), position, length, CUT_CHUNK)
+            self._add_chunk(cut_records(head, self._file.read(length), self._content), position, length, CUT_CHUNK)
 
     def _search(self, start: int) -> int | None:
         """Return the offset of the first intact chunk from a byte on; None where there is none."""
@@ -147,4 +148,4 @@ class BagPass:
         if head is None or head.fields.keys() != _CHUNK_FIELDS or head.end > self._size:
             return False
         self._budget -= head.length + head.number("size")
-        return whole_records(head, self._file.read(head.length)) is not None
+        return whole_records(head, self._file.read(head.length), self._content) is not None

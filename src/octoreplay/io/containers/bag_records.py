@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import IO, NamedTuple
 
-from octoreplay.io.containers.decompression import decompress, is_plausible_size
+from octoreplay.io.containers.decompression import ContentBudget, decompress, is_plausible_size
 from octoreplay.io.containers.log_reader import Channel, normalise_type_name
 from octoreplay.io.messages.decoders import Bytes
 
@@ -103,15 +103,15 @@ def message_head(records: Bytes, start: int, end: int) -> tuple[int, int] | None
     return _UINT32.unpack(match["conn"])[0], sec * 1_000_000_000 + nanosec
 
 
-def walk_messages(records: Bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Yield (connection, log time [ns], start, end) of each complete message in a chunk."""
-    for head_start, start, end in walk(records):
+def walk_messages(records: Bytes, budget: ContentBudget) -> Iterator[tuple[int, int, int, int]]:
+    """Yield (connection, log time [ns], start, end) of each complete message in a chunk; records take a budget."""
+    for head_start, start, end in budget.counted(walk(records)):
         message = message_head(records, head_start, start - 4)
         if message is not None:
             yield *message, start, end
 
 
-def whole_records(head: RecordHead, data: bytes) -> Bytes | None:
+def whole_records(head: RecordHead, data: bytes, budget: ContentBudget) -> Bytes | None:
     """Return the records of a chunk; None for another record, or where its sizes do not match."""
     if head.operation != CHUNK or len(data) != head.length:
         return None
@@ -119,13 +119,16 @@ def whole_records(head: RecordHead, data: bytes) -> Bytes | None:
     if not compression or not is_plausible_size(compression, len(data), size):
         return None
     records = decompress(compression, memoryview(data), size)
+    budget.take(len(records))
     return records if len(records) == size else None
 
 
-def cut_records(head: RecordHead, data: bytes) -> Bytes:
+def cut_records(head: RecordHead, data: bytes, budget: ContentBudget) -> Bytes:
     """Return the records of a chunk that is cut, up to where they can be decompressed."""
     compression = head.fields.get("compression", b"").decode("ascii", "replace")
-    return decompress(compression, memoryview(data), max(0, head.number("size")))
+    records = decompress(compression, memoryview(data), max(0, head.number("size")))
+    budget.take(len(records))
+    return records
 
 
 def channel_of(fields: Mapping[str, bytes], data: Bytes) -> Channel | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, TypeAlias
 
 from octoreplay.errors import InputError
+from octoreplay.io.containers.decompression import ContentBudget
 from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, TopicInfo
 from octoreplay.io.messages.decoders import Bytes
 
@@ -39,6 +40,11 @@ class Block:
     channel_ids: frozenset[int] | None
     form: str = ""
     num_messages: int | None = None
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Least and greatest log time of its messages; None where the index does not give the greatest."""
+        return None if self.end_ns is None else (self.start_ns, self.end_ns)
 
     def can_hold(self, channel_ids: Set[int], start_ns: float, stop_ns: float) -> bool:
         """Return True if the block may hold messages of some channels with ``start_ns <= log time < stop_ns``."""
@@ -136,6 +142,7 @@ class BlockLog(LogReader):
         try:
             self._size = self._file.seek(0, io.SEEK_END)
             self._file.seek(0)
+            self._budget = ContentBudget(path, self._size)
             self._index = self._read_index()
         except OSError as error:
             self._file.close()
@@ -187,6 +194,7 @@ class BlockLog(LogReader):
         stop = math.inf if stop_ns is None else stop_ns
         blocks = [block for block in self._index.blocks if block.can_hold(wanted.keys(), first, stop)]
         blocks.sort(key=lambda block: (block.start_ns, block.offset))
+        self._budget = ContentBudget(self.path, self._size)
         pending: list[Entry] = []
         for block in blocks:
             while pending and pending[0][:2] < (block.start_ns, block.offset):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Collection, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -179,6 +179,27 @@ def _page_counts(header: bytes) -> tuple[int, int]:
     page_size = int.from_bytes(header[16:18], "big")
     # A page size of 65536 is stored as 1, because it does not fit into two bytes.
     return 65536 if page_size == 1 else page_size, int.from_bytes(header[28:32], "big")
+
+
+def check_schema(path: Path) -> None:
+    """Raise InputError for a database whose rows are computed: a view can give any number of rows of any size."""
+    with closing(_connect(path, path.stat().st_size)) as database:
+        try:
+            kinds = {kind for (kind,) in database.execute("SELECT type FROM sqlite_master")}
+            names = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            # Ordinary columns are not hidden; generated and those of virtual tables are.
+            is_stored = all(
+                not hidden
+                for name in names
+                for (hidden,) in database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,))
+            )
+        except sqlite3.Error:
+            # A damaged schema has nothing to compute.
+            return
+    if not kinds <= {"table", "index"} or not is_stored:
+        raise InputError(
+            f"{path}: cannot be read: it has views, triggers or generated columns; rosbag2 writes plain tables only"
+        )
 
 
 def _connect(path: Path, size: int) -> sqlite3.Connection:

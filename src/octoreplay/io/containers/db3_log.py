@@ -13,7 +13,7 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from octoreplay.errors import InputError
-from octoreplay.io.containers.damaged_db3_log import DamagedDb3Log
+from octoreplay.io.containers.damaged_db3_log import DamagedDb3Log, check_schema
 from octoreplay.io.containers.log_reader import Channel, LogReader, RawMessage, TopicInfo, normalise_type_name
 
 _FORMATS = {
@@ -25,6 +25,7 @@ _FORMATS = {
 
 def open_db3(path: Path) -> LogReader:
     """Open a sqlite3 recording, also a damaged one. Raises InputError where nothing in it can be read."""
+    check_schema(path)
     try:
         return Db3Log(path)
     except InputError as error:

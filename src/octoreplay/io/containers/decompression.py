@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import bz2
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lz4.frame
 import zstandard
@@ -15,14 +16,51 @@ from octoreplay.io.messages.decoders import Bytes
 
 MAX_CHUNK_BYTES = 1 << 30
 """Greatest size of a chunk or message; a greater one is damage. Recorders write chunks of a few MB."""
-MAX_FILE_RATIO = 1000
-"""Greatest ratio of decompressed to compressed size of a file."""
+SMALL_CONTENT = 1 << 27
+"""Size up to which a chunk, a message or a file may decompress however small it is [byte]."""
+SMALL_COUNT = 1 << 17
+"""Number of records that a file may hold however small it is; above, a record takes four bytes or more."""
+MAX_RATIO = 256
+"""Greatest ratio of decompressed to compressed size above SMALL_CONTENT. Recorded chunks have ratios below 20."""
 _PIECE_BYTES = 1 << 20
 _BLOCK_BYTES = 1 << 17
 # Greatest ratio of decompressed to compressed size: a zstd block of 4 bytes holds at most 128 KiB (RFC 8878, 3.1.1.2),
 # and a length byte of lz4 counts at most 255 bytes. bz2 needs no limit: its output buffer grows with the output.
-_MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
+_FORMAT_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _FAILURES = (zstandard.ZstdError, OSError, RuntimeError, EOFError, ValueError, OverflowError, MemoryError)
+
+
+_T = TypeVar("_T")
+
+
+class ContentBudget:
+    """Bytes and records that one pass over a file of ``num_bytes`` may read; they bound its memory and time.
+
+    Methods raise InputError where the file holds more, which only files made for it do.
+    """
+
+    def __init__(self, path: Path, num_bytes: int) -> None:
+        self._path = path
+        self._num_bytes = num_bytes
+        self._bytes_left = content_limit(num_bytes)
+        self._records_left = SMALL_COUNT + num_bytes // 4
+
+    def take(self, num_bytes: int) -> None:
+        """Take some decompressed bytes."""
+        self._bytes_left -= num_bytes
+        if self._bytes_left < 0:
+            self._refuse(f"{content_limit(self._num_bytes):,} bytes")
+
+    def counted(self, records: Iterable[_T]) -> Iterator[_T]:
+        """Yield records and take each of them."""
+        for record in records:
+            self._records_left -= 1
+            if self._records_left < 0:
+                self._refuse(f"{SMALL_COUNT + self._num_bytes // 4:,} messages")
+            yield record
+
+    def _refuse(self, most: str) -> None:
+        raise InputError(f"{self._path}: damaged: its {self._num_bytes:,} bytes hold more than {most}; record it again")
 
 
 def is_plausible_size(compression: str, num_bytes: int, size: int) -> bool:
@@ -66,11 +104,12 @@ def decompress_message(data: Bytes) -> bytes | None:
 def decompress_file(source: Path, target: Path) -> None:
     """Decompress a zstd file into another one, up to the first damage.
 
-    The output is limited to 1000 times the size of ``source`` plus 1 GiB. Raises InputError where ``source`` cannot be
-    read or holds nothing that can be decompressed, and where ``target`` cannot be written.
+    The output is limited to ``SMALL_CONTENT``, or ``MAX_RATIO`` times the size of ``source`` if that is more. Raises
+    InputError where ``source`` cannot be read or holds nothing that can be decompressed, and where ``target`` cannot be
+    written.
     """
     try:
-        room = MAX_FILE_RATIO * source.stat().st_size + MAX_CHUNK_BYTES
+        room = content_limit(source.stat().st_size)
         with source.open("rb") as file, target.open("wb") as copy:
             reader = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
             with suppress(zstandard.ZstdError):
@@ -85,11 +124,15 @@ def decompress_file(source: Path, target: Path) -> None:
         raise InputError(f"{source}: cannot be decompressed into {target.parent}: {error.strerror}") from error
 
 
+def content_limit(num_bytes: int) -> int:
+    """Return the greatest size to which ``num_bytes`` compressed bytes may decompress [byte]."""
+    return max(SMALL_CONTENT, MAX_RATIO * num_bytes)
+
+
 def _max_bytes(compression: str, num_bytes: int) -> int:
-    """Return the greatest size to which ``num_bytes`` bytes can decompress."""
-    if compression not in _MAX_RATIO:
-        return MAX_CHUNK_BYTES
-    return min(MAX_CHUNK_BYTES, _MAX_RATIO[compression] * num_bytes + _PIECE_BYTES)
+    """Return the greatest size to which ``num_bytes`` bytes of a chunk or message can decompress."""
+    limit = min(MAX_CHUNK_BYTES, content_limit(num_bytes))
+    return min(limit, _FORMAT_RATIO[compression] * num_bytes + _PIECE_BYTES) if compression in _FORMAT_RATIO else limit
 
 
 def _zstd(data: memoryview, size: int) -> Bytes:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from octoreplay.config.fields import path_problem
 from octoreplay.errors import InputError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -51,8 +52,21 @@ def fingerprint(path: Path, *, whole: bool = False) -> Fingerprint:
 
 
 def log_files(log: Path) -> tuple[Path, ...]:
-    """Return the files of one log: the file itself, or all files of a rosbag2 folder, sorted."""
-    return tuple(sorted(path for path in log.iterdir() if path.is_file())) if log.is_dir() else (log,)
+    """Return the files of one log: the file itself, or all files of a rosbag2 folder, sorted.
+
+    Raises InputError where the folder cannot be read or holds a file with a name that is not UTF-8.
+    """
+    if not log.is_dir():
+        return (log,)
+    try:
+        files = tuple(sorted(path for path in log.iterdir() if path.is_file()))
+    except OSError as error:
+        raise InputError(f"{log}: cannot be read: {error.strerror}") from error
+    for file in files:
+        problem = path_problem(file)
+        if problem is not None:
+            raise InputError(f"{file}: {problem}")
+    return files
 
 
 def _summary_start(stream: BinaryIO, size: int) -> int | None:

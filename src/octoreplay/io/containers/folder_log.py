@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from octoreplay.errors import InputError
-from octoreplay.io.containers.decompression import decompress_message
+from octoreplay.config.yaml_file import load_yaml, read_text
+from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.containers.decompression import ContentBudget, decompress_message
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
 
 METADATA = "metadata.yaml"
+MAX_NODES = 1_000_000
+"""Largest number of keys and values in the metadata; each file of a split recording takes about 13."""
 _STORAGES = ("mcap", "sqlite3")
 _SPLIT_NAME = re.compile(r"(?P<prefix>.+)_(?P<number>\d+)")
 
@@ -36,19 +39,16 @@ def folder_contents(path: Path) -> FolderContents:
     """
     if not (path / METADATA).is_file():
         return FolderContents(_split_files(path))
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     where = path / METADATA
     try:
-        content = YAML(typ="safe", pure=True).load(where.read_text(encoding="utf-8"))
+        content = load_yaml(read_text(where, "recording"), str(where), MAX_NODES)
         information = content["rosbag2_bagfile_information"]
         # Old versions write the folder's name before the file's.
         files = tuple(dict.fromkeys(path / Path(name).name for name in information["relative_file_paths"]))
         storage = str(information["storage_identifier"])
         mode = str(information.get("compression_mode") or "none").lower()
         compression = str(information.get("compression_format") or "")
-    except (OSError, YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+    except (ConfigError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(f"{where}: not the metadata of a rosbag2 recording; name the log files themselves") from error
     if storage not in _STORAGES:
         raise InputError(f"{where}: storage '{storage}' cannot be read; convert the recording to mcap or sqlite3")
@@ -136,6 +136,7 @@ class FolderLog(LogReader):
         messages in this range are not read.
         """
         bad: Counter[str] = Counter()
+        budget = ContentBudget(self.path, sum(log.path.stat().st_size for log in self._logs))
         for message in self._merged(topics, start_ns, stop_ns):
             if not self._compressed_messages:
                 yield message
@@ -145,6 +146,7 @@ class FolderLog(LogReader):
                 bad[message.topic] += 1
                 self._damage.skip_messages(message.topic, bad[message.topic])
             else:
+                budget.take(len(data))
                 yield RawMessage(message.log, message.channel, message.log_time_ns, bytearray(data))
 
     def _merged(self, topics: Collection[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from octoreplay.errors import InputError, printable
+from octoreplay.errors import ConfigError, InputError, printable
 from octoreplay.io.containers.damage import Damage, damage_sentence
 from octoreplay.io.messages import decoders
 from octoreplay.io.messages.decoders import Bytes, DamagedMessageError, UndefinedTypeError
@@ -131,13 +131,14 @@ class RawMessage:
     def sensor_message(self) -> SensorMessage:
         """Return the message in the form common to ROS and Foxglove schemas, for types that ``kind_of`` knows.
 
-        Raises the errors of ``decode``, and DamagedMessageError where fields are missing.
+        Raises the errors of ``decode``, DamagedMessageError where fields are missing, and InputError or ConfigError
+        for packets of a lidar that cannot be decoded.
         """
         value = self.decode()
         try:
             return convert(self.type_name, value)
-        except DamagedMessageError as error:
-            raise DamagedMessageError(f"{self.where}: {error}") from error
+        except (InputError, ConfigError) as error:
+            raise type(error)(f"{self.where}: {error}") from error
 
     @property
     def _header_offset(self) -> int:
@@ -201,7 +202,7 @@ class LogReader(ABC):
 
         It covers what has been read so far, so it is complete only after the last message. A reader logs nothing.
         """
-        return damage_sentence(self.path, self.damage_clauses)
+        return damage_sentence(self.path, self.damage_clauses, self.start_ns, self.end_ns)
 
     @property
     def damage_clauses(self) -> tuple[str, ...]:
@@ -232,7 +233,7 @@ def first_whole_message(log: LogReader, topic: str, kinds: Collection[Kind]) -> 
     messages = (message for message in log.messages((topic,)) if kind_of(message.type_name) in kinds)
     for message in islice(messages, _NUM_TRIED):
         found = found or message
-        with suppress(InputError):
+        with suppress(InputError, ConfigError):
             message.sensor_message()
             return message
     return found

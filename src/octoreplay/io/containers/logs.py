@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,11 +15,12 @@ from octoreplay.io.containers.decompression import decompress_file
 from octoreplay.io.containers.folder_log import FolderLog, folder_contents
 from octoreplay.io.containers.log_reader import LogReader
 from octoreplay.io.containers.mcap_log import McapLog
+from octoreplay.records import FilePath
 
 _MAGIC_LENGTH = 16
 
 
-def open_log(path: Path) -> LogReader:
+def open_log(path: FilePath) -> LogReader:
     """Open one log; the reader is a context manager.
 
     The container is recognised by the first bytes of the file, not by its name. Raises InputError for a path that is
@@ -51,6 +53,11 @@ def open_log(path: Path) -> LogReader:
         if path.suffix != ".db3":
             raise InputError(f"{path}: a rosbag2 sqlite3 recording must end in .db3; rename it")
         return open_db3(path)
+    if path.suffix in (".yaml", ".yml"):
+        raise InputError(
+            f"{path}: a YAML file, not a log; for a team file use 'octoreplay run {shlex.quote(str(path))}', or name"
+            " its logs"
+        )
     raise InputError(
         f"{path}: not a log; give MCAP (.mcap), a ROS 1 bag (.bag) or a rosbag2 recording (.db3 or folder)"
     )

@@ -39,16 +39,16 @@ class McapLog(BlockLog):
         """Return the index from the summary, else from one pass over the file."""
         if self._file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{self.path}: not an MCAP file")
-        return index_from_summary(self._file) or McapPass(self._file, self._damage).index()
+        return index_from_summary(self._file) or McapPass(self._file, self._damage, self._budget).index()
 
     def _read_block(self, block: Block, wanted: Collection[int]) -> Iterator[Entry]:
         """Yield the messages of the wanted channels in a chunk or in a sequence of records outside chunks."""
         records = self._records(block)
         if records is None:
-            self._damage.skip_part("chunk", block.offset, self._num_messages_of(block))
+            self._damage.skip_part("chunk", block.offset, self._num_messages_of(block), block.span_ns)
             return
         end = num_late = 0
-        for opcode, start, end in walk(records):
+        for opcode, start, end in self._budget.counted(walk(records)):
             if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.size:
                 channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(records, start)
                 if channel_id not in wanted:
@@ -73,8 +73,8 @@ class McapLog(BlockLog):
         if len(data) < block.length:
             return None
         if block.form == CHUNK:
-            return whole_records(data)
-        return cut_records(data) if block.form == CUT_CHUNK else data
+            return whole_records(data, self._budget)
+        return cut_records(data, self._budget) if block.form == CUT_CHUNK else data
 
     def _num_messages_of(self, block: Block) -> int | None:
         """Return the number of messages of a damaged chunk, from the message indexes behind it; None without them."""

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 
 from octoreplay.io.containers.block_log import CUT_CHUNK, BlockBuilder, Index
 from octoreplay.io.containers.damage import Damage
-from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES
+from octoreplay.io.containers.decompression import MAX_CHUNK_BYTES, ContentBudget
 from octoreplay.io.containers.mcap_records import (
     FOOTER,
     MAGIC,
@@ -54,12 +54,14 @@ class McapPass:
     without chunks, the first of three plausible records in a row.
     """
 
-    def __init__(self, file: IO[bytes], damage: Damage) -> None:
+    def __init__(self, file: IO[bytes], damage: Damage, content: ContentBudget) -> None:
         self._file = file
         self._damage = damage
         self._size = file.seek(0, io.SEEK_END)
         self._index = Index()
-        self._definitions = Definitions()
+        self._content = content
+        self.definitions = Definitions()
+        """Schemas and channels found so far."""
         self._has_chunks = False
         self._data_ended = False
         self._is_finished = False
@@ -108,7 +110,7 @@ class McapPass:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             body = self._bytes(start, min(end - start, _MAX_DEFINITION_BYTES))
             # The summary repeats the definitions, and its damage may be the reason for this pass.
-            self._definitions.add(opcode, body, is_certain=not self._data_ended)
+            self.definitions.add(opcode, body, is_certain=not self._data_ended)
         elif opcode == Opcode.MESSAGE_INDEX and self._broken_chunk is not None:
             offset, count = self._broken_chunk
             self._broken_chunk = offset, count + num_indexed(self._bytes(start, 6), end - start)
@@ -136,32 +138,32 @@ class McapPass:
         self._end_loose_block(start)
         self._broken_chunk = None
         body = self._bytes(start, end - start) if end - start <= 2 * MAX_CHUNK_BYTES else b""
-        records = whole_records(body)
+        records = whole_records(body, self._content)
         if records is not None:
             self._add_chunk(records, start, end - start, CHUNK)
             self._floor = end
             return end
         if end < self._size and self._head(end) is None:
             return None
-        self._damage.skip_part("chunk", start, None)
+        self._damage.skip_part("chunk", start, None, _span_of(chunk_head(body)))
         self._broken_chunk = start, 0
         # Later chunks may use channels that are declared in the damaged one.
-        damaged_records = memoryview(cut_records(body))
-        for opcode, record_start, record_end in walk(damaged_records):
-            self._definitions.add(opcode, damaged_records[record_start:record_end], is_certain=False)
+        damaged_records = memoryview(cut_records(body, self._content))
+        for opcode, record_start, record_end in self._content.counted(walk(damaged_records)):
+            self.definitions.add(opcode, damaged_records[record_start:record_end], is_certain=False)
         return end
 
     def _add_chunk(self, records: Bytes, offset: int, length: int, form: str) -> None:
         """Add the block of a chunk, and its schemas and channels."""
         builder = BlockBuilder(self._index.tally)
         end = 0
-        for opcode, start, end in walk(records):
+        for opcode, start, end in self._content.counted(walk(records)):
             if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.size:
                 channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(records, start)
                 if log_time_ns <= MAX_TIME_NS:
                     builder.add(channel_id, log_time_ns)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._definitions.add(opcode, memoryview(records)[start:end])
+                self.definitions.add(opcode, memoryview(records)[start:end])
         self._index.blocks += builder.build(offset, length, form)
         if end < len(records) and form == CHUNK:
             self._damage.skip_part("part", offset, None)
@@ -223,7 +225,7 @@ class McapPass:
             if end - start < MESSAGE_HEAD.size:
                 return False
             channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack(data)
-            return channel_id in self._definitions.channels and log_time_ns <= MAX_TIME_NS
+            return channel_id in self.definitions.channels and log_time_ns <= MAX_TIME_NS
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._budget -= end - start
             return end - start <= _WINDOW_BYTES and read_record(opcode, self._bytes(start, end - start)) is not None
@@ -234,14 +236,14 @@ class McapPass:
         start = position + RECORD_HEAD.size
         if self._chunk_head(position) is not None:
             length = min(self._size - start, MAX_CHUNK_BYTES)
-            self._add_chunk(cut_records(self._bytes(start, length)), start, length, CUT_CHUNK)
+            self._add_chunk(cut_records(self._bytes(start, length), self._content), start, length, CUT_CHUNK)
         if self._ends_with_magic and not self._data_ended:
             self._damage.skip_part("part", position, None)
 
     def _finish(self, end: int) -> None:
         """Remove messages of unknown channels; record a missing end as damage."""
         self._end_loose_block(end)
-        self._index.channels = self._definitions.resolved()
+        self._index.channels = self.definitions.resolved()
         self._damage.skip_messages(0, self._index.tally.drop_unknown(self._index.channels))
         if self._is_finished or self._ends_with_magic:
             return
@@ -264,3 +266,9 @@ class McapPass:
         """Return bytes of the file, fewer at its end."""
         self._file.seek(offset)
         return self._file.read(max(0, min(length, self._size - offset)))
+
+
+def _span_of(head: ChunkHead | None) -> tuple[int, int] | None:
+    """Log times of the first and the last message of a damaged chunk; None where they cannot be right."""
+    is_plausible = head is not None and 0 < head.start_ns <= head.end_ns <= MAX_TIME_NS
+    return (head.start_ns, head.end_ns) if head is not None and is_plausible else None

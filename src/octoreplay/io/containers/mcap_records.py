@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from isal import isal_zlib
@@ -18,7 +18,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Statistics
 from mcap.records import Schema as SchemaRecord
 
-from octoreplay.io.containers.decompression import decompress, is_plausible_size
+from octoreplay.io.containers.decompression import ContentBudget, decompress, is_plausible_size
 from octoreplay.io.containers.log_reader import Channel, normalise_type_name
 from octoreplay.io.messages.decoders import ROS_FORMATS, Bytes
 
@@ -28,6 +28,8 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<QQI")
 MAX_TIME_NS = (1 << 63) - 1
 """Greatest log time accepted [ns] (year 2262). MCAP stores unsigned times, which may exceed int64."""
+CRC_KEY = "crc32"
+"""Last key of a metadata record that octoreplay writes: its checksum, see ``metadata_crc``."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _INDEX_HEAD = struct.Struct("<HI")
 _READERS: dict[int, Any] = {
@@ -79,6 +81,16 @@ class ChunkHead(NamedTuple):
     length: int
 
 
+def metadata_crc(name: str, values: Mapping[str, str]) -> str:
+    """Return the checksum of a metadata record as 8 hexadecimal digits.
+
+    It is the CRC-32 of the name and of all keys and values but ``CRC_KEY`` in their order, each in UTF-8 and followed
+    by a zero byte. MCAP has no checksum of a metadata record alone.
+    """
+    pairs = (part for key, value in values.items() if key != CRC_KEY for part in (key, value))
+    return f"{isal_zlib.crc32(b''.join(part.encode() + bytes(1) for part in (name, *pairs))):08x}"
+
+
 def read_record(opcode: int, body: Bytes) -> Record | None:
     """Parse a schema, channel, chunk index or statistics record; None for other records and damaged ones."""
     if opcode not in _READERS:
@@ -117,20 +129,29 @@ def chunk_head(body: Bytes) -> ChunkHead | None:
     return ChunkHead(start_ns, end_ns, size, crc, compression, start, length)
 
 
-def whole_records(body: Bytes) -> Bytes | None:
-    """Return the records of a chunk; None where its sizes or its checksum, if it has one, do not match."""
+def whole_records(body: Bytes, budget: ContentBudget | None = None) -> Bytes | None:
+    """Return the records of a chunk, which are taken from ``budget``.
+
+    The result is None where the chunk's sizes or its checksum, if it has one, do not match.
+    """
     head = chunk_head(body)
     if head is None or head.start + head.length != len(body):
         return None
+    if budget is not None:
+        budget.take(head.size)
     records = decompress(head.compression, memoryview(body)[head.start :], head.size)
     is_whole = len(records) == head.size and (head.crc == 0 or isal_zlib.crc32(records) == head.crc)
     return records if is_whole else None
 
 
-def cut_records(body: Bytes) -> Bytes:
-    """Return the records of a chunk that is cut, up to where they can be decompressed."""
+def cut_records(body: Bytes, budget: ContentBudget) -> Bytes:
+    """Return the records of a chunk that is cut, up to where they can be decompressed; they are taken from a budget."""
     head = chunk_head(body)
-    return b"" if head is None else decompress(head.compression, memoryview(body)[head.start :], head.size)
+    if head is None:
+        return b""
+    records = decompress(head.compression, memoryview(body)[head.start :], head.size)
+    budget.take(len(records))
+    return records
 
 
 def num_indexed(head: Bytes, length: int) -> int:

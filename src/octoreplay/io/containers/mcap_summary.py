@@ -47,7 +47,7 @@ def index_from_summary(file: IO[bytes]) -> Index | None:
             definitions.add(opcode, body)
         elif opcode not in _IN_SUMMARY and opcode < _FIRST_PRIVATE_OPCODE:
             return None
-    if statistics is None or not _is_complete(statistics, chunks, definitions) or not _are_disjoint(chunks, start):
+    if statistics is None or not _is_complete(statistics, chunks, definitions) or not are_disjoint(chunks, start):
         return None
     if crc and _checksum(file, start, footer_start + RECORD_HEAD.size + 16) != crc:
         return None
@@ -92,7 +92,7 @@ def _is_complete(statistics: Statistics, chunks: list[ChunkIndex], definitions: 
     )
 
 
-def _are_disjoint(chunks: list[ChunkIndex], end: int) -> bool:
+def are_disjoint(chunks: list[ChunkIndex], end: int) -> bool:
     """Return True if the chunks lie in the data section without overlap, so that no byte is read twice."""
     place = len(MAGIC)
     for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):

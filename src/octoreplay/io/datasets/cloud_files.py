@@ -71,7 +71,7 @@ def read_kitti_labels(path: Path, num_points: int) -> npt.NDArray[np.uint32]:
 
     Raises InputError where the file does not hold ``num_points`` labels.
     """
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if len(data) != 4 * num_points:
         raise InputError(
             f"{path}: holds {len(data) / 4:g} labels of 4 bytes, but its cloud has {num_points} points; it is cut, or "
@@ -83,7 +83,7 @@ def read_kitti_labels(path: Path, num_points: int) -> npt.NDArray[np.uint32]:
 def _read_ply(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Properties of the element 'vertex', in native byte order."""
     ply = read_ply(path, _REMEDY)
-    points = ply["vertex"].data
+    points = ply["vertex"]
     return {
         name: np.array(points[name], points[name].dtype.newbyteorder("="))
         for name in points.dtype.names or ()
@@ -93,7 +93,7 @@ def _read_ply(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 def _read_kitti(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Columns x, y, z and intensity of a KITTI file."""
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if path.name.lower().endswith(".pcd.bin") or len(data) % 16:
         raise InputError(
             f"{path}: {len(data)} bytes are not KITTI's points of 16 bytes (x y z intensity as float32); it is cut, or "
@@ -103,8 +103,8 @@ def _read_kitti(path: Path) -> dict[str, npt.NDArray[Any]]:
     return {name: points[:, k] for k, name in enumerate(_KITTI_COLUMNS)}
 
 
-def _read_bytes(path: Path) -> bytes:
-    """Content of a file. Raises InputError where it cannot be read."""
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a file. Raises InputError where it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:

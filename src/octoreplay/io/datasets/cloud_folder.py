@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.datasets.cloud_files import FORMATS, read_cloud, read_kitti_labels
 from octoreplay.io.datasets.frames_folder import (
     check_choice,
@@ -28,18 +28,27 @@ from octoreplay.io.datasets.frames_folder import (
     entries_of_chosen,
     files_in,
     frame_stamps,
+    last_number,
     natural_order,
     read_times,
     robot_name,
-    unfinished,
     write_frames,
 )
 from octoreplay.io.datasets.pcd import read_viewpoint
-from octoreplay.io.datasets.pose_files import PoseReader, PoseTable, matrix_reader, read_poses
+from octoreplay.io.datasets.pose_files import (
+    PoseReader,
+    PoseTable,
+    fixed_reader,
+    matrix_reader,
+    read_keyframe,
+    read_pose_graph,
+    read_poses,
+)
+from octoreplay.io.output_file import unfinished
 from octoreplay.io.robots.robot_log_writer import MAP_FRAME, RobotLogWriter
 from octoreplay.io.sensors.labels import UNLABELLED
 from octoreplay.io.text_tables import seconds_to_ns
-from octoreplay.records import ClassTable, Float64Array
+from octoreplay.records import ClassTable, FilePath, Float64Array
 from octoreplay.transforms import pose_matrix, rotation_to_quaternion
 
 CloudFrameName: TypeAlias = Literal["sensor", "world"]
@@ -78,12 +87,13 @@ class CloudImportSummary:
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """Source of the poses: a table and its file, or a reader for each chosen cloud."""
+    """Source of the poses: a table and its file, or a reader and possibly a stamp for each chosen cloud."""
 
     name: str
     file: Path
     table: PoseTable | None = None
     readers: tuple[PoseReader, ...] = ()
+    stamps: list[int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,20 +106,23 @@ class _Times:
 
 
 def import_clouds(
-    folder: Path,
-    output: Path,
+    folder: FilePath,
+    output: FilePath,
     *,
     rate: float | None = None,
-    times: Path | None = None,
-    poses: Path | None = None,
+    times: FilePath | None = None,
+    poses: FilePath | None = None,
+    pose_format: str | None = None,
+    pose_origin: Sequence[float] | None = None,
     frame: CloudFrameName | None = None,
-    labels: Path | None = None,
+    labels: FilePath | None = None,
     robot_id: str | None = None,
     class_table: ClassTable | None = None,
     first: int = 0,
     last: int | None = None,
     every: int = 1,
     map_frame: str = MAP_FRAME,
+    identity_poses: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> CloudImportSummary:
     """Write the point clouds and poses of a folder as one robot's log (MCAP).
@@ -118,8 +131,11 @@ def import_clouds(
     - Stamps: from 0 at ``rate`` Hz; or the seconds in the text file ``times``, one line per cloud of the folder or per
       chosen cloud; or, without both, those of ``times.txt`` here or one folder up, the stamps in the file names, or
       those of a TUM file of poses with one line per cloud.
-    - Poses: ``poses``, a TUM or KITTI file (``pose_files.read_poses``); or, without it, matrices in ``NAME.pose.txt``
-      beside the clouds, ``poses.txt`` here or one folder up, or VIEWPOINT of PCD files.
+    - Poses: ``poses``, a trajectory file (``trajectories.read_rows``, with ``pose_format`` and ``pose_origin``), or a
+      pose graph (.g2o) whose vertices have the last numbers in the clouds' names; or, without it, matrices in
+      ``NAME.pose.txt`` beside the clouds, keyframes of hdl_graph_slam, ``poses.txt`` or ``graph.g2o`` here or one
+      folder up, or VIEWPOINT of PCD files. With ``identity_poses`` all poses are the identity; clouds without times are
+      then one second apart.
     - Points: ``frame`` is the frame they are given in; None is the sensor's frame, with VIEWPOINT the world's. Points
       that are not finite are left out.
     - Labels: ``labels`` is a folder of KITTI ``.label`` files named like the clouds (default: ``labels/`` beside the
@@ -129,14 +145,20 @@ def import_clouds(
     One cloud at a time is in memory. The same input gives the same bytes. Raises InputError for missing or damaged
     files, ConfigError for options that do not fit, OutputError where the log cannot be written; then no file is left.
     """
+    folder, output = Path(folder), Path(output)
+    times, poses, labels = (None if path is None else Path(path) for path in (times, poses, labels))
     check_choice(rate, times, first, every)
     check_map_frame(map_frame)
     robot_id = robot_name(robot_id, output)
     clouds = _find_clouds(folder)
     chosen = chosen_frames(folder, len(clouds), first, last, every)
     paths = [clouds[k] for k in chosen]
-    found = _find_poses(paths, poses)
+    if identity_poses and poses is not None:
+        raise ConfigError("identity_poses and poses: give one of them, not both")
+    found = _identity(paths) if identity_poses else _find_poses(paths, poses, pose_format, pose_origin)
     own = _find_times(clouds, chosen, times, found, has_rate=rate is not None)
+    if identity_poses and own.stamps is None and rate is None:
+        rate = 1.0
     stamps = frame_stamps(own.source, own.stamps, rate, len(paths))
     job = _Import(
         paths=paths,
@@ -263,8 +285,10 @@ def _find_clouds(folder: Path) -> list[Path]:
         kinds = sorted({path.suffix.lower() for path in clouds})
         if len(kinds) > 1:
             raise InputError(f"{place}: holds {' and '.join(kinds)} files; keep clouds of one format in it")
+        # Some programs write a subfolder for each cloud: 000000/cloud.pcd.
+        clouds = clouds or [path for suffix in FORMATS for path in place.glob(f"*/cloud{suffix}")]
         if clouds:
-            clouds.sort(key=natural_order)
+            clouds.sort(key=lambda path: (natural_order(path.parent), natural_order(path)))
             stamps = _name_stamps(clouds)
             return clouds if stamps is None else [path for _, path in sorted(zip(stamps, clouds, strict=True))]
     endings = sorted({path.suffix for path in files_in(folder) if path.suffix})
@@ -285,39 +309,62 @@ def _find_labels(paths: Sequence[Path], labels: Path | None) -> list[Path | None
 # --- poses -----------------------------------------------------------------------------------------------------------
 
 
-def _find_poses(paths: Sequence[Path], given: Path | None) -> _Poses:
+def _find_poses(
+    paths: Sequence[Path], given: Path | None, pose_format: str | None, origin: Sequence[float] | None
+) -> _Poses:
     """Source of the poses: a given file, matrices beside the clouds, ``poses.txt``, or VIEWPOINT."""
     folder = paths[0].parent
     if given is not None:
-        return _tabled(given)
+        return _graph(given, paths) if given.suffix.lower() == ".g2o" else _tabled(given, pose_format, origin)
     matrices = [path.with_name(f"{path.stem}.pose.txt") for path in paths]
     if any(path.is_file() for path in matrices):
         return _Poses("*.pose.txt", folder, readers=tuple(matrix_reader(path) for path in matrices))
+    if all((path.parent / "data").is_file() for path in paths):
+        keyframes = [read_keyframe(path.parent / "data") for path in paths]
+        readers = tuple(fixed_reader(T) for _, T in keyframes)
+        return _Poses("keyframes of hdl_graph_slam", folder, None, readers, [stamp_ns for stamp_ns, _ in keyframes])
     for place in (folder, folder.parent):
         if (place / "poses.txt").is_file():
-            return _tabled(place / "poses.txt")
+            return _tabled(place / "poses.txt", pose_format, origin)
+        if (place / "graph.g2o").is_file():
+            return _graph(place / "graph.g2o", paths)
     if paths[0].suffix.lower() != ".pcd":
         raise InputError(
-            f"{folder}: no poses found; looked for NAME.pose.txt beside the clouds and poses.txt here and one folder "
-            "up; give a file of poses"
+            f"{folder}: no poses found; looked for NAME.pose.txt beside the clouds, and poses.txt and graph.g2o here"
+            " and one folder up; give a file of poses, or identity_poses (--identity-poses) for clouds in one frame"
         )
     viewpoints = [read_viewpoint(path) for path in paths]
     # Writers without poses store the identity.
     is_unset = [T is None or np.array_equal(T, np.eye(4)) for T in viewpoints]
     if all(T is None for T in viewpoints) or (len(paths) > 1 and all(is_unset)):
-        raise InputError(f"{folder}: no poses found, and the VIEWPOINT of every cloud is unset; give a file of poses")
-    return _Poses(_VIEWPOINT, folder, readers=tuple(_constant(T) for T in viewpoints))
+        raise InputError(
+            f"{folder}: no poses found, and the VIEWPOINT of every cloud is unset; give a file of poses, or"
+            " identity_poses (--identity-poses) for clouds in one frame"
+        )
+    return _Poses(_VIEWPOINT, folder, readers=tuple(fixed_reader(T) for T in viewpoints))
 
 
-def _tabled(path: Path) -> _Poses:
+def _identity(paths: Sequence[Path]) -> _Poses:
+    """The identity as the pose of every cloud."""
+    return _Poses("the identity", paths[0].parent, readers=(fixed_reader(np.eye(4)),) * len(paths))
+
+
+def _graph(path: Path, clouds: Sequence[Path]) -> _Poses:
+    """Poses of the vertices of a pose graph that have the numbers of the clouds."""
+    vertices = read_pose_graph(path)
+    numbers = [last_number(cloud) for cloud in clouds]
+    poses = [None if number is None else vertices.get(number) for number in numbers]
+    if all(T is None for T in poses):
+        raise InputError(
+            f"{path}: none of its {len(vertices)} vertices has the number of a cloud such as '{clouds[0].name}'"
+        )
+    return _Poses(path.name, path, readers=tuple(map(fixed_reader, poses)))
+
+
+def _tabled(path: Path, pose_format: str | None, origin: Sequence[float] | None) -> _Poses:
     """Poses of a table."""
-    table = read_poses(path)
+    table = read_poses(path, pose_format, origin)
     return _Poses(f"{path.name} ({table.name})", path, table)
-
-
-def _constant(T_map_sensor: Float64Array | None) -> PoseReader:
-    """Reader of a known pose."""
-    return lambda: T_map_sensor
 
 
 def _readers(found: _Poses, own: _Times, chosen: range, total: int) -> Sequence[PoseReader]:
@@ -326,7 +373,7 @@ def _readers(found: _Poses, own: _Times, chosen: range, total: int) -> Sequence[
     if table is None:
         return found.readers
     if table.stamps is None or own.are_of_poses or own.stamps is None:
-        return [_constant(T) for T in entries_of_chosen(table.poses, "poses", chosen, total, found.file)]
+        return [fixed_reader(T) for T in entries_of_chosen(table.poses, "poses", chosen, total, found.file)]
     return [partial(table.at, stamp_ns) for stamp_ns in own.stamps]
 
 
@@ -345,6 +392,8 @@ def _find_times(clouds: Sequence[Path], chosen: range, given: Path | None, found
     names = _name_stamps(clouds)
     if names is not None:
         return _Times(folder, [names[k] for k in chosen])
+    if found.stamps is not None:
+        return _Times(folder, found.stamps)
     if pose_stamps is not None:
         return _Times(
             found.file, entries_of_chosen(pose_stamps, "poses", chosen, len(clouds), found.file), are_of_poses=True

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
-from octoreplay.errors import ConfigError, InputError, OutputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.datasets.pose_files import PoseReader
 from octoreplay.io.text_tables import rows, seconds_to_ns
 from octoreplay.records import Float64Array
@@ -23,6 +22,12 @@ def natural_order(path: Path) -> tuple[list[tuple[bool, int, str]], str]:
     """Return the sort key of a file by the numbers in its name, so that 10 comes after 9."""
     parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
     return [(False, int(part), "") if part[0] in "0123456789" else (True, 0, part) for part in parts], path.name
+
+
+def last_number(path: Path) -> int | None:
+    """Return the last number in the name of a file, or of its folder where its name holds none; None without any."""
+    numbers = re.findall(r"[0-9]+", path.stem) or re.findall(r"[0-9]+", path.parent.name)
+    return int(numbers[-1]) if numbers else None
 
 
 def check_choice(rate: float | None, times: Path | None, first: int, every: int) -> None:
@@ -146,20 +151,3 @@ def frame_stamps(source: Path, own: Sequence[int] | None, rate: float | None, co
     if stamps[-1] >= _END_OF_TIME_NS:
         raise InputError(f"{source}: times must be below 2^31 s, the limit of ROS messages")
     return stamps
-
-
-@contextmanager
-def unfinished(output: Path) -> Iterator[Path]:
-    """Yield a path to write the log to; it is renamed to ``output`` at the end, and removed after any error.
-
-    An OSError becomes an OutputError.
-    """
-    partial = output.with_name(f"{output.stem}.partial.mcap")
-    try:
-        yield partial
-        partial.replace(output)
-    except BaseException as error:
-        partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
-        raise

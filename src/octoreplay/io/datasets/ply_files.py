@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.errors import InputError
+from octoreplay.io.datasets.ply_format import PlyError, read_elements
 from octoreplay.io.sensors.clouds import LABEL_FIELDS
 from octoreplay.io.sensors.labels import UNLABELLED
 from octoreplay.records import Float64Array, Int64Array
@@ -19,57 +18,21 @@ _FACE_LISTS = ("vertex_indices", "vertex_index")
 """Names of the list of a face's vertices."""
 
 
-def read_ply(path: Path, remedy: str) -> Any:
-    """Return the file as plyfile's PlyData.
+def read_ply(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
+    """Return the elements of a file by name, as ``read_elements`` does.
 
     Raises InputError where it cannot be read, is cut or damaged, or has no element 'vertex'; ``remedy`` ends the
     message.
     """
-    from plyfile import PlyParseError
-
     try:
-        with path.open("rb") as file:
-            is_text = b"format ascii" in file.read(4096)
-            file.seek(0)
-            # plyfile reads binary elements at once from a real file only; the lines of a text file are counted.
-            text = file.read() if is_text else b""
-            ply = _read_text(text) if is_text else _read_binary(file)
-            num_left = _lines(text) - sum(len(element) for element in ply) if is_text else len(file.read().strip())
+        elements = read_elements(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+    except PlyError as error:
         raise InputError(f"{path}: is cut or damaged: {error}; {remedy}") from error
-    if num_left > 0:
-        raise InputError(f"{path}: is damaged: it is longer than its header says; {remedy}")
-    if "vertex" not in ply:
+    if "vertex" not in elements:
         raise InputError(f"{path}: has no element 'vertex'; {remedy}")
-    return ply
-
-
-def _read_text(text: bytes) -> Any:
-    """Read a text file without numpy's warning for missing rows, which plyfile then reports."""
-    from plyfile import PlyData
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return PlyData.read(io.BytesIO(text))
-
-
-def _read_binary(file: Any) -> Any:
-    """Read a binary file; triangles are read at once, faces of other sizes one by one."""
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        return PlyData.read(file, known_list_len={"face": dict.fromkeys(_FACE_LISTS, 3)})
-    except PlyParseError:
-        file.seek(0)
-        return PlyData.read(file)
-
-
-def _lines(text: bytes) -> int:
-    """Number of lines after a PLY file's header that are not blank."""
-    body = text.partition(b"end_header")[2]
-    return sum(bool(line.strip()) for line in body.splitlines())
+    return elements
 
 
 def raw_labels(column: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
@@ -86,7 +49,7 @@ def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]
     InputError where neither faces nor vertices have labels, and as ``read_ply`` does.
     """
     ply = read_ply(path, "write it again")
-    vertices = ply["vertex"].data
+    vertices = ply["vertex"]
     names = vertices.dtype.names or ()
     missing = [name for name in "xyz" if name not in names or vertices[name].dtype.kind not in "iuf"]
     if missing:
@@ -96,7 +59,7 @@ def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
     labels = _label_column(ply, "face")
     if labels is not None:
-        triangles, faces = _triangles(path, ply["face"].data, len(points))
+        triangles, faces = _triangles(path, ply["face"], len(points))
         return points[triangles], raw_labels(labels)[faces]
     labels = _label_column(ply, "vertex")
     if labels is None:
@@ -104,11 +67,11 @@ def read_labelled_ply(path: Path) -> tuple[Float64Array, npt.NDArray[np.uint32]]
     return points[:, None], raw_labels(labels)
 
 
-def _label_column(ply: Any, element: str) -> npt.NDArray[Any] | None:
+def _label_column(ply: dict[str, npt.NDArray[Any]], element: str) -> npt.NDArray[Any] | None:
     """Labels of an element's rows; None without any."""
     if element not in ply:
         return None
-    rows = ply[element].data
+    rows = ply[element]
     present = set(rows.dtype.names or ())
     names = (name for name in LABEL_FIELDS if name in present and rows[name].dtype.kind in "iuf")
     return next((rows[name] for name in names), None)
@@ -120,7 +83,7 @@ def _triangles(path: Path, faces: npt.NDArray[Any], num_vertices: int) -> tuple[
     if name is None:
         raise InputError(f"{path}: its faces have no list 'vertex_indices'; write them with one")
     lists = faces[name]
-    if lists.ndim == 2:
+    if lists.ndim == 2 and lists.shape[1] == 3:
         triangles, owners = lists.astype(np.int64), np.arange(len(lists))
     else:
         sizes = np.fromiter(map(len, lists), np.int64, len(lists))

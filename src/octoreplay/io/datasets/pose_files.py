@@ -1,11 +1,11 @@
-"""Pose files: one 4x4 matrix per file, and tables of TUM and KITTI.
+"""Pose files: one 4x4 matrix per file, and tables.
 
 ``T_map_sensor`` is (4, 4) float64 and maps sensor coordinates to map coordinates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -14,12 +14,12 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.errors import InputError
+from octoreplay.errors import InputError, escaped
+from octoreplay.io.output_file import write_whole
 from octoreplay.io.robots.trajectories import Trajectory, read_rows, rigid, trajectory
-from octoreplay.io.text_files import write_whole
-from octoreplay.io.text_tables import floats, read_matrix, rows
+from octoreplay.io.text_tables import floats, read_matrix, rows, seconds_to_ns
 from octoreplay.records import Float64Array
-from octoreplay.transforms import inverse, numbers_of
+from octoreplay.transforms import inverse, normalise, numbers_of, pose_matrix
 
 POSE_GAP_NS = 200_000_000
 """Largest time between two poses that are interpolated."""
@@ -32,9 +32,9 @@ PoseReader: TypeAlias = Callable[[], Float64Array | None]
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """Rows of a pose file: T_map_sensor, None where a row is not finite; stamps [ns] in a TUM file only.
+    """Rows of a pose file: T_map_sensor, None where a row is not finite; stamps [ns] in a file with times only.
 
-    ``name`` is the format.
+    ``name`` is the kind of file.
     """
 
     name: str
@@ -68,19 +68,65 @@ def matrix_reader(path: Path) -> PoseReader:
     return read
 
 
-def read_poses(path: Path) -> PoseTable:
-    """Return the poses of a TUM file (stamp, position, quaternion x y z w) or a KITTI file (3x4 part of a matrix).
+def fixed_reader(T_map_sensor: Float64Array | None) -> PoseReader:
+    """Return a reader of a known pose."""
+    return lambda: T_map_sensor
+
+
+def read_pose_graph(path: Path) -> dict[int, Float64Array]:
+    """Return the poses T_map_vertex of a g2o file by the number of their vertex.
+
+    Vertices are rows 'VERTEX_SE3:QUAT id x y z qx qy qz qw'; all other rows are skipped
+    (https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-3D). Raises InputError for a file without vertices
+    and for a vertex without these numbers.
+    """
+    vertices = {}
+    for where, fields in rows(path):
+        if fields[0] != "VERTEX_SE3:QUAT":
+            continue
+        # Ids may be keys of gtsam above 2^53, which are not exact as floats.
+        numbers = floats(where, fields[2:])
+        rotation = normalise(numbers[3:]) if len(numbers) == 7 and np.isfinite(numbers).all() else None
+        if rotation is None or not (fields[1].isascii() and fields[1].isdigit() and len(fields[1]) <= 20):
+            raise InputError(f"{where}: expects an id, a position and a quaternion x y z w")
+        vertices[int(fields[1])] = pose_matrix(numbers[:3], rotation)
+    if not vertices:
+        raise InputError(f"{path}: holds no row VERTEX_SE3:QUAT")
+    return vertices
+
+
+def read_keyframe(path: Path) -> tuple[int, Float64Array | None]:
+    """Return stamp [ns] and pose T_map_sensor of a keyframe of hdl_graph_slam, from its file ``data``.
+
+    The file has a row 'stamp SECONDS NANOSECONDS' and, after a row 'estimate', four rows of a matrix
+    (https://github.com/koide3/hdl_graph_slam, src/hdl_graph_slam/keyframe.cpp). Raises InputError without them.
+    """
+    lines = list(rows(path))
+    words = {fields[0]: number for number, (_, fields) in reversed(list(enumerate(lines)))}
+    if not {"stamp", "estimate"} <= words.keys():
+        raise InputError(f"{path}: expects the rows 'stamp' and 'estimate' of a keyframe of hdl_graph_slam")
+    where, stamp = lines[words["stamp"]]
+    matrix = [floats(*line) for line in lines[words["estimate"] + 1 :][:4]]
+    if len(stamp) != 3 or not (stamp[2].isascii() and stamp[2].isdigit()) or [len(row) for row in matrix] != [4] * 4:
+        raise InputError(f"{where}: expects 'stamp SECONDS NANOSECONDS', and four rows of 4 numbers after 'estimate'")
+    stamp_ns = seconds_to_ns(where, stamp[1]) + int(stamp[2][:9])
+    T = np.array(matrix)
+    return stamp_ns, rigid(f"{path}, estimate", T) if np.isfinite(T).all() else None
+
+
+def read_poses(path: Path, pose_format: str | None = None, origin: Sequence[float] | None = None) -> PoseTable:
+    """Return the poses of a trajectory file (``trajectories.read_rows``).
 
     KITTI's poses are those of the left camera; with ``calib.txt`` beside the file they become the lidar's,
     inv(Tr) T_map_camera Tr, in a map that starts at the lidar (https://github.com/PRBonn/semantic-kitti-api).
-    Raises InputError where the file is empty, has another number of columns or a matrix that is not a rigid transform.
+    Raises InputError as ``read_rows`` does.
     """
-    found = read_rows(path)
+    found = read_rows(path, pose_format, origin)
     if found.stamps_ns is not None:
-        return PoseTable("TUM", found.matrices(), trajectory(found.stamps_ns, found), found.stamps_ns.tolist())
+        return PoseTable(found.name, found.matrices(), trajectory(found.stamps_ns, found), found.stamps_ns.tolist())
     calibration = path.with_name("calib.txt")
-    if not calibration.is_file():
-        return PoseTable("KITTI", found.matrices())
+    if not calibration.is_file() or pose_format not in (None, "kitti"):
+        return PoseTable(found.name, found.matrices())
     T_camera_lidar = _read_calibration(calibration)
     T_lidar_camera = inverse(T_camera_lidar)
     return PoseTable(
@@ -97,13 +143,14 @@ def read_tum_track(path: Path) -> Trajectory:
     return trajectory(found.stamps_ns, found)
 
 
-def write_tum(path: Path, stamps_ns: npt.ArrayLike, poses: Float64Array) -> None:
+def write_tum(path: Path, stamps_ns: npt.ArrayLike, poses: Float64Array, *, comments: Sequence[str] = ()) -> None:
     """Write a trajectory as a TUM file: poses (T, 4, 4) float64 and their stamps (T,) int64 [ns].
 
-    ``read_tum_track`` returns the same stamps and positions; rotations become unit quaternions. Raises OutputError if
-    the file cannot be written.
+    ``read_tum_track`` returns the same stamps and positions; rotations become unit quaternions. ``comments`` are lines
+    at the beginning. Raises OutputError if the file cannot be written.
     """
-    lines = ["# time x y z qx qy qz qw\n"]
+    lines = [f"# {escaped(comment)}\n" for comment in comments]
+    lines += ["# time x y z qx qy qz qw\n"]
     for stamp_ns, T in zip(np.asarray(stamps_ns, dtype=np.int64).tolist(), poses, strict=True):
         lines.append(f"{Decimal(stamp_ns).scaleb(-9):f} {' '.join(map(repr, numbers_of(T)))}\n")
     write_whole(path, "".join(lines))

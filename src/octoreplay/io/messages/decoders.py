@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 from octoreplay.errors import InputError
+from octoreplay.io.messages import livox
 from octoreplay.io.messages.ros_types import typestore
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
@@ -81,6 +82,9 @@ def _decoder(type_name: str, encoding: str, definition_format: str, definition: 
         raise UndefinedTypeError(
             f"message encoding '{encoding}' is not supported; supported are {', '.join(ENCODINGS)}"
         )
+    if type_name in livox.TYPES:
+        livox.check_definition(definition.decode("utf-8", "replace"))
+        return lambda data: livox.decode_custom_msg(memoryview(data), is_ros1=encoding == "ros1")
     store = _store(type_name, encoding, definition_format, definition.decode("utf-8", "replace"))
     deserialise = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
     # rosbags' annotation allows only bytes and memoryview; any buffer works.
@@ -106,6 +110,8 @@ def _store(type_name: str, encoding: str, definition_format: str, definition: st
     known = typestore()
     if not definition:
         return get_typestore(Stores.ROS1_NOETIC) if encoding == "ros1" else known
+    # Definitions recorded before 2011 have the Header under its old name; a field 'Header' refers to the present one.
+    definition = re.sub(r"\broslib/Header\b", "std_msgs/Header", definition)
     try:
         types = _idl_types(definition) if definition_format == "ros2idl" else get_types_from_msg(definition, type_name)
     except TypesysError:

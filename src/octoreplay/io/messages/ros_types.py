@@ -14,6 +14,17 @@ VISION_MSGS = {
 }
 """Definitions of vision_msgs 4 that are missing from rosbags' type stores."""
 
+OCTOMAP_MSGS = {
+    "octomap_msgs/msg/Octomap": ("std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"),
+}
+"""Definition of octomap_msgs, which rosbags' type stores do not have."""
+
+VELODYNE_MSGS = {
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
+}
+"""Definitions of velodyne_msgs, which rosbags' type stores do not have."""
+
 OCTOREPLAY_MSGS = {
     "octoreplay_msgs/msg/MapState": """\
 # One robot's map or evidence after the tick at header.stamp, as a packet of the map codec (docs/packet-format.md).
@@ -138,9 +149,9 @@ octoreplay_msgs/LinkMetrics[] links
 
 @cache
 def typestore() -> Typestore:
-    """Return the types of ROS 2 Humble, vision_msgs and octoreplay_msgs."""
+    """Return the types of ROS 2 Humble, vision_msgs, octomap_msgs, velodyne_msgs and octoreplay_msgs."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, definition in {**VISION_MSGS, **OCTOREPLAY_MSGS}.items():
+    for name, definition in {**VISION_MSGS, **OCTOMAP_MSGS, **VELODYNE_MSGS, **OCTOREPLAY_MSGS}.items():
         store.register(get_types_from_msg(definition, name))
     return store
 

@@ -1,7 +1,7 @@
 """Sensor, pose and label messages in one form for ROS message types and Foxglove schemas.
 
 Sources: ROS's common_interfaces, geometry2 and vision_msgs; apriltag_ros and
-isaac_ros_apriltag_interfaces; https://docs.foxglove.dev/docs/sdk/schemas
+isaac_ros_apriltag_interfaces; livox_ros_driver; velodyne_msgs; https://docs.foxglove.dev/docs/sdk/schemas
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from octoreplay.io.messages import livox, velodyne
 from octoreplay.io.messages.decoders import Bytes, DamagedMessageError
+from octoreplay.io.messages.inertial import Inertial, convert_imu
 from octoreplay.io.messages.ros_types import stamp_to_ns
 from octoreplay.records import Float64Array
 from octoreplay.transforms import normalise, pose_matrix
@@ -36,6 +38,7 @@ class Kind(StrEnum):
     LABEL_INFO = "LabelInfo"
     FIX = "position fix"
     TAGS = "tags"
+    IMU = "IMU"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -168,7 +171,9 @@ class PositionFix:
     is_valid: bool
 
 
-SensorMessage: TypeAlias = Image | CompressedImage | Calibration | Cloud | Scan | Transforms | LabelNames | PositionFix
+SensorMessage: TypeAlias = (
+    Image | CompressedImage | Calibration | Cloud | Scan | Transforms | LabelNames | PositionFix | Inertial
+)
 
 
 def kind_of(type_name: str) -> Kind | None:
@@ -181,7 +186,8 @@ def convert(type_name: str, value: Any) -> SensorMessage:
     """Convert a decoded message of a type that ``kind_of`` knows; bytes are not copied.
 
     Raises DamagedMessageError where a field is missing or has another type, as in JSON or in a type of the same name,
-    and for a type that is not used, as on a topic with several types.
+    and for a type that is not used, as on a topic with several types. For packets of a lidar raises the errors of
+    ``velodyne.cloud_of``.
     """
     entry = _TYPES.get(_plain(type_name))
     if entry is None:
@@ -423,10 +429,11 @@ _TYPES: Mapping[str, tuple[Kind, Callable[[Any], SensorMessage]]] = {
     "foxglove.CameraCalibration": (Kind.CAMERA_INFO, _camera_info),
     "sensor_msgs/msg/PointCloud2": (Kind.CLOUD, _ros_cloud),
     "foxglove.PointCloud": (Kind.CLOUD, _foxglove_cloud),
+    **dict.fromkeys(livox.TYPES, (Kind.CLOUD, _ros_cloud)),
+    velodyne.TYPE: (Kind.CLOUD, lambda scan: _ros_cloud(velodyne.cloud_of(scan))),
     "sensor_msgs/msg/LaserScan": (Kind.SCAN, _ros_scan),
     "foxglove.LaserScan": (Kind.SCAN, _foxglove_scan),
-    "nav_msgs/msg/Odometry": (Kind.ODOMETRY, _odometry),
-    "foxglove.Odometry": (Kind.ODOMETRY, _odometry),
+    **dict.fromkeys(("nav_msgs/msg/Odometry", "foxglove.Odometry"), (Kind.ODOMETRY, _odometry)),
     "geometry_msgs/msg/TransformStamped": (Kind.ODOMETRY, _transform_stamped),
     "geometry_msgs/msg/PoseStamped": (Kind.POSE, _odometry),
     "geometry_msgs/msg/PoseWithCovarianceStamped": (Kind.POSE, _odometry),
@@ -437,8 +444,8 @@ _TYPES: Mapping[str, tuple[Kind, Callable[[Any], SensorMessage]]] = {
     "foxglove.FrameTransforms": (Kind.TF, _tf_message),
     "foxglove.FrameTransform": (Kind.TF, _frame_transform),
     "vision_msgs/msg/LabelInfo": (Kind.LABEL_INFO, _label_info),
-    "sensor_msgs/msg/NavSatFix": (Kind.FIX, _position_fix),
-    "foxglove.LocationFix": (Kind.FIX, _position_fix),
+    **dict.fromkeys(("sensor_msgs/msg/NavSatFix", "foxglove.LocationFix"), (Kind.FIX, _position_fix)),
+    "sensor_msgs/msg/Imu": (Kind.IMU, convert_imu),
     "apriltag_ros/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),
     "apriltags2_ros/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),
     "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": (Kind.TAGS, _tag_detections),

@@ -9,10 +9,10 @@ import numpy as np
 
 from octoreplay.config.robot import RobotConfig
 from octoreplay.io.messages.ros_types import header, message
-from octoreplay.records import TEAM, Float64Array
+from octoreplay.records import TEAM, Color, Float64Array
 from octoreplay.transforms import rotation_to_quaternion
 
-LINE_LIST, TEXT_VIEW_FACING, ADD, DELETE = 5, 9, 0, 2
+LINE_LIST, CUBE_LIST, TEXT_VIEW_FACING, ADD, DELETEALL = 5, 6, 9, 0, 3
 """visualization_msgs/Marker types and actions."""
 
 
@@ -46,17 +46,19 @@ def marker(
     points: Sequence[Any] = (),
     text: str = "",
     position: Float64Array | None = None,
+    color: Color = (255, 255, 255),
     frame_id: str = TEAM,
 ) -> Any:
-    """Return a visualization_msgs/Marker; fields unused by lines and texts are empty."""
+    """Return a visualization_msgs/Marker; fields unused by lines, cubes and texts are empty."""
     place = point(np.zeros(3) if position is None else position)
+    red, green, blue = (value / 255 for value in color)
     identity = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     empty_bytes = np.zeros(0, dtype=np.uint8)
     return message(
         "visualization_msgs/msg/Marker", header=header(stamp_ns, frame_id), ns=namespace, id=marker_id, type=kind,
         action=action, pose=message("geometry_msgs/msg/Pose", position=place, orientation=identity),
         scale=message("geometry_msgs/msg/Vector3", **_xyz(np.array(scale))),
-        color=message("std_msgs/msg/ColorRGBA", r=1.0, g=1.0, b=1.0, a=1.0),
+        color=message("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
         lifetime=message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False, points=list(points),
         colors=[], texture_resource="",
         texture=message("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=empty_bytes),

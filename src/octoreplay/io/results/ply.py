@@ -1,17 +1,15 @@
-"""Writers of binary PLY files: meshes, and maps with leaf centres as points or leaves as cubes.
+"""Encoders of binary PLY files: meshes, and maps with leaf centres as points or leaves as cubes.
 
 CloudCompare, MeshLab and Open3D read them. Open3D keeps the ``label`` property only when reading with ``open3d.t.io``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from octoreplay.errors import OutputError
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.records import LeafTable, UInt8Array
 
@@ -29,16 +27,15 @@ _FACES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4
 """Faces of the cube as indices of corners, counter-clockwise as seen from outside."""
 
 
-def write_points(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
-    """Write the centres of the leaves as points. ``colors`` is (L, 3) uint8. Raises OutputError."""
-    write_mesh(path, _vertices(leaves, colors, leaves.centers), None, comments)
+def points_file(leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> bytes:
+    """Return a PLY file of the centres of the leaves as points. ``colors`` is (L, 3) uint8."""
+    return mesh_file(_vertices(leaves, colors, leaves.centers), None, comments)
 
 
-def write_voxels(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> None:
-    """Write each leaf as a cube of its size: 8 vertices and 12 triangles. ``colors`` is (L, 3) uint8.
+def voxels_file(leaves: LeafTable, colors: UInt8Array, comments: Sequence[str] = ()) -> bytes:
+    """Return a PLY file of each leaf as a cube of its size: 8 vertices and 12 triangles. ``colors`` is (L, 3) uint8.
 
     Cubes share no vertices, so each keeps its colour. Not all viewers support quads, hence triangles.
-    Raises OutputError.
     """
     corners = leaves.centers[:, None, :] + _CORNERS[None] * leaves.sizes[:, None, None]
     vertices = np.repeat(_vertices(leaves, colors, leaves.centers), 8)
@@ -48,7 +45,7 @@ def write_voxels(path: Path, leaves: LeafTable, colors: UInt8Array, comments: Se
     indices = 8 * np.arange(len(leaves), dtype=np.int32)[:, None, None] + triangles.astype(np.int32)[None]
     faces = np.empty(12 * len(leaves), dtype=[("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = indices.reshape(-1, 3)
-    write_mesh(path, vertices, faces, comments)
+    return mesh_file(vertices, faces, comments)
 
 
 def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
@@ -64,30 +61,30 @@ def _vertices(leaves: LeafTable, colors: UInt8Array, positions: Any) -> Any:
     return vertices
 
 
-def write_mesh(path: Path, vertices: Any, faces: Any, comments: Sequence[str] = ()) -> None:
-    """Write a mesh, or points where ``faces`` is None. Raises OutputError.
+def mesh_file(vertices: Any, faces: Any, comments: Sequence[str] = ()) -> bytes:
+    """Return a PLY file of a mesh, or of points where ``faces`` is None.
 
     ``vertices`` (V,) and ``faces`` (F,) are packed structured arrays of little-endian numbers. The first field of
-    ``faces`` is ``vertex_indices`` (3,) int32. No incomplete file appears under ``path``.
+    ``faces`` is ``vertex_indices`` (3,) int32.
     """
-    from plyfile import PlyData, PlyElement
-
-    elements = [PlyElement.describe(vertices, "vertex")]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(vertices)}", *_properties(vertices.dtype)]
     content = [vertices.tobytes()]
     if faces is not None:
-        elements.append(PlyElement.describe(faces, "face"))
-        # plyfile writes lists row by row, 100 times slower than rows of one length at once.
+        header += [f"element face {len(faces)}", *_properties(faces.dtype)]
         rows = np.empty(len(faces), dtype=[("length", "u1"), *faces.dtype.descr])
         rows["length"] = 3
         for name in faces.dtype.names:
             rows[name] = faces[name]
         content.append(rows.tobytes())
-    header = PlyData(elements, byte_order="<", comments=list(comments)).header
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        partial.write_bytes(b"".join([header.encode("ascii"), b"\n", *content]))
-        partial.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    return b"".join(["\n".join([*header, "end_header\n"]).encode("ascii"), *content])
+
+
+def _properties(dtype: np.dtype[Any]) -> Iterator[str]:
+    """Lines of the header on the properties of an element."""
+    for name in dtype.names or ():
+        kind = _PLY_TYPES[dtype[name].base.str.lstrip("<|")]
+        yield f"property {f'list uchar {kind}' if dtype[name].shape else kind} {name}"
+
+
+_PLY_TYPES = {"u1": "uchar", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}

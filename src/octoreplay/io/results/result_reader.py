@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import struct
+import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -15,50 +15,57 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
 from zstandard import ZstdError
 
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import parse_team
-from octoreplay.errors import ConfigError, InputError
+from octoreplay.config.yaml_file import load_json
+from octoreplay.errors import ConfigError, InputError, OctoreplayError
 from octoreplay.io.containers.fingerprint import fingerprint
+from octoreplay.io.containers.mcap_records import CRC_KEY, metadata_crc
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore_of
-from octoreplay.io.results.result_writer import (
+from octoreplay.io.results.json_records import value_of
+from octoreplay.io.results.result_writer import READABLE_VERSIONS
+from octoreplay.io.results.stored_records import fields_of, frame_place, map_state, summary_from_metrics, tick_metrics
+from octoreplay.io.results.topics import (
     CONTRADICTION_TOPIC,
-    FORMAT_VERSION,
     FRAMES_TOPIC,
     METRICS_TOPIC,
     evidence_topic,
     map_state_topic,
     pose_topic,
 )
-from octoreplay.records import CENTRAL, ClassTable, Float64Array, FrameCounts, MapState
+from octoreplay.io.results.unfinished import UnfinishedReader, container_reader
+from octoreplay.records import CENTRAL, ClassTable, Float64Array, MapState
 from octoreplay.run_metrics import (
     FramePlace,
-    Join,
-    LinkMetrics,
-    LinkTotals,
     PairMetrics,
-    RobotMetrics,
     RunSummary,
     TickMetrics,
+    log_sent_bytes,
 )
 
 
 class ResultReader:
     """One result file, read lazily; a context manager.
 
-    ``config`` is the run's configuration; its relative log paths are resolved against the result's folder.
+    ``config`` is the run's configuration; its relative log paths are resolved against the result's folder. Checksums
+    are compared as ``CheckedReader`` says. An unfinished result (``x.partial.mcap``, or any file with
+    ``is_unfinished``) gives what its intact chunks hold.
     Raises InputError for a file that is missing, cut, damaged or not an octoreplay result.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, is_unfinished: bool = False) -> None:
         self.path = path
         try:
             self._file = path.open("rb")
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         try:
-            self._reader, self._metadata = self._open()
+            self._unchecked: list[str] = []
+            self._reader, self._metadata = self._open(is_unfinished)
             self._check_kind()
             self.config = self._read_config()
         except BaseException:
@@ -100,32 +107,90 @@ class ResultReader:
         return self._metadata.get("summary", {}).get("complete") == "true"
 
     @property
+    def stop_reason(self) -> str:
+        """Reason for the end of the run; 'cut off' where the file was not finished."""
+        return self._metadata.get("summary", {}).get("stop_reason", "cut off")
+
+    @property
+    def extent(self) -> str:
+        """Clause on the last tick of an incomplete result and its log time."""
+        last = self.last_tick()
+        if last is None:
+            return "holds no tick"
+        number, stamp_ns, elapsed = last
+        return f"ends at tick {number}, {elapsed:.3f} s after the start, at log time {stamp_ns / 1e9:.3f} s"
+
+    def last_tick(self) -> tuple[int, int, float] | None:
+        """Return number, stamp [ns] and time since the start [s] of the last tick; None without any."""
+        for stamp_ns, value in self._messages(METRICS_TOPIC, reverse=True):
+            number = int(value.tick)
+            return number, stamp_ns, number * round(self.config.network.publish_period * 1e9) / 1e9
+        return None
+
+    @property
     def inputs(self) -> dict[str, tuple[int, str, str]]:
         """Size [bytes], method and fingerprint of each input file by its path, in the order of the robots."""
-        stored = {name: json.loads(text) for name, text in self._metadata.get("inputs", {}).items()}
-        return {name: (entry["size"], entry["method"], entry["fingerprint"]) for name, entry in stored.items()}
+        found = {}
+        for name, text in self._metadata.get("inputs", {}).items():
+            entry = self._json("inputs", dict[str, Any], text)
+            try:
+                found[name] = (int(entry["size"]), str(entry["method"]), str(entry["fingerprint"]))
+            except (LookupError, TypeError, ValueError, OverflowError) as error:
+                raise self._wrong("inputs", error) from error
+        return found
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Message type of each topic, by topic."""
+        summary = self._reader.get_summary()
+        assert summary is not None
+        channels = sorted(summary.channels.values(), key=lambda channel: str(channel.topic))
+        return {channel.topic: summary.schemas[channel.schema_id].name for channel in channels}
 
     @property
     def prior(self) -> float:
         """Log-odds of each occupied class in an unobserved cell, h_0."""
-        return float(self.description["prior"])
+        return self._prior
+
+    @property
+    def damage(self) -> tuple[str, ...]:
+        """Clauses on what is missing of an unfinished result; empty for a finished one."""
+        return self._reader.damage if isinstance(self._reader, UnfinishedReader) else ()
+
+    def copy_to(self, writer: RosMcapWriter) -> int:
+        """Copy metadata and messages, in the order of the file, and return the number of messages.
+
+        The copy is not complete, for the same reason. Raises InputError and OutputError.
+        """
+        for name, values in self._metadata.items():
+            if name != "summary":
+                writer.write_metadata(name, values)
+        num_messages = 0
+        try:
+            for schema, channel, record in self._reader.iter_messages(log_time_order=False):
+                writer.copy(schema, channel, record)
+                num_messages += 1
+        except _DAMAGE as error:
+            raise InputError(f"{self.path}: damaged: {error}") from error
+        writer.write_metadata("summary", {"complete": "false", "stop_reason": self.stop_reason})
+        return num_messages
 
     def metrics(self) -> list[TickMetrics]:
         """Return the metrics of all ticks, in order; without pairs in results that do not hold them."""
         pairs = {
-            int(value.tick): tuple(PairMetrics(**_fields(PairMetrics, pair)) for pair in value.pairs)
+            int(value.tick): tuple(PairMetrics(**fields_of(PairMetrics, pair)) for pair in value.pairs)
             for _, value in self._messages(CONTRADICTION_TOPIC)
         }
         places = self.places()
         return [
-            _tick_metrics(value, pairs.get(int(value.tick), ()), places.get(int(value.tick), ()))
+            tick_metrics(value, pairs.get(int(value.tick), ()), places.get(int(value.tick), ()))
             for _, value in self._messages(METRICS_TOPIC)
         ]
 
     def places(self) -> dict[int, tuple[FramePlace, ...]]:
         """Return the frames of all robots by tick; empty where all maps are in the team's frame."""
         return {
-            int(value.tick): tuple(_frame_place(robot) for robot in value.robots)
+            int(value.tick): tuple(frame_place(robot) for robot in value.robots)
             for _, value in self._messages(FRAMES_TOPIC)
         }
 
@@ -139,16 +204,18 @@ class ResultReader:
             raise InputError(f"{self.path}: holds no tick; the run was interrupted before its first one")
         stored = self._metadata.get("summary", {})
         if not self.is_complete:
-            return _summary_from_metrics(metrics, stored.get("stop_reason", "cut off"))
-        names = {item.name for item in dataclasses.fields(RunSummary)}
-        values: dict[str, Any] = {
-            name: text if name == "stop_reason" else json.loads(text) for name, text in stored.items() if name in names
-        }
-        values["warnings"] = tuple(values["warnings"])
-        values["joins"] = tuple(Join(**{**join, "moved": tuple(join["moved"])}) for join in values.get("joins", ()))
-        values["links"] = tuple(LinkMetrics(**link) for link in values["links"])
-        values["frame_counts"] = {robot: _frame_counts(count) for robot, count in values["frame_counts"].items()}
-        return RunSummary(**values, wall_seconds=math.nan, last=metrics[-1])
+            return summary_from_metrics(metrics, self.stop_reason)
+        values: dict[str, Any] = {"wall_seconds": math.nan, "last": metrics[-1]}
+        values["log_sent_bytes"] = log_sent_bytes(metrics)
+        for item in dataclasses.fields(RunSummary):
+            if item.name == "stop_reason":
+                values[item.name] = self.stop_reason
+            elif item.name in stored:
+                values[item.name] = self._json("summary", _SUMMARY_TYPES[item.name], stored[item.name])
+        try:
+            return RunSummary(**values)
+        except TypeError as error:
+            raise self._wrong("summary", error) from error
 
     def state_times(self, robot_id: str, *, evidence: bool = False) -> list[tuple[int, int]]:
         """Return (tick, stamp_ns) of a robot's stored maps, or of its stored evidence, in order."""
@@ -179,7 +246,7 @@ class ResultReader:
         end = None if until_ns is None else until_ns + 1
         chain: list[MapState] = []
         for _, value in self._messages(self._state_topic(robot_id, evidence), end_ns=end, reverse=True):
-            state = _map_state(value)
+            state = map_state(value)
             if chain and state.sequence != chain[-1].base_sequence:
                 continue
             chain.append(state)
@@ -194,14 +261,20 @@ class ResultReader:
             raise InputError(f"{self.path}: holds no centralised map up to the time asked for; run the logs again")
         if evidence:
             raise InputError(
-                f"{self.path}: no evidence of robot '{robot_id}' is stored up to the time asked for; run the logs again"
+                f"{self.path}: no evidence of robot '{robot_id}' is stored up to the time asked for; ask for the end,"
+                " or run the logs again, with --evidence-every for evidence at earlier times"
             )
-        raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for")
+        if until_ns is None:
+            raise InputError(f"{self.path}: no map of robot '{robot_id}' is stored; run the logs again")
+        raise InputError(
+            f"{self.path}: no map of robot '{robot_id}' is stored up to the time asked for; ask for the end, or run the"
+            " logs again, with a shorter --state-every for maps at earlier times"
+        )
 
     def all_states(self) -> Iterator[MapState]:
         """Yield all stored states of the robots and of the centralised map, in order of time."""
         for _, value in self._messages(*map(map_state_topic, (*self.robots, CENTRAL))):
-            yield _map_state(value)
+            yield map_state(value)
 
     def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
         """Return a robot's sensor poses: stamps [ns], and (P, 7) x, y, z, qx, qy, qz, qw in the team's frame."""
@@ -225,13 +298,36 @@ class ResultReader:
                 sentences.append(f"{path}: has changed since {self.path.name} was made from it")
         return sentences
 
-    def _open(self) -> tuple[SeekingReader, dict[str, dict[str, str]]]:
-        """Return the container's reader and all metadata records by name."""
+    def _json(self, name: str, hint: Any, text: str) -> Any:
+        """Return a value of the metadata record ``name``, which is JSON of the type ``hint``."""
         try:
-            reader = SeekingReader(self._file, validate_crcs=True)
-            return reader, {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+            return value_of(hint, load_json(text, name))
+        except (ConfigError, ValueError) as error:
+            raise self._wrong(name, error) from error
+
+    def _wrong(self, name: str, error: Exception) -> InputError:
+        """Return the error for a metadata record that cannot be read."""
+        return InputError(f"{self.path}: damaged: its metadata '{name}' cannot be read: {error}")
+
+    def _open(self, is_unfinished: bool) -> tuple[SeekingReader, dict[str, dict[str, str]]]:
+        """Return the container's reader and all metadata records by name, without their checksums."""
+        metadata: dict[str, dict[str, str]] = {}
+        try:
+            reader = container_reader(self._file, self.path, is_unfinished=is_unfinished)
+            for record in reader.iter_metadata():
+                values = dict(record.metadata)
+                crc = values.pop(CRC_KEY, None)
+                if crc is None:
+                    self._unchecked.append(record.name)
+                elif crc != metadata_crc(record.name, values):
+                    raise InputError(f"{self.path}: damaged: the checksum of its metadata does not match")
+                metadata[record.name] = values
+            if isinstance(reader, UnfinishedReader):
+                # It may be written before the last chunk, which is missing.
+                metadata.pop("summary", None)
         except _DAMAGE as error:
-            raise InputError(f"{self.path}: not a finished MCAP file; {_NOT_A_RESULT}") from error
+            raise InputError(f"{self.path}: not a finished MCAP file, or damaged; {_NOT_A_RESULT}") from error
+        return reader, metadata
 
     def _read_config(self) -> RunConfig:
         """Parse the stored configuration."""
@@ -248,11 +344,19 @@ class ResultReader:
         if "octoreplay" not in self._metadata or "config" not in self._metadata:
             raise InputError(f"{self.path}: an MCAP file, but no result of octoreplay; {_NOT_A_RESULT}")
         version = self.description.get("format_version")
-        if version != FORMAT_VERSION:
+        if version not in READABLE_VERSIONS:
             raise InputError(
-                f"{self.path}: result format {version}, this version reads {FORMAT_VERSION}; use octoreplay"
-                f" {self.description.get('version')}, which wrote it"
+                f"{self.path}: result format {version}, this version reads {' and '.join(READABLE_VERSIONS)}; use"
+                f" octoreplay {self.description.get('version')}, which wrote it"
             )
+        if version != _WITHOUT_CHECKSUMS and self._unchecked:
+            raise InputError(f"{self.path}: damaged: its metadata '{self._unchecked[0]}' has no checksum")
+        try:
+            self._prior = float(self.description["prior"])
+        except (KeyError, ValueError) as error:
+            raise self._wrong("octoreplay", error) from error
+        if not math.isfinite(self._prior):
+            raise self._wrong("octoreplay", ValueError("its prior is not finite"))
 
     def _known(self, robot_id: str) -> str:
         """Return the name of a robot or of the centralised map; raise InputError for any other."""
@@ -280,11 +384,17 @@ class ResultReader:
             raise InputError(f"{self.path}: damaged at topic '{topics[0]}': {error}") from error
 
 
+_WITHOUT_CHECKSUMS = "2"
+"""Result format whose metadata have no checksums."""
+
 _FORMER_DEFAULTS = {"packets": "full", "flow_bits": 4}
 """Parameters of results that do not name all of them, and were written before these defaults changed."""
 
-_DAMAGE = (McapError, ZstdError, SerdeError, struct.error, LookupError, ValueError, OverflowError, MemoryError, OSError)
+_DAMAGE = (McapError, ZstdError, SerdeError, TypesysError, AssertionError, struct.error, LookupError, ValueError,
+           TypeError, SyntaxError, OverflowError, MemoryError, RecursionError, OSError)  # fmt: skip
 """Exceptions raised by reading a damaged file."""
+
+_SUMMARY_TYPES = typing.get_type_hints(RunSummary)
 
 
 def is_result(path: Path) -> bool:
@@ -293,91 +403,10 @@ def is_result(path: Path) -> bool:
         return False
     try:
         with path.open("rb") as file:
-            names = {record.name for record in SeekingReader(file).iter_metadata()}
-    except (OSError, *_DAMAGE):
+            names = {record.name for record in container_reader(file, path).iter_metadata()}
+    except (OSError, OctoreplayError, *_DAMAGE):
         return False
     return {"octoreplay", "config"} <= names
 
 
 _NOT_A_RESULT = "give the OUT.mcap of 'octoreplay run'"
-
-
-def _frame_place(value: Any) -> FramePlace:
-    """Return a FramePlace from its message."""
-    position, turn = value.pose.position, value.pose.orientation
-    numbers = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-    return FramePlace(value.robot_id, value.frame_id, tuple(float(number) for number in numbers))
-
-
-def _tick_metrics(value: Any, pairs: tuple[PairMetrics, ...], places: tuple[FramePlace, ...]) -> TickMetrics:
-    """Return TickMetrics from its message, the metrics of the pairs and the frames of the robots."""
-    plain = ("tick", "settling", "total_distance", "total_distance_all", "distance_per_leaf",
-             "distance_per_cell_and_link", "num_known_cells", "label_disagreement", "max_change")  # fmt: skip
-    return TickMetrics(
-        stamp_ns=stamp_to_ns(value.header.stamp),
-        robots=tuple(RobotMetrics(**_fields(RobotMetrics, robot)) for robot in value.robots),
-        links=tuple(LinkMetrics(**_fields(LinkMetrics, link)) for link in value.links),
-        pairs=pairs,
-        places=places,
-        total_distance_published=getattr(value, "total_distance_published", math.nan),
-        **{name: getattr(value, name) for name in plain},
-    )
-
-
-def _fields(kind: Any, value: Any) -> dict[str, Any]:
-    """Return the fields of the dataclass ``kind`` from the fields of a message with the same names."""
-    return {item.name: getattr(value, item.name) for item in dataclasses.fields(kind)}
-
-
-def _map_state(value: Any) -> MapState:
-    """Return a MapState from its message."""
-    return MapState(
-        robot_id=value.robot_id,
-        stamp_ns=stamp_to_ns(value.header.stamp),
-        tick=int(value.tick),
-        sequence=int(value.sequence),
-        base_sequence=int(value.base_sequence),
-        is_key_frame=bool(value.is_key_frame),
-        data=value.data.tobytes(),
-        frame_id=value.header.frame_id,
-        num_robots=getattr(value, "num_robots", None),
-    )
-
-
-def _frame_counts(stored: dict[str, Any]) -> FrameCounts:
-    """Return FrameCounts from JSON, where keys are text; counts of older versions that are unknown are ignored."""
-    by_number = {
-        name: {int(number): count for number, count in stored.get(name, {}).items()}
-        for name in ("unknown_label_pixels", "unknown_colors")
-    }
-    known = {item.name for item in dataclasses.fields(FrameCounts)}
-    return FrameCounts(**{name: value for name, value in {**stored, **by_number}.items() if name in known})
-
-
-def _summary_from_metrics(metrics: Sequence[TickMetrics], stop_reason: str) -> RunSummary:
-    """Compute the summary of an interrupted run from its metrics."""
-    published = [robot for tick in metrics for robot in tick.robots if robot.packet_bytes]
-
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(robot, name) for robot in published])) if published else 0.0
-
-    links = LinkTotals()
-    for tick in metrics:
-        links.add(tick.links)
-    return RunSummary(
-        num_ticks=len(metrics),
-        num_settling_ticks=sum(tick.settling for tick in metrics),
-        stop_reason=stop_reason,
-        log_seconds=(metrics[-1].stamp_ns - metrics[0].stamp_ns) / 1e9,
-        wall_seconds=math.nan,
-        last=metrics[-1],
-        peak_total_distance=max(tick.total_distance for tick in metrics),
-        peak_total_distance_all=max(tick.total_distance_all for tick in metrics),
-        mean_packet_bytes=mean("packet_bytes"),
-        mean_octree_bytes=mean("octree_bytes"),
-        mean_grid_bytes=mean("grid_bytes"),
-        total_sent_bytes=sum(robot.sent_bytes for tick in metrics for robot in tick.robots),
-        links=links.totals(),
-        frame_counts={},
-        warnings=(),
-    )

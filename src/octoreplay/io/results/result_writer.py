@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,119 +15,115 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay import interrupts
 from octoreplay._version import __version__
+from octoreplay.config.fields import path_problem
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.team_file import dump_team
-from octoreplay.errors import OutputError
+from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
-from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.containers.mcap_writer import RosMcapWriter, Written
 from octoreplay.io.messages.ros_types import header, message
+from octoreplay.io.output_file import locked, publish, sync_folder, temporary_path, writing
 from octoreplay.io.results.geometry_messages import (
-    ADD,
-    DELETE,
-    LINE_LIST,
-    TEXT_VIEW_FACING,
-    marker,
     point,
     quaternion,
     static_transform,
     transform,
     vector,
 )
-from octoreplay.log_odds import best_labels, label_probabilities
-from octoreplay.records import TEAM, ClassTable, LeafTable, MapState, RobotPose
+from octoreplay.io.results.map_messages import CLOUD, GRID, OCTOMAP, cloud_message, grid_message, octomap_message
+from octoreplay.io.results.markers import graph_markers, map_markers
+from octoreplay.io.results.occupancy_grid import Grid
+from octoreplay.io.results.topics import (
+    CONTRADICTION_TOPIC,
+    FRAMES_TOPIC,
+    GRAPH_TOPIC,
+    METRICS_TOPIC,
+    STATIC_TF_TOPIC,
+    TF_TOPIC,
+    evidence_topic,
+    grid_topic,
+    map_state_topic,
+    map_view_topic,
+    markers_topic,
+    octomap_topic,
+    packet_topic,
+    pose_topic,
+)
+from octoreplay.io.results.unfinished import PARTIAL_SUFFIX, has_messages
+from octoreplay.records import TEAM, MapState, RobotPose
 from octoreplay.run_metrics import PAIR_SHARES, RunSummary, TickMetrics
 from octoreplay.transforms import transform_of
 
-FORMAT_VERSION = "2"
+FORMAT_VERSION = "3"
 """Version of the result format; it increases with each incompatible change."""
-METRICS_TOPIC = "/metrics"
-CONTRADICTION_TOPIC = "/contradiction"
-FRAMES_TOPIC = "/frames"
-GRAPH_TOPIC = "/graph"
-TF_TOPIC = "/tf"
-STATIC_TF_TOPIC = "/tf_static"
-
-_FLOAT32, _UINT8 = 7, 2
-"""sensor_msgs/PointField datatypes."""
-VIEW_FIELDS = (
-    ("x", "<f4", 0, _FLOAT32),
-    ("y", "<f4", 4, _FLOAT32),
-    ("z", "<f4", 8, _FLOAT32),
-    ("rgb", "<u4", 12, _FLOAT32),
-    ("label", "u1", 24, _UINT8),
-    ("size", "<f4", 16, _FLOAT32),
-    ("probability", "<f4", 20, _FLOAT32),
-)
-"""Fields of a point in a map view: name, NumPy format, offset, PointField datatype. ``rgb`` holds the integer
-0x00RRGGBB and is declared as float32, a convention of PCL that viewers follow."""
-VIEW_DTYPE = np.dtype(
-    {
-        "names": [name for name, *_ in VIEW_FIELDS],
-        "formats": [number_format for _, number_format, *_ in VIEW_FIELDS],
-        "offsets": [offset for *_, offset, _ in VIEW_FIELDS],
-        "itemsize": 28,
-    }
-)
-
-
-def map_state_topic(robot_id: str) -> str:
-    """Return the topic of a robot's stored map states."""
-    return f"/{robot_id}/map_state"
-
-
-def evidence_topic(robot_id: str) -> str:
-    """Return the topic of a robot's stored evidence."""
-    return f"/{robot_id}/evidence"
-
-
-def map_view_topic(robot_id: str) -> str:
-    """Return the topic of a robot's map for viewers."""
-    return f"/{robot_id}/map"
-
-
-def pose_topic(robot_id: str) -> str:
-    """Return the topic of a robot's sensor pose."""
-    return f"/{robot_id}/pose"
-
-
-def packet_topic(robot_id: str) -> str:
-    """Return the topic of the packets that a robot sent."""
-    return f"/{robot_id}/packet"
+READABLE_VERSIONS = ("2", FORMAT_VERSION)
+"""Versions of the result format that ``ResultReader`` reads."""
 
 
 def partial_path(path: Path) -> Path:
     """Return the path of a result until it is complete: ``x.partial.mcap`` for ``x.mcap``."""
     stem = path.stem if path.suffix == ".mcap" else path.name
-    return path.with_name(f"{stem}.partial.mcap")
+    return path.with_name(f"{stem}{PARTIAL_SUFFIX}")
+
+
+def check_unstarted(path: Path) -> None:
+    """Raise OutputError where an earlier run left an unfinished result of this output that holds messages.
+
+    The same for a name that is too long for that of an unfinished result.
+    """
+    partial = partial_path(path)
+    if path_problem(partial) is not None:
+        raise OutputError(f"{path}: cannot be written: its name is too long for one ending in {PARTIAL_SUFFIX}")
+    with writing(path):
+        exists = partial.exists()
+    if exists and has_messages(partial):
+        raise OutputError(
+            f"{partial}: an earlier run left this unfinished result; continue it with --resume, or remove it and start"
+            " again with --restart"
+        )
 
 
 class ResultWriter:
-    """Writes a result to a temporary file, which ``complete`` renames; a context manager.
+    """Writes a result to ``x.partial.mcap``, which ``complete`` renames to ``x.mcap``; a context manager.
 
-    Without ``complete`` the file is removed at exit. After a KeyboardInterrupt it is finished instead and kept as
-    ``x.partial.mcap``. ``config`` is resolved: all robots and topics are given. Equal calls give equal bytes: no
-    wall-clock time and nothing machine-dependent is written.
+    After an error or a KeyboardInterrupt the partial file is finished and kept if it holds a tick, and a note of the
+    exception names it; without a tick it is removed. ``config`` is resolved: all robots and topics are given. Equal
+    calls give equal bytes: no wall-clock time and nothing machine-dependent is written.
 
-    Raises OutputError where the result cannot be written or would overwrite an input, and InputError where an input
-    cannot be read for its fingerprint.
+    An existing partial file is an error, unless it holds no message or ``restart`` removes it. With ``continues`` it
+    stays as it is until ``take_over`` has copied it. The lock of the output
+    is held until the end. Raises OutputError where the result cannot be written, is being written by another process,
+    or would overwrite an input, and InputError where an input cannot be read for its fingerprint.
     """
 
-    def __init__(self, path: Path, config: ResolvedRun) -> None:
+    def __init__(self, path: Path, config: ResolvedRun, *, restart: bool = False, continues: bool = False) -> None:
         self.path = path
         self.partial_path = partial_path(path)
+        self._work_path = temporary_path(self.partial_path) if continues else self.partial_path
         self._config = config
         self._class_table = config.classes
         self._started = False
-        self._open = True
+        self._has_ticks = False
+        self._is_kept = False
         self._check_path()
-        inputs = self._inputs()
-        self._writer = RosMcapWriter(self.partial_path)
-        try:
-            self._write_description(inputs)
-        except BaseException:
-            self.discard()
-            raise
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(locked(path))
+            inputs = self._inputs()
+            with interrupts.deferred():
+                if not restart and not continues:
+                    check_unstarted(path)
+                with writing(self._work_path):
+                    self._work_path.unlink(missing_ok=True)
+                self._writer = RosMcapWriter(self._work_path, data_crc=True)
+                stack.callback(self._discard)
+                self._write_description(inputs)
+                # All that a reader needs besides chunks is safe before the first of them.
+                self._writer.sync()
+                with writing(path):
+                    sync_folder(path.parent)
+            self._at_exit = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -133,12 +131,29 @@ class ResultWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self._open:
-            return
-        if kind is not None and issubclass(kind, KeyboardInterrupt):
-            self.keep_partial()
-        else:
-            self.discard()
+        if value is not None and self._has_ticks:
+            self._keep(value)
+        self._at_exit.close()
+
+    def sync(self) -> Written:
+        """Flush to disk what was written; return what ``take_over`` needs."""
+        self._writer.sync()
+        return self._writer.written
+
+    def take_over(self, written: Written) -> None:
+        """Continue the partial file of an earlier run after its ``sync``, before anything else is written.
+
+        Raises ConfigError where the settings or the inputs of that run were different, and InputError where its file is
+        damaged.
+        """
+        for (name, values), (_, earlier) in zip(self._writer.written.metadata, written.metadata, strict=True):
+            if values != earlier:
+                raise ConfigError(f"{self.path}: cannot be continued: {_difference(name, values, earlier)}")
+        self._writer.take_over(self.partial_path, written)
+        self._started = self._has_ticks = True
+        with interrupts.deferred(), writing(self.partial_path):
+            publish(self._work_path, self.partial_path)
+            self._work_path = self.partial_path
 
     def write_state(self, state: MapState) -> None:
         """Write one robot's map, a key frame or a delta, to ``/<robot>/map_state``."""
@@ -161,6 +176,7 @@ class ResultWriter:
     def write_metrics(self, metrics: TickMetrics) -> None:
         """Write the team's metrics after one tick to ``/metrics``, those of pairs to ``/contradiction``."""
         self._start(metrics.stamp_ns)
+        self._has_ticks = True
         fields = {item.name: getattr(metrics, item.name) for item in dataclasses.fields(metrics)}
         del fields["stamp_ns"], fields["pairs"], fields["places"]
         fields["robots"] = [message("octoreplay_msgs/msg/RobotMetrics", **vars(robot)) for robot in metrics.robots]
@@ -200,17 +216,18 @@ class ResultWriter:
     def write_view(self, robot_id: str, stamp_ns: int, points: npt.NDArray[Any], frame_id: str = TEAM) -> None:
         """Write the ``view_points`` of one robot's map as a point cloud for viewers to ``/<robot>/map``."""
         self._start(stamp_ns)
-        type_name = "sensor_msgs/msg/PointCloud2"
-        fields = [
-            message("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=1)
-            for name, _, offset, datatype in VIEW_FIELDS
-        ]
-        value = message(
-            type_name, header=header(stamp_ns, frame_id), height=1, width=len(points), fields=fields,
-            is_bigendian=False, point_step=VIEW_DTYPE.itemsize, row_step=VIEW_DTYPE.itemsize * len(points),
-            data=points.view(np.uint8).reshape(-1), is_dense=True,
-        )  # fmt: skip
-        self._writer.write(map_view_topic(robot_id), type_name, value, stamp_ns)
+        self._writer.write(map_view_topic(robot_id), CLOUD, cloud_message(points, stamp_ns, frame_id), stamp_ns)
+
+    def write_grid(self, robot_id: str, stamp_ns: int, grid: Grid, frame_id: str = TEAM) -> None:
+        """Write the occupancy grid of one robot's map to ``/<robot>/grid``."""
+        self._start(stamp_ns)
+        self._writer.write(grid_topic(robot_id), GRID, grid_message(grid, stamp_ns, frame_id), stamp_ns)
+
+    def write_octomap(self, robot_id: str, stamp_ns: int, nodes: bytes, frame_id: str = TEAM) -> None:
+        """Write the nodes of one robot's map as an OctoMap tree to ``/<robot>/octomap``."""
+        self._start(stamp_ns)
+        value = octomap_message(nodes, self._config.map.resolution, stamp_ns, frame_id)
+        self._writer.write(octomap_topic(robot_id), OCTOMAP, value, stamp_ns)
 
     def write_poses(self, stamp_ns: int, poses: Sequence[RobotPose]) -> None:
         """Write the robots' sensor poses to ``/<robot>/pose`` and ``/tf`` (frame -> ``<robot>/sensor``)."""
@@ -231,35 +248,18 @@ class ResultWriter:
 
     def write_graph(self, stamp_ns: int, links: Sequence[tuple[str, str]], poses: Sequence[RobotPose]) -> None:
         """Write the tick's links (pairs of robots, each once) as lines and the robots' names to ``/graph``."""
+        robot_ids = [robot.robot_id for robot in self._config.robots]
+        self._write_markers(GRAPH_TOPIC, stamp_ns, graph_markers(stamp_ns, links, poses, robot_ids))
+
+    def write_cubes(self, robot_id: str, stamp_ns: int, points: npt.NDArray[Any], frame_id: str = TEAM) -> None:
+        """Write the ``view_points`` of one robot's map as cubes to ``/<robot>/markers``."""
+        markers = map_markers(stamp_ns, points, self._class_table, frame_id)
+        self._write_markers(markers_topic(robot_id), stamp_ns, markers)
+
+    def _write_markers(self, topic: str, stamp_ns: int, markers: list[Any]) -> None:
         self._start(stamp_ns)
-        positions = {pose.robot_id: vector(pose.T_team_sensor) for pose in poses}
-        frames = {pose.robot_id: pose.frame_id for pose in poses}
-        lines = []
-        # A link joins robots in one frame; a frame without links deletes the lines of an earlier tick.
-        for number, frame_id in enumerate(dict.fromkeys(frames.values()) or [TEAM]):
-            ends = [end for link in links if positions.keys() >= set(link) for end in link if frames[end] == frame_id]
-            lines.append(
-                marker(
-                    stamp_ns,
-                    "links",
-                    number,
-                    LINE_LIST,
-                    action=ADD if ends else DELETE,
-                    points=[point(positions[end]) for end in ends],
-                    scale=(0.08, 0.0, 0.0),
-                    frame_id=frame_id,
-                )
-            )
-        names = [
-            marker(
-                stamp_ns, "robots", index, TEXT_VIEW_FACING, text=robot_id, scale=(0.0, 0.0, 0.6),
-                position=positions[robot_id] + (0.0, 0.0, 0.8), frame_id=frames[robot_id],
-            )
-            for index, robot_id in enumerate(robot.robot_id for robot in self._config.robots)
-            if robot_id in positions
-        ]  # fmt: skip
         type_name = "visualization_msgs/msg/MarkerArray"
-        self._writer.write(GRAPH_TOPIC, type_name, message(type_name, markers=[*lines, *names]), stamp_ns)
+        self._writer.write(topic, type_name, message(type_name, markers=markers), stamp_ns)
 
     def write_packet(self, robot_id: str, stamp_ns: int, tick: int, data: bytes) -> None:
         """Write one packet as sent to ``/<robot>/packet``."""
@@ -273,30 +273,63 @@ class ResultWriter:
 
     def complete(self, summary: RunSummary) -> None:
         """Write the summary of the run, finish the file and rename it to its final name."""
-        try:
-            self._writer.write_metadata("summary", _summary_values(summary))
+        interrupts.check()
+        with interrupts.deferred():
+            self._writer.write_metadata("summary", _summary_values(self._with_relative_paths(summary)))
             self._writer.finish()
-            self.partial_path.replace(self.path)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
-        self._open = False
+            if not self._writer.is_at(self.partial_path):
+                raise OutputError(
+                    f"{self.path}: cannot be written: {self.partial_path.name} was removed during the run"
+                )
+            with writing(self.path):
+                publish(self.partial_path, self.path)
 
-    def keep_partial(self) -> None:
-        """Finish the file under its temporary name, so that it can be opened, without replacing the final file."""
-        self._writer.write_metadata("summary", {"complete": "false", "stop_reason": "interrupted"})
-        self._writer.finish()
-        self._open = False
+    def _keep(self, error: BaseException) -> None:
+        """Finish the file under its temporary name where that is possible, and note it in the exception."""
+        with interrupts.deferred(), contextlib.suppress(OutputError):
+            # After a failed write the file may have no chunk.
+            is_of_use = self._writer.is_open or has_messages(self.partial_path)
+            if is_of_use and self._writer.is_at(self.partial_path):
+                self._is_kept = True
+                error.add_note(f"the finished part is in {self.partial_path}")
+            if self._writer.is_open:
+                self._writer.write_metadata("summary", {"complete": "false", "stop_reason": _stop_reason(error)})
+            self._writer.finish()
 
-    def discard(self) -> None:
-        """Remove the unfinished file."""
-        self._open = False
+    def _discard(self) -> None:
+        """Close the file, and remove it unless it has its final name or is kept."""
         with contextlib.suppress(OutputError):
             self._writer.finish()
-        with contextlib.suppress(OSError):
-            self.partial_path.unlink()
+        if not self._is_kept and self._writer.is_at(self._work_path):
+            with contextlib.suppress(OSError):
+                self._work_path.unlink()
+
+    def _with_relative_paths(self, summary: RunSummary) -> RunSummary:
+        """Return the summary with the paths of inputs in its sentences relative to the result's folder."""
+        folder = self.path.parent.resolve()
+        files = {str(path): os.path.relpath(path, folder) for robot in self._config.robots for path in robot.files}
+        # Longest first, because a path may begin with another one.
+        names = sorted((name for name in files if Path(name).is_absolute()), key=len, reverse=True)
+
+        def relative(text: str) -> str:
+            for name in names:
+                text = text.replace(name, files[name])
+            return text
+
+        counts = {
+            robot_id: dataclasses.replace(
+                count,
+                first_missing={cause: relative(text) for cause, text in count.first_missing.items()},
+                truncated_files=[relative(text) for text in count.truncated_files],
+            )
+            for robot_id, count in summary.frame_counts.items()
+        }
+        return dataclasses.replace(summary, frame_counts=counts, warnings=tuple(map(relative, summary.warnings)))
 
     def _check_path(self) -> None:
         """Raise OutputError for a path that cannot be written, or that is an input of the run."""
+        if self.path.name.endswith(PARTIAL_SUFFIX):
+            raise OutputError(f"{self.path}: unfinished results end in {PARTIAL_SUFFIX}; name another output")
         if self.path.is_dir():
             raise OutputError(f"{self.path}: is a folder; give a file name such as {self.path / 'out.mcap'}")
         if not self.path.parent.is_dir():
@@ -316,7 +349,7 @@ class ResultWriter:
     def _write_description(self, inputs: dict[str, Fingerprint]) -> None:
         """Write the metadata: format, configuration, classes and fingerprints of the inputs."""
         config, folder = self._config, self.path.parent.resolve()
-        robots = tuple(robot.with_absolute_paths() for robot in config.robots)
+        robots = tuple(robot.with_paths_from(folder) for robot in config.robots)
         self._writer.write_metadata(
             "octoreplay",
             {
@@ -330,14 +363,14 @@ class ResultWriter:
             },
         )
         used = dataclasses.replace(config, robots=robots, sensor=config.effective_sensor)
-        self._writer.write_metadata("config", {"team_file": dump_team(used, folder, with_defaults=True)})
+        self._writer.write_metadata("config", {"team_file": dump_team(used, with_defaults=True)})
         classes = [{"id": 0, "name": "free", "color": None}]
         classes += [{"id": c.class_id, "name": c.name, "color": list(c.color)} for c in self._class_table.classes]
         self._writer.write_metadata("classes", {"classes": json.dumps(classes)})
         self._writer.write_metadata(
             "inputs",
             {
-                _relative(path, folder): json.dumps(
+                os.path.relpath(path, folder): json.dumps(
                     {"size": entry.size, "method": entry.method, "fingerprint": entry.value}
                 )
                 for path, entry in inputs.items()
@@ -358,32 +391,31 @@ class ResultWriter:
         self._writer.write(topic, type_name, message(type_name, transforms=transforms), stamp_ns)
 
 
-def view_points(leaves: LeafTable, classes: ClassTable) -> npt.NDArray[Any]:
-    """Return the occupied leaves of a map as an array of ``VIEW_DTYPE``, with the colours of the classes."""
-    label = best_labels(leaves.log_odds)
-    occupied = np.flatnonzero(label)
-    label = label[occupied]
-    points = np.zeros(len(occupied), dtype=VIEW_DTYPE)
-    for axis, name in enumerate("xyz"):
-        points[name] = leaves.centers[occupied, axis]
-    color = classes.colors.astype(np.uint32)[label.astype(np.intp) - 1]
-    points["rgb"] = (color[:, 0] << 16) | (color[:, 1] << 8) | color[:, 2]
-    points["label"] = label
-    points["size"] = leaves.sizes[occupied]
-    points["probability"] = label_probabilities(leaves.log_odds[occupied])
-    return points
+def _stop_reason(error: BaseException) -> str:
+    """Return the reason that an unfinished result gives for its end."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    return "out of memory" if isinstance(error, MemoryError) else f"error: {error}"
 
 
-def _relative(path: str, folder: Path) -> str:
-    """Return a path as in the stored team file: relative to the result's folder if it lies below it."""
-    return str(Path(path).relative_to(folder)) if Path(path).is_relative_to(folder) else path
+def _difference(name: str, values: Mapping[str, str], earlier: Mapping[str, str]) -> str:
+    """Phrase on the first difference between two metadata records."""
+    key = next(key for key in [*values, *earlier] if values.get(key) != earlier.get(key))
+    if name == "inputs":
+        return f"the log '{key}' is not as it was; run with --restart to start from the beginning"
+    now, then = (record.get(key, "").splitlines() for record in (values, earlier))
+    lines = next(((a, b) for a, b in itertools.zip_longest(now, then, fillvalue="") if a != b), ("", ""))
+    return (
+        f"'{lines[0].strip()}' was '{lines[1].strip()}'; use the same settings, or run with --restart to start from the"
+        " beginning"
+    )
 
 
 def _summary_values(summary: RunSummary) -> dict[str, str]:
     """Return a summary as metadata, with numbers and lists as JSON; without the wall time, which differs by run."""
     values = {"complete": "true"}
     for item in dataclasses.fields(summary):
-        if item.name in ("wall_seconds", "last", "links", "frame_counts", "joins"):
+        if item.name in ("wall_seconds", "log_sent_bytes", "last", "links", "frame_counts", "joins"):
             continue
         value = getattr(summary, item.name)
         values[item.name] = value if isinstance(value, str) else json.dumps(value)

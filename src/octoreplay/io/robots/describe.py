@@ -12,12 +12,19 @@ from octoreplay.config.resolved import MapFrame, ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.io.messages.sensor_messages import kind_of
-from octoreplay.io.robots.classes import check_labelled, has_labels, team_class_table
+from octoreplay.io.robots.classes import (
+    LabelledSensor,
+    check_labelled,
+    label_info_warnings,
+    labelled_sensors,
+    team_class_table,
+)
+from octoreplay.io.robots.label_counts import LabelCounts, check_labels, count_labels
 from octoreplay.io.robots.log_groups import LogGroup, groups_in
-from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.io.robots.survey import LogSurveys, Survey
 from octoreplay.io.robots.team_check import TeamMember, check_team, team_member
-from octoreplay.io.robots.topics import attempt, find_topics
+from octoreplay.io.robots.topics import attempt, find_topics, other_sensors
 from octoreplay.records import ClassTable
 
 
@@ -57,19 +64,27 @@ class RobotSummary:
     """One robot in the logs: the topics that a run would use, and what a run would lack.
 
     ``frame`` is its map frame and ``span_ns`` the stamps of its first and last message, None where they are unknown.
+    ``other_sensors`` are sensor topics in frames of their own that the robot does not use.
     """
 
     robot: RobotConfig
     frame: MapFrame | None
     span_ns: tuple[int, int] | None
     missing: tuple[str, ...]
+    other_sensors: tuple[str, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on choices that the team file can change."""
-        if self.frame is None or not self.frame.origin:
-            return ()
-        return (f"map_frame: {self.frame.origin}; map_frame: {self.frame.pose_frame} leaves these transforms out",)
+        notes = []
+        if self.frame is not None and self.frame.origin:
+            notes.append(
+                f"map_frame: {self.frame.origin}; map_frame: {self.frame.pose_frame} leaves these transforms out"
+            )
+        if self.other_sensors:
+            topics = ", ".join(repr(topic) for topic in self.other_sensors)
+            notes.append(f"sensors: not used: {topics}; a robot with several sensors has one entry in sensors for each")
+        return tuple(notes)
 
 
 @dataclass(frozen=True)
@@ -77,7 +92,8 @@ class LogDescription:
     """Contents of a set of logs.
 
     ``overlap_ns`` is the (start, end) that all robots share, None without an overlap; ``missing`` is what the team as
-    a whole lacks for a run; ``warnings`` are sentences on frames and clocks that do not fit together.
+    a whole lacks for a run; ``warnings`` are sentences on frames, clocks and classes that do not fit together;
+    ``labels`` are histograms of the raw labels of a sample of messages.
     """
 
     logs: tuple[LogSummary, ...]
@@ -86,13 +102,19 @@ class LogDescription:
     class_table: ClassTable | None
     missing: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    labels: tuple[LabelCounts, ...] = ()
+
+    @property
+    def is_ready(self) -> bool:
+        """True where nothing is missing for a run."""
+        return not self.missing and not any(robot.missing for robot in self.robots)
 
 
-def describe(logs: Sequence[Path], *, strict_frames: bool = False) -> LogDescription:
+def describe(logs: Sequence[Path], *, strict_frames: bool = False, classes: ClassTable | None = None) -> LogDescription:
     """Return the contents of some logs and what they lack for a run.
 
-    A log that cannot be opened has a summary with the reason. Raises ConfigError with ``strict_frames`` where nothing
-    relates the map frames of two robots.
+    ``classes`` is the class table of the run, by default that of the logs. A log that cannot be opened has a summary
+    with the reason. Raises ConfigError with ``strict_frames`` where nothing relates the map frames of two robots.
     """
     with LogSurveys() as known:
         errors: dict[Path, list[str]] = {path: [] for path in logs}
@@ -102,8 +124,17 @@ def describe(logs: Sequence[Path], *, strict_frames: bool = False) -> LogDescrip
         groups = (attempt(lambda: groups_in(surveys), missing) or []) if surveys else []
         problems: list[list[str]] = [[] for _ in groups]
         members = [_member(group, lacks) for group, lacks in zip(groups, problems, strict=True)]
-        classes = _class_table([member.robot for member in members], groups, missing)
-    warnings = check_team(members, strict_frames=strict_frames)
+        robots = [member.robot for member in members]
+        warnings = check_team(members, strict_frames=strict_frames)
+        if classes is None:
+            classes = _class_table(robots, groups, missing)
+        else:
+            warnings += label_info_warnings(classes, labelled_sensors(robots, groups))
+        labels = [
+            _labels(sensor, lacks, classes)
+            for robot, group, lacks in zip(robots, groups, problems, strict=True)
+            for sensor in labelled_sensors([robot], [group])
+        ]
     spans = [member.clock.span_ns for member in members if member.clock is not None]
     start, end = max((s for s, _ in spans), default=0), min((e for _, e in spans), default=0)
     return LogDescription(
@@ -112,24 +143,42 @@ def describe(logs: Sequence[Path], *, strict_frames: bool = False) -> LogDescrip
             for path, survey in found.items()
         ),
         robots=tuple(
-            RobotSummary(member.robot, member.frame, member.clock.span_ns if member.clock else None, tuple(lacks))
-            for member, lacks in zip(members, problems, strict=True)
+            RobotSummary(
+                member.robot,
+                member.frame,
+                member.clock.span_ns if member.clock else None,
+                tuple(lacks),
+                tuple(other_sensors(member.robot, group)),
+            )
+            for member, lacks, group in zip(members, problems, groups, strict=True)
         ),
         overlap_ns=(start, end) if spans and start <= end else None,
         class_table=classes,
         missing=tuple(missing),
-        warnings=warnings,
+        warnings=(*warnings, *(found.warning for found in labels if found is not None and found.warning is not None)),
+        labels=tuple(found for found in labels if found is not None),
     )
+
+
+def _labels(sensor: LabelledSensor, lacks: list[str], classes: ClassTable | None) -> LabelCounts | None:
+    """Histogram of a sensor's labels; what a run would refuse is appended to ``lacks``."""
+    logs = [survey.log for survey in sensor.group.surveys]
+    if not sensor.is_labelled:
+        return None
+    counts = attempt(lambda: count_labels(sensor.robot, logs, classes), lacks)
+    if counts is not None and classes is not None:
+        attempt(lambda: check_labels(sensor.robot, logs, classes), lacks)
+    return counts
 
 
 def _class_table(robots: Sequence[RobotConfig], groups: Sequence[LogGroup], missing: list[str]) -> ClassTable | None:
     """The team's class table; None where it has none, with the reason in ``missing``."""
     if not robots:
         return None
-    labelled = [has_labels(robot, group) for robot, group in zip(robots, groups, strict=True)]
-    classes = attempt(lambda: edited(team_class_table(robots, groups, labelled), (), ()), missing)
+    sensors = labelled_sensors(robots, groups)
+    classes = attempt(lambda: edited(team_class_table(sensors), (), ()), missing)
     if classes is not None:
-        attempt(functools.partial(check_labelled, classes, robots, labelled), missing)
+        attempt(functools.partial(check_labelled, classes, sensors), missing)
     return classes
 
 
@@ -158,4 +207,4 @@ def _member(group: LogGroup, missing: list[str]) -> TeamMember:
 def _check_readable(member: TeamMember, group: LogGroup) -> None:
     """Raise InputError where the robot's logs have no usable intrinsics, frames or poses."""
     resolved = ResolvedRobot.from_config(member.robot, None, member.frame)
-    RobotLog(resolved, TimeConfig(), None, logs=[survey.log for survey in group.surveys])
+    SensorLogs(resolved, TimeConfig(), None, logs=[survey.log for survey in group.surveys])

@@ -4,31 +4,43 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from octoreplay.config.class_tables.edits import edited
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
+from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.io.robots.classes import check_labelled, has_labels, team_class_table
+from octoreplay.io.containers.open_files import allow_open_files
+from octoreplay.io.robots.classes import check_labelled, label_info_warnings, labelled_sensors, team_class_table
 from octoreplay.io.robots.log_groups import group_of, groups_in
 from octoreplay.io.robots.survey import LogSurveys
 from octoreplay.io.robots.team_check import TeamMember, check_team, team_frame_origins, team_member
 from octoreplay.io.robots.topics import find_topics
+from octoreplay.records import FilePath
 
 
-def discover(logs: Sequence[Path], surveys: LogSurveys | None = None) -> tuple[ResolvedRobot, ...]:
+def discover(
+    logs: Sequence[FilePath],
+    surveys: LogSurveys | None = None,
+    *,
+    edit: Callable[[Sequence[RobotConfig]], Sequence[RobotConfig]] = list,
+) -> tuple[ResolvedRobot, ...]:
     """Return the robots in some logs with their topics and frames, in the order of the logs.
 
     A log holds one robot, named by its file; or several, named by the first part of their topics, where at least two
-    such namespaces hold a sensor and a pose each. Raises ConfigError where several topics fit (the message lists them
-    as lines of a team file), InputError where a log has no depth image, point cloud or pose. Logs in ``surveys`` are
-    not opened again.
+    such namespaces hold a sensor and a pose each. ``edit`` sets fields of the robots before the others are found. Logs
+    in ``surveys`` are not opened again. Raises ConfigError where several topics fit (the message lists them as lines of
+    a team file), InputError where a log has no depth image, point cloud or pose.
     """
     with _shared(surveys) as known:
-        groups = groups_in([known.of(path) for path in logs])
-        return tuple(_resolved(team_member(find_topics(group.blank_robot(), group), group)) for group in groups)
+        groups = groups_in([known.of(Path(path)) for path in logs])
+        robots = edit([group.blank_robot() for group in groups])
+        return tuple(
+            _resolved(team_member(find_topics(robot, group), group))
+            for robot, group in zip(robots, groups, strict=True)
+        )
 
 
 def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun:
@@ -42,6 +54,7 @@ def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun
     """
     if isinstance(config, ResolvedRun):
         return config
+    allow_open_files([path for robot in config.robots for path in robot.logs])
     with _shared(surveys) as known:
         groups = [group_of(robot, tuple(known.of(path) for path in robot.logs)) for robot in config.robots]
         members = [
@@ -49,16 +62,18 @@ def resolve(config: RunConfig, surveys: LogSurveys | None = None) -> ResolvedRun
             for robot, group in zip(config.robots, groups, strict=True)
         ]
         robots = [_resolved(member) for member in members]
-        labelled = [has_labels(robot, group) for robot, group in zip(robots, groups, strict=True)]
-        classes = config.classes
-        if classes is None:
-            classes = edited(team_class_table(robots, groups, labelled), config.merge_classes, config.ignore_hits)
-    check_labelled(classes, robots, labelled)
+        sensors = labelled_sensors(robots, groups)
+        classes, contradictions = config.classes, tuple[str, ...]()
+        if classes is not None:
+            contradictions = label_info_warnings(classes, sensors)
+        else:
+            classes = edited(team_class_table(sensors), config.merge_classes, config.ignore_hits)
+    check_labelled(classes, sensors)
     on_air = config.alignment.is_on_air
     warnings = check_team(members, strict_frames=config.time.strict_frames, need_common_frame=not on_air)
     origins = team_frame_origins(members)
     robots = [dataclasses.replace(robot, frame_origin=origins[robot.robot_id]) for robot in robots]
-    return ResolvedRun.from_config(config, robots, classes, warnings)
+    return ResolvedRun.from_config(config, robots, classes, (*warnings, *contradictions))
 
 
 def _resolved(member: TeamMember) -> ResolvedRobot:

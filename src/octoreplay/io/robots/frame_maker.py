@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -13,7 +12,7 @@ from octoreplay.io.containers.log_reader import RawMessage
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Calibration, Cloud, CompressedImage, Image, Scan
 from octoreplay.io.robots.frame_queue import Settled
-from octoreplay.io.sensors.cameras import camera_model, check_camera, image_size
+from octoreplay.io.sensors.cameras import camera_model, check_camera, has_rectified_name, image_size
 from octoreplay.io.sensors.clouds import decode_cloud, decode_scan
 from octoreplay.io.sensors.images import decode_confidences, decode_depth, decode_labels
 from octoreplay.io.sensors.labels import LabelLookup
@@ -75,7 +74,7 @@ class DepthFrameMaker(FrameMaker):
 
     def make(
         self, settled: Settled[RawMessage], stamp_ns: int, T_team_sensor: Float64Array, boxes: tuple[BodyBox, ...]
-    ) -> Frame:
+    ) -> DepthFrame:
         """Return the frame of a depth image."""
         message = settled.message
         depth, unit = decode_depth(_image(message), message.where, self._robot.depth_unit)
@@ -90,8 +89,9 @@ class DepthFrameMaker(FrameMaker):
             confidence_image = decode_confidences(_image(confidence), confidence.where)
             self._check_size(confidence_image, depth, confidence, message)
         return DepthFrame(
-            self._robot.robot_id, stamp_ns, depth, unit, class_image, camera, T_team_sensor, confidence_image, boxes
-        )
+            self._robot.robot_id, stamp_ns, depth, unit, class_image, camera, T_team_sensor, confidence_image, boxes,
+            self._robot.min_range, self._robot.max_range,
+        )  # fmt: skip
 
     def _camera_of(self, depth: Any, where: str) -> CameraModel:
         """The camera of an image. Raises InputError where its size differs from the calibration or the first image."""
@@ -160,7 +160,10 @@ class CloudFrameMaker(FrameMaker):
             # Rays begin at the origin of the frame that the points are given in.
             T_team_sensor = T_team_sensor @ T_frame_points
         confidences = points.confidences if class_ids is not None else None
-        return CloudFrame(self._robot.robot_id, stamp_ns, points.points, class_ids, T_team_sensor, confidences, boxes)
+        return CloudFrame(
+            self._robot.robot_id, stamp_ns, points.points, class_ids, T_team_sensor, confidences, boxes,
+            self._robot.min_range, self._robot.max_range,
+        )  # fmt: skip
 
 
 def _image(message: RawMessage) -> Image | CompressedImage:
@@ -175,4 +178,4 @@ def _is_rectified(robot: RobotConfig) -> bool:
     """True where the depth image is rectified, by the team file or else by the topic's name."""
     if robot.rectified is not None:
         return robot.rectified
-    return re.search(r"(^|[/_])rect", str(robot.depth_topic).lower()) is not None
+    return has_rectified_name(str(robot.depth_topic))

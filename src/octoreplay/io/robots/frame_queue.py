@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from operator import itemgetter
 from typing import Generic, NamedTuple, Protocol, TypeVar
@@ -56,13 +56,22 @@ class FrameQueue(Generic[Message]):
     - A partner belongs to the nearest sensor message (the earlier of two) without a partner of its kind, within
       ``pair_tolerance_ns``. A sensor message takes the nearest of its partners of a kind.
 
-    The number of messages held is bounded by the window, whatever the length of the log.
+    ``find_pose`` is called with the stamp of a message that would be settled before its pose is known. The number of
+    messages held is bounded by the window, whatever the length of the log.
     """
 
     def __init__(
-        self, poses: Poses, *, reorder_window_ns: int, pair_tolerance_ns: int, pose_gap_ns: int, num_partners: int
+        self,
+        poses: Poses,
+        *,
+        reorder_window_ns: int,
+        pair_tolerance_ns: int,
+        pose_gap_ns: int,
+        num_partners: int,
+        find_pose: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._poses = poses
+        self._find_pose = find_pose
         self._window_ns = reorder_window_ns
         self._tolerance_ns = pair_tolerance_ns
         self._pose_gap_ns = pose_gap_ns
@@ -78,6 +87,11 @@ class FrameQueue(Generic[Message]):
     def newest_ns(self) -> int | None:
         """Largest stamp of all messages so far; None before the first."""
         return self._newest_ns
+
+    def unused_partners(self, kind: int) -> tuple[int, int]:
+        """Return the numbers of partners of a kind without a sensor message, and of those with a repeated stamp."""
+        partners = self._partners[kind]
+        return partners.num_dropped + len(partners), partners.num_repeated
 
     def needed_from_ns(self, first_ns: int) -> int:
         """Stamp from which poses are still needed; ``first_ns`` is the sensor's first stamp."""
@@ -116,6 +130,8 @@ class FrameQueue(Generic[Message]):
         if self._popped_ns is not None and self._popped_ns != stamp_ns:
             self._stamps.discard(self._popped_ns)
         self._popped_ns = stamp_ns
+        if not self._poses.is_known(stamp_ns):
+            self._find_pose(stamp_ns)
         pose = self._poses.at(stamp_ns)
         self._poses.forget_before(stamp_ns)
         return Settled(stamp_ns, message, partners, pose)
@@ -137,15 +153,22 @@ class _Partners(Generic[Message]):
     """Partners of one kind that no sensor message has taken yet."""
 
     def __init__(self, tolerance_ns: int) -> None:
+        self.num_dropped = 0
+        self.num_repeated = 0
         self._tolerance_ns = tolerance_ns
         self._stamps: list[int] = []
         self._messages: dict[int, Message] = {}
 
+    def __len__(self) -> int:
+        return len(self._stamps)
+
     def add(self, stamp_ns: int, message: Message) -> None:
         """Add a partner; of two with the same stamp the first is kept."""
-        if stamp_ns not in self._messages:
-            self._messages[stamp_ns] = message
-            insort(self._stamps, stamp_ns)
+        if stamp_ns in self._messages:
+            self.num_repeated += 1
+            return
+        self._messages[stamp_ns] = message
+        insort(self._stamps, stamp_ns)
 
     def take(self, waiting: Sequence[int]) -> Message | None:
         """Return and remove the partner of the earliest of the waiting sensor messages, given by their stamps."""
@@ -168,6 +191,7 @@ class _Partners(Generic[Message]):
     def drop_before(self, stamp_ns: int) -> None:
         """Drop partners before a stamp; no waiting or future sensor message can take them."""
         end = bisect_left(self._stamps, stamp_ns)
+        self.num_dropped += end
         for stamp in self._stamps[:end]:
             del self._messages[stamp]
         del self._stamps[:end]

@@ -8,11 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from octoreplay.config.robot import RobotConfig
-from octoreplay.errors import ConfigError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.log_reader import TopicInfo
 from octoreplay.io.messages.decoders import ENCODINGS
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
 from octoreplay.io.robots.survey import Survey, TopicSample
+
+LABELLED_SUFFIX = ".labelled"
+"""End of the stem of a log that 'octoreplay label' has written: its robot has the name that it had before."""
+
+_DRIVERS = {
+    "ouster_ros/msg/PacketMsg": "ouster-ros",
+    "ouster_msgs/msg/PacketMsg": "ouster-ros",
+    "ouster_sensor_msgs/msg/PacketMsg": "ouster-ros",
+}
+"""Drivers that turn the raw packets of a lidar into point clouds, by the type of the packets."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +84,28 @@ class LogGroup:
         encodings = {topic.encoding for topic in topics}
         if encodings.isdisjoint(ENCODINGS):
             return f"its messages are encoded as {', '.join(sorted(encodings))}; {', '.join(ENCODINGS)} can be read"
+        for topic in topics:
+            if topic.type_name in _DRIVERS:
+                return (
+                    f"'{topic.name}' holds the raw packets of a lidar ({topic.type_name}); play the log into the "
+                    f"driver {_DRIVERS[topic.type_name]}, and record its point clouds together with the other topics"
+                )
         names = sorted({topic.type_name for topic in topics})
         return f"its messages are {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
+
+    def no_sensor(self, missing: str) -> InputError | ConfigError:
+        """Return the error about a missing sensor: with the first cause where sensor topics cannot be decoded.
+
+        It is a ConfigError where this cause is a missing package.
+        """
+        causes = {name: cause for s in reversed(self.surveys) for name, cause in s.unreadable.items()}
+        names = sorted(name for name in causes if self._is_own(name))
+        if not names:
+            return InputError(f"{self.paths}: {missing}; {self.contents()}")
+        cause = causes[names[0]]
+        kind = ConfigError if isinstance(cause, ConfigError) else InputError
+        listed = f"{', '.join(repr(name) for name in names[:8])}{', ...' if len(names) > 8 else ''}"
+        return kind(f"{self.paths}: {missing}; no message of {listed} can be decoded: {cause}")
 
     def _is_own(self, topic: str) -> bool:
         """True where a topic belongs to the robot, or the robot has the logs to itself."""
@@ -108,7 +138,8 @@ def group_of(robot: RobotConfig, surveys: tuple[Survey, ...]) -> LogGroup:
     Raises ConfigError where the logs hold several robots and none of them has the configured one's id.
     """
     namespaces = set(itertools.chain(*(survey.robots for survey in surveys)))
-    named = robot.depth_topic or robot.cloud_topic
+    first = robot.views[0]
+    named = first.depth_topic or first.cloud_topic
     owners = {topic: owner for survey in surveys for topic, owner in survey.owners.items()}
     if named and named not in owners:
         # The named sensor belongs to none of the robots, so the robot's other topics must be named too.
@@ -123,8 +154,11 @@ def group_of(robot: RobotConfig, surveys: tuple[Survey, ...]) -> LogGroup:
 
 
 def _names_of_files(paths: Sequence[Path]) -> dict[Path, str]:
-    """Robot name for each file: its stem, or its folder's name where stems repeat."""
-    for names in ([path.stem for path in paths], [path.resolve().parent.name for path in paths]):
+    """Robot name for each file: its stem without '.labelled', or its folder's name where stems repeat."""
+    for names in (
+        [path.stem.removesuffix(LABELLED_SUFFIX) for path in paths],
+        [path.resolve().parent.name for path in paths],
+    ):
         if len(set(names)) == len(names) and all(names):
             return dict(zip(paths, names, strict=True))
     repeated = next(path for path in paths if [p.stem for p in paths].count(path.stem) > 1)

@@ -15,6 +15,7 @@ from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo, first_whole_message
 from octoreplay.io.messages.sensor_messages import Kind, StampedTransform, Transforms, kind_of
 from octoreplay.io.robots.log_groups import LogGroup
+from octoreplay.io.robots.missing_poses import STILL_REMEDY, odometry_remedy
 from octoreplay.io.robots.pose_source import POSE_KINDS, load_static_transforms, moving_tf_names, tf_topics
 from octoreplay.io.robots.poses import FrameTree, frame_name
 
@@ -35,7 +36,7 @@ def find_map_frame(robot: RobotConfig, group: LogGroup) -> MapFrame:
     poses' frame where the chain leads through the robot's own body or is a cycle. Raises InputError where the poses are
     TF and the sensor's frame is unknown or has no parent.
     """
-    if robot.pose_file is not None:
+    if robot.pose_topic is None:
         return MapFrame(robot.map_frame)
     sensor_frame = None if robot.sensor_frame is None else frame_name(robot.sensor_frame)
     tree = sampled_tree(robot.depth_topic or robot.cloud_topic or "", group)
@@ -106,7 +107,8 @@ def _tf_pose_frame(robot: RobotConfig, sensor_frame: str | None, tree: FrameTree
     if robot.map_frame is None and len(above) == 1:
         known = ", ".join(tree.frames[:12]) or "none"
         raise InputError(
-            f"{group.paths}: TF has no frame above the sensor's frame '{sensor_frame}'; frames in TF: {known}"
+            f"{group.paths}: TF has no frame above the sensor's frame '{sensor_frame}'; frames in TF: {known}; give "
+            f"sensor_frame, pose_file ({odometry_remedy(robot.logs)}), or {STILL_REMEDY}"
         )
     odometry = [frame for frame in above[1:] if _ODOMETRY_FRAME.search(frame.rsplit("/", 1)[-1])]
     if odometry:

@@ -1,9 +1,10 @@
-"""Pose of a robot's sensor over time, from a pose topic or a trajectory file and TF, or from TF alone."""
+"""Pose of a robot's sensor over time, from a pose topic or a trajectory file and TF, from TF alone, or fixed."""
 
 from __future__ import annotations
 
 import heapq
 import math
+from collections import Counter
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Self, TypeAlias
@@ -22,6 +23,8 @@ from octoreplay.transforms import normalise, transform_of
 
 Link: TypeAlias = tuple[str, str]
 """Transform that TF must give: (target frame, source frame)."""
+
+_USED, _UNUSABLE, _UNDECODABLE = "used", "unusable", "undecodable"
 
 POSE_KINDS = (Kind.ODOMETRY, Kind.POSE, Kind.PATH, Kind.TF)
 """Kinds of messages that a pose topic can carry."""
@@ -46,13 +49,23 @@ def moving_tf_names(topics: Collection[TopicInfo]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(topic.name for topic in topics if not is_static_tf(topic)))
 
 
-def load_static_transforms(tree: FrameTree, logs: Sequence[LogReader], topics: Collection[TopicInfo]) -> None:
-    """Add every static transform of the logs to a tree, wherever in the files it is."""
+def load_static_transforms(
+    tree: FrameTree, logs: Sequence[LogReader], topics: Collection[TopicInfo]
+) -> dict[str, Counter[str]]:
+    """Add every static transform of the logs to a tree, wherever in the files it is.
+
+    Returns the numbers of messages by topic and outcome, as ``PoseSource.take`` gives it.
+    """
     static = {topic.name for topic in topics if is_static_tf(topic)}
+    outcomes: dict[str, Counter[str]] = {name: Counter() for name in sorted(static)}
     for log in logs:
         for message in log.messages(static):
-            with suppress(DamagedMessageError):
-                tree.add_transforms(_transforms(message), is_static=True)
+            try:
+                outcome = _USED if tree.add_transforms(_transforms(message), is_static=True) else _UNUSABLE
+            except DamagedMessageError:
+                outcome = _UNDECODABLE
+            outcomes[message.topic][outcome] += 1
+    return outcomes
 
 
 class PoseSource:
@@ -60,7 +73,8 @@ class PoseSource:
 
     A pose is the product T_map_origin T_origin_body T_body_sensor. The middle one comes from the pose topic or file,
     the others from TF unless they are the identity or configured. Where the pose topic is TF, the whole pose comes from
-    TF. The messages of ``topics`` must be passed to ``take`` in the order of the log.
+    TF. A configured ``pose`` holds at all times. The messages of ``topics`` must be passed to ``take`` in the order of
+    the log.
 
     T_map_origin is the correction of the poses. It is interpolated like every transform, but between two values that
     are more than ``pose_gap_ns`` apart the earlier one applies, before its first value the first, and after its last
@@ -89,11 +103,14 @@ class PoseSource:
         self._tf = tf_topics(infos, robot.sensor_topic)
         self._tree = FrameTree(pose_gap_ns)
         self._T_given = None if robot.T_body_sensor is None else transform_of(robot.T_body_sensor)
-        load_static_transforms(self._tree, logs, self._tf)
+        self.static_outcomes = load_static_transforms(self._tree, logs, self._tf)
+        """Numbers of messages of the static TF topics by topic and outcome."""
         kinds = {kind_of(topic.type_name) for topic in infos if topic.name == robot.pose_topic}
         self.trajectory: Trajectory | None = known.trajectory if known else self._whole_trajectory(Kind.PATH in kinds)
         """Poses from a file or a path, known from the beginning; else None."""
-        self._track = PoseTrack(pose_gap_ns) if self.trajectory is None and Kind.TF not in kinds else None
+        self._T_still = None if robot.pose is None else transform_of(robot.pose)
+        has_track = self.trajectory is None and self._T_still is None and Kind.TF not in kinds
+        self._track = PoseTrack(pose_gap_ns) if has_track else None
         self._whole: Link | None = None
         self._after: Link | None = None
         if Kind.TF in kinds:
@@ -119,15 +136,31 @@ class PoseSource:
         stamps += [self._tree.last_ns(*link) for link in self._moving_links]
         return all(stamp is not None and stamp >= stamp_ns for stamp in stamps)
 
-    def take(self, message: RawMessage) -> None:
-        """Take a message of one of the topics. Raises DamagedMessageError where it cannot be decoded."""
-        found = _transforms(message)
+    def take(self, message: RawMessage) -> str:
+        """Take a message of one of the topics and return its outcome.
+
+        It is 'used', 'undecodable', or 'unusable' where no pose in it is finite with a rotation. A message that is not
+        used leads to frames without a pose.
+        """
+        try:
+            found = _transforms(message)
+        except DamagedMessageError:
+            return _UNDECODABLE
         stamp = message.log_time_ns if self._use_log_time else None
         if kind_of(message.type_name) is Kind.TF:
-            self._tree.add_transforms(found, is_static=False, stamp_ns=stamp)
-        elif self._track is not None:
+            is_used = self._tree.add_transforms(found, is_static=False, stamp_ns=stamp)
+        else:
+            is_used = self._add_to_track(found, stamp)
+        return _USED if is_used else _UNUSABLE
+
+    def _add_to_track(self, found: Transforms, stamp_ns: int | None) -> bool:
+        """Add the poses of a message to the track, if there is one; return False if none was added."""
+        num_added = 0
+        if self._track is not None:
             for pose in found.transforms:
-                self._track.add(pose.stamp_ns if stamp is None else stamp, pose.translation, pose.rotation)
+                stamp = pose.stamp_ns if stamp_ns is None else stamp_ns
+                num_added += self._track.add(stamp, pose.translation, pose.rotation)
+        return num_added > 0
 
     def at(self, stamp_ns: int) -> Float64Array | None:
         """T_map_sensor at a stamp, (4, 4) float64; None where the poses around it are missing or too far apart."""
@@ -154,6 +187,17 @@ class PoseSource:
         with suppress(InputError):
             return self._tree.T_a_b(self._sensor_frame, frame, 0)
         return None
+
+    @property
+    def sensor_frame(self) -> str:
+        """Frame of the sensor, without the leading slash of ROS 1."""
+        return self._sensor_frame
+
+    @property
+    def body_frame(self) -> str:
+        """Highest frame that fixed transforms join to the sensor; the sensor's own frame without any."""
+        fixed = [f for f in self._tree.ancestors(self._sensor_frame) if self._tree.is_fixed(f, self._sensor_frame)]
+        return fixed[-1]
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop poses that no stamp from ``stamp_ns`` on needs."""
@@ -192,6 +236,8 @@ class PoseSource:
 
     def _pose_at(self, stamp_ns: int) -> Float64Array | None:
         """T_origin_body at a stamp, where the body is the sensor if the whole pose comes from TF."""
+        if self._T_still is not None:
+            return self._T_still
         if self.trajectory is not None:
             return self.trajectory.matrix_at(stamp_ns, self._pose_gap_ns)
         return self._link_at(self._whole, stamp_ns) if self._track is None else self._track.matrix_at(stamp_ns)
@@ -252,8 +298,8 @@ class PoseSource:
 
     def _links_of_poses(self) -> tuple[Link | None, Link | None]:
         """Links before and after the poses, by the first pose's parent and child frames."""
-        if self._robot.pose_file is not None:
-            # A file names no frames: it holds poses of the sensor, or of the body where T_body_sensor is given.
+        if self._robot.pose_topic is None:
+            # Configured poses name no frames: they are of the sensor, or of the body where T_body_sensor is given.
             return None, None
         topic = str(self._robot.pose_topic)
         # The first messages of a growing path are empty.
@@ -277,7 +323,9 @@ class PoseSource:
     def _whole_trajectory(self, is_path: bool) -> Trajectory | None:
         """Trajectory of a pose file or of the last Path message; None for another pose topic."""
         if self._robot.pose_file is not None:
-            return self._file_trajectory(read_rows(self._robot.pose_file))
+            return self._file_trajectory(
+                read_rows(self._robot.pose_file, self._robot.pose_format, self._robot.pose_origin)
+            )
         if not is_path:
             return None
         if self._use_log_time:

@@ -120,32 +120,39 @@ class FrameTree:
         stamp_ns: int | None,
         translation: Sequence[float],
         quaternion: Sequence[float],
-    ) -> None:
+    ) -> bool:
         """Add T_parent_child: fixed where ``stamp_ns`` is None, else the moving transform's value at that stamp.
 
-        A transform that is not finite or has a zero quaternion is ignored.
+        Returns False and adds nothing where the transform is not finite, has a zero quaternion, or gives a frame a
+        second parent.
         """
         parent, child = frame_name(parent), frame_name(child)
         known = self._parents.setdefault(child, parent)
         if known != parent:
             self._other_parents[child] = parent
-            return
+            return False
         if stamp_ns is None:
             rotation = normalise(quaternion)
-            if rotation is not None and all(math.isfinite(value) for value in translation):
-                self._fixed[child] = pose_matrix(translation, rotation)
-            return
+            if rotation is None or not all(math.isfinite(value) for value in translation):
+                return False
+            self._fixed[child] = pose_matrix(translation, rotation)
+            return True
         if child not in self._moving:
             self._moving[child] = PoseTrack(self._pose_gap_ns)
-        self._moving[child].add(stamp_ns, translation, quaternion)
+        return self._moving[child].add(stamp_ns, translation, quaternion)
 
-    def add_transforms(self, found: Transforms, *, is_static: bool, stamp_ns: int | None = None) -> None:
-        """Add the transforms of a message at their own stamps, or all at ``stamp_ns``."""
+    def add_transforms(self, found: Transforms, *, is_static: bool, stamp_ns: int | None = None) -> bool:
+        """Add the transforms of a message at their own stamps, or all at ``stamp_ns``.
+
+        Returns False where none was added.
+        """
+        num_added = 0
         for entry in found.transforms:
-            stamp = entry.stamp_ns if stamp_ns is None else stamp_ns
-            self.add(entry.parent, entry.child, None if is_static else stamp, entry.translation, entry.rotation)
+            stamp = None if is_static else entry.stamp_ns if stamp_ns is None else stamp_ns
+            num_added += self.add(entry.parent, entry.child, stamp, entry.translation, entry.rotation)
             if found.holds:
                 self._holding.add(frame_name(entry.child))
+        return num_added > 0
 
     @property
     def frames(self) -> tuple[str, ...]:

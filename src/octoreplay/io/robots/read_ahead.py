@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.records import Frame
 
 NUM_AHEAD = 4
@@ -24,7 +25,7 @@ class ReadAhead:
     ``team_start_ns`` is that of ``RobotLog.frames``. Errors of the thread are raised by the iterator of ``frames``.
     """
 
-    def __init__(self, log: RobotLog, team_start_ns: int | None = None) -> None:
+    def __init__(self, log: RobotLog | SensorLogs, team_start_ns: int | None = None) -> None:
         self._log = log
         self._team_start_ns = team_start_ns
         self._queue: Queue[Frame | Exception | None] = Queue(NUM_AHEAD)

@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRobot
+from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
 from octoreplay.errors import InputError
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, first_whole_message
@@ -21,8 +22,11 @@ from octoreplay.io.containers.logs import open_log
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Kind, kind_of
 from octoreplay.io.robots.body_box import body_box_at
+from octoreplay.io.robots.frame_counts import LeadingFrames, count_topics
 from octoreplay.io.robots.frame_maker import CloudFrameMaker, DepthFrameMaker, FrameMaker
 from octoreplay.io.robots.frame_queue import Fate, FrameQueue, Settled
+from octoreplay.io.robots.label_counts import check_labels
+from octoreplay.io.robots.late_poses import PoseLookAhead, UnposedFrames
 from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.stamp_check import StampCheck
 from octoreplay.io.robots.thinning import Thinning
@@ -49,8 +53,10 @@ class RobotLog:
     - Poses: they are in the team's frame. A sensor that is further than ``reach`` [m] from the team's origin along an
       axis has no pose.
     - Open ``logs`` of the robot are used as they are and stay open.
+    - ``depth_maker`` and ``cloud_maker`` make the decoder of the sensor's messages.
 
-    Raises InputError where a log cannot be opened or has no intrinsics, frames or poses.
+    Raises InputError where a log cannot be opened or has no intrinsics, frames or poses, and where the class table has
+    none of the labels (``check_labels``).
     """
 
     def __init__(
@@ -61,12 +67,15 @@ class RobotLog:
         *,
         reach: float = math.inf,
         logs: Sequence[LogReader] | None = None,
+        depth_maker: Callable[[RobotConfig, LabelLookup | None, RawMessage | None], FrameMaker] = DepthFrameMaker,
+        cloud_maker: Callable[[RobotConfig, LabelLookup | None], FrameMaker] = CloudFrameMaker,
     ) -> None:
         self.robot = robot
         self.counts = FrameCounts()
         self._time = time
         self._reach = reach
         self._num_out_of_reach = 0
+        self._depth_maker, self._cloud_maker = depth_maker, cloud_maker
         self._use_log_time = time.clock == "log"
         self._offset_ns = robot.clock_offset_ns
         self._stamp_check = StampCheck(self._offset_ns)
@@ -88,6 +97,8 @@ class RobotLog:
             self.first_stamp_ns = self._first_stamp(first)
             """First stamp of the sensor, clock offset applied."""
             self._maker = self._frame_maker()
+            if self._labels is not None and class_table is not None:
+                check_labels(robot, self._logs, class_table)
             # Fails before the run where the log can give no pose.
             self.pose_source()
             self._closing = stack.pop_all()
@@ -119,30 +130,34 @@ class RobotLog:
         counted. The logs are read from their beginning where the delay between stamps and log times changes by more
         than 10 s, where the poses have no correction within 10 s before the start, and with Foxglove's transforms,
         which hold from their first message on. Reading ends when ``is_wanted``, which is called for every message,
-        returns false. Every call starts with new counts. Raises InputError for an encoding without depth or labels, for
-        images of different sizes, and for frames that TF does not join.
+        returns false. Every call starts with new counts; their sums agree after the last frame. Raises InputError for
+        an encoding without depth or labels, for images of different sizes, and for frames that TF does not join.
         """
-        self.counts = FrameCounts(truncated_files=self._damage())
+        self.counts = FrameCounts(sensor_topic=self.sensor_topic, truncated_files=self._damage())
         if self._labels is not None:
             self._labels.unknown = self.counts.unknown_label_pixels
             self._labels.unknown_colors = self.counts.unknown_colors
         start_ns = self.first_stamp_ns if team_start_ns is None else team_start_ns
         self._stamp_check, self._num_out_of_reach = StampCheck(self._offset_ns), 0
+        self._leading = LeadingFrames()
         thinning = Thinning(self._time, start_ns - self._offset_ns)
         poses = self.pose_source()
+        count_topics(self.counts, self.robot, self._logs, self._maker.partner_topics, poses)
         log_start_ns = self._log_start_ns(thinning.needed_from_ns, poses)
         if log_start_ns is not None:
             self._check_first_stamps()
         for settled in self._settled(poses, thinning, log_start_ns, is_wanted):
-            if thinning.keeps(settled.stamp_ns):
-                yield from self._frame(settled, poses)
+            made = self._make(settled, poses) if thinning.keeps(settled.stamp_ns) else "not_selected"
+            self._count(settled, made if isinstance(made, str) else "used")
+            if not isinstance(made, str):
+                yield made
         # Reading may have found more damage than opening.
         self.counts.truncated_files = self._damage()
         if self.counts.used == 0 and self.counts.no_pose > 0:
             if log_start_ns is not None:
                 # Transforms in the part that was not read may connect the frames.
                 for message in self.messages(poses.topics, None, log_start_ns):
-                    self._add_pose(message, poses)
+                    poses.take(message)
             poses.check_connected()
             self._check_within_reach()
 
@@ -164,7 +179,7 @@ class RobotLog:
         Messages that no pose from the stamp ``needed_from_ns`` (without the clock offset) on needs may be left out.
         """
         for message in self.messages(poses.topics, self._log_start_ns(needed_from_ns, poses)):
-            self._add_pose(message, poses)
+            poses.take(message)
             yield message
 
     def _settled(
@@ -172,12 +187,19 @@ class RobotLog:
     ) -> Iterator[Settled[RawMessage]]:
         """Sensor messages in stamp order, with their partners and poses."""
         partner_topics = self._maker.partner_topics
+        look_ahead = PoseLookAhead(
+            poses,
+            lambda log_time_ns: self.messages(poses.topics, log_start_ns if log_time_ns is None else log_time_ns),
+            lambda message: self._take_pose(message, poses),
+        )
+        self._unposed = UnposedFrames(round(self._time.pose_gap * 1e9))
         queue: FrameQueue[RawMessage] = FrameQueue(
             poses,
             reorder_window_ns=round(self._time.reorder_window * 1e9),
             pair_tolerance_ns=round(self._time.pair_tolerance * 1e9),
             pose_gap_ns=round(self._time.pose_gap * 1e9),
             num_partners=len(partner_topics),
+            find_pose=look_ahead.find,
         )
         topics = {self.sensor_topic, *poses.topics, *partner_topics}
         for number, message in enumerate(self._until_sensor_ends(self.messages(topics, log_start_ns))):
@@ -185,7 +207,11 @@ class RobotLog:
                 return
             if self._is_over(thinning, queue.newest_ns, message.log_time_ns):
                 break
-            self._take(message, queue, poses, partner_topics)
+            look_ahead.log_time_ns = message.log_time_ns
+            if message.topic not in poses.topics:
+                self._take(message, queue, partner_topics)
+            elif look_ahead.is_new(message):
+                self._take_pose(message, poses)
             while (ready := queue.pop(final=False)) is not None:
                 yield ready
             if number % _FORGET_EVERY == 0:
@@ -193,6 +219,11 @@ class RobotLog:
                 poses.forget_before(queue.needed_from_ns(self.first_stamp_ns - self._offset_ns))
         while (ready := queue.pop(final=True)) is not None:
             yield ready
+        for kind, topic in enumerate(partner_topics):
+            if topic not in partner_topics[:kind]:
+                num_unpaired, num_repeated = queue.unused_partners(kind)
+                self.counts.settle(topic, "unpaired", count=num_unpaired)
+                self.counts.settle(topic, "duplicate", count=num_repeated)
 
     def _until_sensor_ends(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
         """Messages up to ``_LOG_DELAY_NS`` after the last one of the sensor."""
@@ -305,15 +336,15 @@ class RobotLog:
     def _frame_maker(self) -> FrameMaker:
         """Decoder of the sensor's messages."""
         if self.robot.depth_topic is None:
-            return CloudFrameMaker(self.robot, self._labels)
+            return self._cloud_maker(self.robot, self._labels)
         if self.robot.intrinsics is not None:
-            return DepthFrameMaker(self.robot, self._labels, None)
+            return self._depth_maker(self.robot, self._labels, None)
         topic = self.robot.camera_info_topic
         message = None if topic is None else self._first_of(topic, (Kind.CAMERA_INFO,))
         if message is None:
             missing = f"topic '{topic}' holds no CameraInfo" if topic else "there is no CameraInfo topic"
             raise InputError(f"{self._name}: {missing} for '{self.sensor_topic}'; give intrinsics: [fx, fy, cx, cy]")
-        return DepthFrameMaker(self.robot, self._labels, message)
+        return self._depth_maker(self.robot, self._labels, message)
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
@@ -322,23 +353,27 @@ class RobotLog:
         streams = (log.messages(topics, start_ns, stop_ns) for log in self._logs)
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
-    @staticmethod
-    def _add_pose(message: RawMessage, poses: PoseSource) -> None:
-        """Pass a message to the poses; a damaged one leads to frames that are counted as without a pose."""
-        with contextlib.suppress(DamagedMessageError):
-            poses.take(message)
+    def _take_pose(self, message: RawMessage, poses: PoseSource) -> None:
+        """Pass a message to the poses, and note one that comes after a frame that needed it."""
+        self.counts.settle(message.topic, "read")
+        outcome = poses.take(message)
+        self.counts.settle(message.topic, outcome, None if outcome == "used" else message.log_time_ns)
+        is_noted = self._use_log_time or "late_pose" in self.counts.first_missing
+        if outcome == "used" and not is_noted and self._unposed.has_frame_of(message):
+            self.counts.first_missing["late_pose"] = self._described(message, message.header_stamp_ns())
 
-    def _take(
-        self, message: RawMessage, queue: FrameQueue[RawMessage], poses: PoseSource, partner_topics: tuple[str, ...]
-    ) -> None:
-        """Pass a message to the poses or to the queue, or count it as unused."""
-        if message.topic in poses.topics:
-            self._add_pose(message, poses)
-            return
+    def _described(self, message: RawMessage, stamp_ns: int) -> str:
+        """File, topic and stamp of a message, on the team's clock."""
+        return f"{message.log}: topic '{message.topic}' with the stamp {(stamp_ns + self._offset_ns) / 1e9:.3f} s"
+
+    def _take(self, message: RawMessage, queue: FrameQueue[RawMessage], partner_topics: tuple[str, ...]) -> None:
+        """Pass a message of the sensor or a partner to the queue, or count it as unused."""
+        self.counts.settle(message.topic, "read")
         try:
             stamp = self._stamp_of(message, self._stamp_check)
         except DamagedMessageError:
             self.counts.undecodable += message.topic == self.sensor_topic
+            self.counts.settle(message.topic, "undecodable", message.log_time_ns)
             return
         for kind in (kind for kind, topic in enumerate(partner_topics) if topic == message.topic):
             queue.add_partner(kind, stamp, message)
@@ -346,48 +381,56 @@ class RobotLog:
             return
         newest_ns = queue.newest_ns
         fate = queue.add_sensor(stamp, message)
+        if fate is not Fate.WAITS:
+            self.counts.settle(message.topic, fate.name.lower(), stamp + self._offset_ns)
         if fate is Fate.LATE:
             self.counts.late += 1
             back = ((newest_ns or stamp) - stamp) / 1e9
             self.counts.first_missing.setdefault(
-                "late", f"{message.where}: {back:.3f} s before the newest stamp so far"
+                "late", f"{self._described(message, stamp)}: {back:.3f} s before the newest stamp so far"
             )
         elif fate is Fate.DUPLICATE:
             self.counts.duplicate += 1
 
-    def _frame(self, settled: Settled[RawMessage], poses: PoseSource) -> Iterator[Frame]:
-        """The frame of a settled sensor message; nothing where a part is missing, which is counted."""
+    def _make(self, settled: Settled[RawMessage], poses: PoseSource) -> Frame | str:
+        """The frame of a settled sensor message, or the name of the part that is missing."""
         if None in settled.partners:
-            self._count_missing("no_label", settled)
-            return
+            return "no_label"
         if settled.T_map_sensor is None:
-            self._count_missing("no_pose", settled)
-            return
+            return "no_pose"
         T_team_sensor = self.T_team_map @ settled.T_map_sensor
         boxes = self._own_boxes(poses, settled.stamp_ns, T_team_sensor)
         if boxes is None:
-            self._count_missing("no_pose", settled)
-            return
+            return "no_pose"
         if not (np.abs(T_team_sensor[:3, 3]) <= self._reach).all():
             # A single pose may be wrong, so the frame alone is skipped.
             self._num_out_of_reach += 1
-            self._count_missing("no_pose", settled)
-            return
+            return "no_pose"
         try:
             frame = self._maker.make(settled, settled.stamp_ns + self._offset_ns, T_team_sensor, boxes)
         except DamagedMessageError:
-            self.counts.undecodable += 1
-            return
-        if frame is None:
-            self._count_missing("no_label", settled)
-            return
-        self.counts.used += 1
-        yield frame
+            return "undecodable"
+        return "no_label" if frame is None else frame
 
-    def _count_missing(self, cause: str, settled: Settled[RawMessage]) -> None:
-        """Count an unused sensor message by cause, and remember the first of each cause."""
-        setattr(self.counts, cause, getattr(self.counts, cause) + 1)
-        self.counts.first_missing.setdefault(cause, settled.message.where)
+    def _count(self, settled: Settled[RawMessage], outcome: str) -> None:
+        """Count a settled sensor message and its partners by outcome, and remember the first of each cause."""
+        counts, stamp_ns = self.counts, settled.stamp_ns + self._offset_ns
+        if outcome == "used":
+            counts.use(stamp_ns)
+            counts.settle(self.sensor_topic, outcome)
+        else:
+            has_stamp = outcome != "undecodable"
+            counts.settle(self.sensor_topic, outcome, stamp_ns if has_stamp else settled.message.log_time_ns)
+        if outcome in ("no_label", "no_pose", "undecodable"):
+            setattr(counts, outcome, getattr(counts, outcome) + 1)
+        if outcome in ("no_label", "no_pose"):
+            counts.first_missing.setdefault(outcome, self._described(settled.message, settled.stamp_ns))
+        if outcome == "no_pose":
+            self._unposed.add(settled.stamp_ns)
+        self._leading.note(counts, outcome, stamp_ns)
+        partners = {partner.topic: partner for partner in reversed(settled.partners) if partner is not None}
+        for topic in partners:
+            counts.settle(topic, "used" if outcome == "used" else "unmapped")
 
     def _own_boxes(self, poses: PoseSource, stamp_ns: int, T_team_sensor: Float64Array) -> tuple[BodyBox, ...] | None:
         """The robot's own box at a stamp, empty without one; None where TF does not give it."""

@@ -18,6 +18,7 @@ from octoreplay.io.messages.sensor_messages import Kind, PositionFix, StampedTra
 from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.poses import frame_name
 from octoreplay.io.robots.robot_log import RobotLog
+from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.io.robots.thinning import Thinning
 from octoreplay.records import Float64Array
 from octoreplay.transforms import normalise, pose_matrix
@@ -66,7 +67,7 @@ class Sightings:
 _NO_FIXES = Fixes(np.empty(0), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 3)))
 
 
-def read_sightings(log: RobotLog, time: TimeConfig) -> Sightings:
+def read_sightings(log: RobotLog | SensorLogs, time: TimeConfig) -> Sightings:
     """Return the position fixes and the tags in the replayed part of a robot's logs.
 
     Fixes come from ``fix_topic``. Tags come from ``tags_topic``; without one from all moving transforms, as children
@@ -100,7 +101,7 @@ def read_sightings(log: RobotLog, time: TimeConfig) -> Sightings:
 
 
 def _decoded(
-    log: RobotLog, time: TimeConfig, poses: PoseSource
+    log: RobotLog | SensorLogs, time: TimeConfig, poses: PoseSource
 ) -> tuple[list[PositionFix], list[StampedTransform], Counter[str]]:
     """Fixes and detections in the span of ``time``, and the number of messages that cannot be decoded, by topic."""
     robot, fixes, tags, undecoded = log.robot, [], [], Counter[str]()
@@ -138,7 +139,7 @@ def _tags_of_tf(found: Transforms) -> list[StampedTransform]:
     return [replace(tf, child=match["tag"] or match["id"]) for tf, match in matches if match is not None]
 
 
-def _poses_at(log: RobotLog, poses: PoseSource, stamps: Sequence[int]) -> dict[int, Float64Array]:
+def _poses_at(log: RobotLog | SensorLogs, poses: PoseSource, stamps: Sequence[int]) -> dict[int, Float64Array]:
     """T_map_sensor (4, 4) at those of some ascending stamps that have a pose."""
     if not stamps:
         return {}

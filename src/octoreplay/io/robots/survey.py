@@ -9,9 +9,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.log_reader import LogReader, TopicInfo, first_whole_message
 from octoreplay.io.containers.logs import open_log
+from octoreplay.io.messages import velodyne
 from octoreplay.io.messages.decoders import ENCODINGS
 from octoreplay.io.messages.sensor_messages import (
     Cloud,
@@ -25,11 +26,20 @@ from octoreplay.io.messages.sensor_messages import (
 from octoreplay.io.robots.pose_source import POSE_KINDS
 from octoreplay.io.robots.poses import FrameTree, frame_name
 from octoreplay.io.sensors.clouds import label_field
-from octoreplay.io.sensors.images import COLOR_ENCODINGS, DEPTH_ENCODINGS, LABEL_ENCODINGS, encoding_and_size
+from octoreplay.io.sensors.images import (
+    COLOR_ENCODINGS,
+    COLOR_IMAGE_ENCODINGS,
+    DEPTH_ENCODINGS,
+    LABEL_ENCODINGS,
+    encoding_and_size,
+)
 
 IMAGES = (Kind.IMAGE, Kind.COMPRESSED_IMAGE)
 CLOUDS = (Kind.CLOUD, Kind.SCAN)
 SENSORS = (*IMAGES, *CLOUDS)
+
+PACKETS = "packets"
+"""Encoding of the sample of a cloud that is recorded as packets of the lidar."""
 
 _DEPTH_HINTS = ("depth", "range", "disparity_z")
 _LABEL_HINTS = ("label", "semantic", "segment", "class")
@@ -40,8 +50,8 @@ _CONFIDENCE_HINTS = ("confidence", "probability", "uncertainty")
 class TopicSample:
     """Properties of the first message of an image, cloud or scan topic.
 
-    ``encoding`` is '' except for images, ``fields`` is empty except for clouds; ``size`` is (width, height) in pixels
-    or points.
+    ``encoding`` is that of an image, PACKETS for a cloud that is recorded as packets, and otherwise ''; ``fields`` is
+    empty except for clouds; ``size`` is (width, height) in pixels or points.
     """
 
     topic: str
@@ -79,6 +89,11 @@ class TopicSample:
         return self.encoding in COLOR_ENCODINGS or self.encoding == "jpeg rgb8"
 
     @property
+    def has_colors(self) -> bool:
+        """True for an image of three colours, recorded as such or as the pattern of its sensor."""
+        return self.encoding in COLOR_IMAGE_ENCODINGS and not self.encoding.endswith(("mono8", "8UC1"))
+
+    @property
     def is_confidence(self) -> bool:
         """True for an image of label confidences: the topic's name holds hints of both."""
         has_both = self._subject is _CONFIDENCE_HINTS and self._end_of(_LABEL_HINTS) >= 0
@@ -105,8 +120,9 @@ class TopicSample:
 class Survey:
     """Topics of one open log, and samples of its sensor topics by name.
 
-    ``owners`` maps topics to robots where the log holds several robots; it is empty where it holds one.
-    ``frame_trees`` caches TF for the robots that share the log.
+    ``unreadable`` has the first cause for each sensor topic of which no message can be decoded, a ConfigError where a
+    package is missing. ``owners`` maps topics to robots where the log holds several robots; it is empty where it holds
+    one. ``frame_trees`` caches TF for the robots that share the log.
     """
 
     log: LogReader
@@ -117,6 +133,7 @@ class Survey:
     samples: Mapping[str, TopicSample]
     owners: Mapping[str, str]
     damage: str | None
+    unreadable: Mapping[str, InputError | ConfigError] = field(default_factory=dict)
     frame_trees: dict[Hashable, FrameTree] = field(default_factory=dict)
 
     @property
@@ -129,6 +146,10 @@ class Survey:
         """Robots that share the log, in the order of their sensor topics; empty where it holds one."""
         sensors = (topic for topic, sample in self.samples.items() if sample.is_sensor)
         return tuple(dict.fromkeys(self.owners[topic] for topic in sensors if topic in self.owners))
+
+
+_RESULT_TYPE = "octoreplay_msgs/msg/TickMetrics"
+"""Type of messages that every result has, and no log."""
 
 
 class LogSurveys:
@@ -147,22 +168,36 @@ class LogSurveys:
         self._closing.close()
 
     def of(self, path: Path) -> Survey:
-        """Return the survey of a log, opened at the first call. Raises InputError where it cannot be opened."""
+        """Return the survey of a log, opened at the first call.
+
+        Raises InputError where it cannot be opened, and for a result.
+        """
         if path not in self._surveys:
-            self._surveys[path] = survey_log(self._closing.enter_context(open_log(path)))
+            log = self._closing.enter_context(open_log(path))
+            if any(topic.type_name == _RESULT_TYPE for topic in log.topics):
+                raise InputError(
+                    f"{path}: is a result of octoreplay, not a log; give its logs, or repeat its run with"
+                    f" 'octoreplay run --config-from {path}'"
+                )
+            self._surveys[path] = survey_log(log)
         return self._surveys[path]
 
 
 def survey_log(log: LogReader) -> Survey:
     """Return the survey of an open log; the first message of each image, cloud and scan topic is decoded."""
-    samples = {}
+    samples: dict[str, TopicSample] = {}
+    unreadable: dict[str, InputError | ConfigError] = {}
     for topic in log.topics:
         if kind_of(topic.type_name) in SENSORS and topic.encoding in ENCODINGS and topic.num_messages:
-            sample = _sample(log, topic)
+            try:
+                sample = _sample(log, topic)
+            except (InputError, ConfigError) as error:
+                unreadable.setdefault(topic.name, error)
+                continue
             if sample is not None:
                 samples[topic.name] = sample
     owners = _owners_by_name(log.topics, samples) or _owners_by_frame(log, samples)
-    return Survey(log, log.start_ns, log.end_ns, log.message_count, log.topics, samples, owners, log.damage)
+    return Survey(log, log.start_ns, log.end_ns, log.message_count, log.topics, samples, owners, log.damage, unreadable)
 
 
 def first_part(topic: str) -> str:
@@ -171,23 +206,21 @@ def first_part(topic: str) -> str:
 
 
 def _sample(log: LogReader, topic: TopicInfo) -> TopicSample | None:
-    """Sample of a topic's first message; None where it cannot be decoded."""
+    """Sample of a topic's first message; None without one of a sensor. Raises the errors of ``sensor_message``."""
     message = first_whole_message(log, topic.name, SENSORS)
     kind = None if message is None else kind_of(message.type_name)
     if message is None or kind not in SENSORS:
         return None
-    try:
-        found = message.sensor_message()
-        if isinstance(found, Image | CompressedImage):
-            encoding, size = encoding_and_size(found, message.where)
-            detail = f"{encoding} {size[0]}x{size[1]}"
-            return TopicSample(topic.name, kind, encoding, size, frame_name(found.frame_id), (), detail)
-    except InputError:
-        return None
+    found = message.sensor_message()
+    if isinstance(found, Image | CompressedImage):
+        encoding, size = encoding_and_size(found, message.where)
+        detail = f"{encoding} {size[0]}x{size[1]}"
+        return TopicSample(topic.name, kind, encoding, size, frame_name(found.frame_id), (), detail)
     if isinstance(found, Cloud):
         names = [field.name for field in found.fields]
         size, detail = (found.width, found.height), f"{found.width}x{found.height}: {', '.join(names)}"
-        return TopicSample(topic.name, kind, "", size, frame_name(found.frame_id), tuple(names), detail)
+        encoding = PACKETS if message.type_name == velodyne.TYPE else ""
+        return TopicSample(topic.name, kind, encoding, size, frame_name(found.frame_id), tuple(names), detail)
     if isinstance(found, Scan):
         size = (found.ranges.size, 1)
         return TopicSample(topic.name, kind, "", size, frame_name(found.frame_id), (), f"{size[0]} ranges")
@@ -198,7 +231,7 @@ def _owners_by_name(topics: tuple[TopicInfo, ...], samples: Mapping[str, TopicSa
     """Robot of each topic by the first part of its name, where two or more such parts have a sensor and a pose."""
     found = []
     for name in dict.fromkeys(first_part(topic) for topic, sample in samples.items() if sample.is_sensor):
-        own = [topic for topic in topics if first_part(topic.name) == name and topic.name.count("/") > 1]
+        own = [topic for topic in topics if first_part(topic.name) == name and "/" in topic.name.strip("/")]
         has_pose = any(kind_of(topic.type_name) in POSE_KINDS for topic in own)
         # TF gives the pose of a sensor whose frame has the same first part.
         frames = [sample.frame_id for topic, sample in samples.items() if first_part(topic) == name]

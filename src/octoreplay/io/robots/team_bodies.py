@@ -23,8 +23,9 @@ class BodyTrack:
     """Box of one robot over time, with its own reader of the log's poses; a context manager."""
 
     def __init__(self, robot: ResolvedRobot, time: TimeConfig) -> None:
-        self._robot = robot
-        self._log = RobotLog(robot, time, None)
+        # Every sensor of a robot gives the same poses of its body.
+        self._robot = robot.views[0]
+        self._log = RobotLog(self._robot, time, None)
         self._poses = self._log.pose_source()
         self._messages: Iterator[RawMessage] | None = None
         self._pose_gap_ns = round(time.pose_gap * 1e9)

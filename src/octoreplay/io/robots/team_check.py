@@ -29,9 +29,10 @@ def team_member(robot: RobotConfig, group: LogGroup, *, use_log_time: bool = Fal
 
     Raises InputError for poses from TF where the sensor's frame is unknown or has no parent.
     """
-    has_poses = robot.pose_file is not None or robot.pose_topic is not None
-    frame = find_map_frame(robot, group) if has_poses else None
-    return TeamMember(robot, frame, clock_of(robot, group, use_log_time=use_log_time))
+    # The map frame and the clock are the same for all sensors of a robot.
+    first = robot.views[0]
+    frame = find_map_frame(first, group) if robot.has_poses else None
+    return TeamMember(robot, frame, clock_of(first, group, use_log_time=use_log_time))
 
 
 def check_team(
@@ -59,9 +60,10 @@ def team_frame_origins(members: Sequence[TeamMember]) -> dict[str, str]:
 def _shared_messages(robots: Sequence[RobotConfig]) -> Iterator[str]:
     """Sentences on robots that map the same messages."""
     owners: dict[tuple[Path, str], str] = {}
-    for robot in robots:
-        topic = robot.depth_topic or robot.cloud_topic
-        for key in ((path.resolve(), topic) for path in robot.logs if topic):
-            other = owners.setdefault(key, robot.robot_id)
-            if other != robot.robot_id:
-                yield f"{other} and {robot.robot_id} map the same messages of {key[0]}, which count twice"
+    for view in (view for robot in robots for view in robot.views):
+        topic = view.depth_topic or view.cloud_topic
+        for key in ((path.resolve(), topic) for path in view.logs if topic):
+            other = owners.setdefault(key, view.robot_id)
+            if other != view.robot_id:
+                pair = f"{other} and {view.robot_id}"
+                yield f"{pair} map the same messages of {key[0]}, which count twice; leave one of them out"

@@ -112,8 +112,8 @@ def _different_epochs(clocks: Mapping[str, RobotClock]) -> str | None:
         return None
     return (
         f"the clocks of the robots have different epochs: the stamps of {_spans(dated, clocks)} are dates, those of "
-        f"{_spans(others, clocks)} are times since some start; give clock_offset, or use clock: log if the logs were "
-        f"recorded at the same time"
+        f"{_spans(others, clocks)} are times since some start; give clock_offset in the team file, or "
+        f"use --clock log if the logs were recorded at the same time"
     )
 
 
@@ -132,7 +132,10 @@ def _no_common_time(clocks: Mapping[str, RobotClock]) -> str | None:
     if len(groups) == 1:
         return None
     parts = [_spans(group, clocks) for group in groups]
-    return f"the logs share no time: {'; '.join(parts)}; if they were recorded at the same time, give clock_offset"
+    return (
+        f"the logs share no time: {'; '.join(parts)}; if they were recorded at the same time, give clock_offset in the"
+        " team file"
+    )
 
 
 def _different_delays(clocks: Mapping[str, RobotClock]) -> str | None:
@@ -150,7 +153,7 @@ def _different_delays(clocks: Mapping[str, RobotClock]) -> str | None:
         return None
     return (
         f"the clocks of the robots differ: the stamps of {_listed(parts)} differ from the times of recording, those of "
-        f"{_listed(live)} do not; give clock_offset, or use clock: log"
+        f"{_listed(live)} do not; give clock_offset in the team file, or use --clock log"
     )
 
 
@@ -173,7 +176,7 @@ def _shifted_spans(clocks: Mapping[str, RobotClock]) -> str | None:
         parts.append(f"the log of {robot_id} begins {first:.1f} s and ends {last:.1f} s {side} that of {reference}")
     return (
         f"the clocks of the robots may differ: {_listed(parts)}; if they were recorded at the same time, give "
-        f"clock_offset"
+        f"clock_offset in the team file"
     )
 
 

@@ -1,19 +1,31 @@
-"""Trajectories, and trajectory files in evo's formats (TUM, KITTI).
-
-Formats: https://github.com/MichaelGrupp/evo/wiki/Formats
-"""
+"""Trajectories and trajectory files; ``trajectory_columns`` describes the formats."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from octoreplay.errors import InputError
-from octoreplay.io.text_tables import floats, rows, seconds_to_ns
+from octoreplay.geodesy import enu_points
+from octoreplay.io.robots.trajectory_columns import (
+    MATRIX_FORMATS,
+    columns_of,
+    matrices_of,
+    read_table,
+    time_to_ns,
+)
+from octoreplay.io.text_tables import floats, rows
 from octoreplay.records import Float64Array, Int64Array
 from octoreplay.transforms import Pose, interpolate, normalise, pose_matrix, rotation_to_quaternion
+
+LARGEST_POSITION = 100_000.0
+"""Largest coordinate of a trajectory [m]. Projected coordinates (UTM) are larger, and no map covers as much."""
+
+_MOVING, _NO_TURN = 1.0, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +58,13 @@ class Trajectory:
 class TrajectoryRows:
     """Rows of a trajectory file: poses as in Trajectory, ``stamps_ns`` None where the format has no times.
 
-    Rows that are not finite (lost tracking) or have a zero quaternion are NaN.
+    Rows that are not finite (lost tracking) or have a zero quaternion are NaN. ``name`` is the format.
     """
 
     stamps_ns: Int64Array | None
     positions: Float64Array
     rotations: Float64Array
+    name: str = ""
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -70,39 +83,111 @@ def trajectory(stamps_ns: Int64Array, poses: TrajectoryRows) -> Trajectory:
     return Trajectory(stamps, poses.positions[used], poses.rotations[used])
 
 
-def read_rows(path: Path) -> TrajectoryRows:
-    """Return the poses of a trajectory file: TUM (time x y z qx qy qz qw) or KITTI (3x4 matrix by rows, 12 numbers).
+def read_rows(path: Path, pose_format: str | None = None, origin: Sequence[float] | None = None) -> TrajectoryRows:
+    """Return the poses of a trajectory file.
+
+    Formats (``POSE_FORMATS``; found by the header and the number of columns where None is given): TUM, EuRoC, KITTI,
+    4x4 matrices by rows or stacked, Redwood's logs, latitude and longitude, TartanAir (in NED axes, which become x
+    forward, y left, z up). ``origin`` is subtracted from the positions [m]; for latitude, longitude and height it is
+    the point whose east, north and up axes the positions are given in.
 
     Blanks or commas separate the numbers; # begins a comment. Raises InputError with the line where the file is empty,
-    a row has another number of columns, or a matrix is not a rigid transform.
+    a row has another number of columns, a matrix is not a rigid transform, or the layout is not certain; without
+    ``pose_format`` also for a moving track with identity rotations, and for positions above LARGEST_POSITION.
     """
-    table = list(rows(path))
-    if not table:
-        raise InputError(f"{path}: holds no poses")
-    width = len(table[0][1])
-    odd = next(((where, len(fields)) for where, fields in table if len(fields) != width or width not in (8, 12)), None)
-    if odd is not None:
+    found, is_geodetic = _read(path, pose_format)
+    if pose_format is None and found.stamps_ns is not None:
+        _check_turning(path, found)
+    return _in_axes(path, found, origin) if is_geodetic else _near_origin(path, found, origin)
+
+
+def proposed_origin(path: Path, pose_format: str | None = None) -> tuple[float, float, float]:
+    """Return an origin for the coordinates of a trajectory file: whole kilometres at its begin, and a whole height [m].
+
+    Raises InputError as ``read_rows`` does, and for a file without a usable pose.
+    """
+    positions = _read(path, pose_format)[0].positions
+    used = positions[np.isfinite(positions).all(axis=1)]
+    if not len(used):
+        raise InputError(f"{path}: holds no usable pose")
+    x, y, z = used[0].tolist()
+    return round(x, -3), round(y, -3), float(round(z))
+
+
+def _read(path: Path, pose_format: str | None) -> tuple[TrajectoryRows, bool]:
+    """The poses of a file in its own coordinates; True where these are latitudes and longitudes."""
+    table, names = read_table(path)
+    matrices = None if names else matrices_of(path, table, pose_format)
+    if matrices is not None:
+        poses = [_pose_of_matrix(where, numbers) for where, numbers in matrices[1]]
+        return TrajectoryRows(None, *_arrays(poses), matrices[0]), False
+    if pose_format in MATRIX_FORMATS:
+        raise InputError(f"{table[0][0]}: is not the begin of a matrix, which pose_format {pose_format} expects")
+    columns = columns_of(path, table, names, pose_format)
+    time = columns.time
+    stamps = None if time is None else np.array([time_to_ns(w, words[time]) for w, words in table], dtype=np.int64)
+    chosen = (*columns.position, *columns.quaternion)
+    positions, rotations = _arrays([_pose(floats(where, [words[k] for k in chosen])) for where, words in table])
+    if pose_format == "tartanair":
+        positions, rotations = positions * (1.0, -1.0, -1.0), rotations * (1.0, -1.0, -1.0, 1.0)
+    return TrajectoryRows(stamps, positions, rotations, columns.name), columns.is_geodetic
+
+
+def _check_turning(path: Path, found: TrajectoryRows) -> None:
+    """Raise InputError for a track that moves with identity rotations, which positions without rotations have."""
+    used = ~np.isnan(found.rotations[:, 0])
+    way = np.ptp(found.positions[used], axis=0).max() if used.any() else 0.0
+    if way > _MOVING and (np.abs(found.rotations[used, :3]) < _NO_TURN).all():
         raise InputError(
-            f"{odd[0]}: expects 8 numbers in every row (TUM: time x y z qx qy qz qw), or 12 (KITTI: the rows of a 3x4 "
-            f"matrix), got {odd[1]}"
+            f"{path}: the rotation of all {np.count_nonzero(used):,} poses is the identity along {way:.1f} m, as in "
+            "files with positions only; give a trajectory with rotations, or name pose_format if they are true"
         )
-    if width == 12:
-        poses = [_pose_of_matrix(where, floats(where, fields)) for where, fields in table]
-        return TrajectoryRows(None, *_arrays(poses))
-    stamps = np.array([seconds_to_ns(where, fields[0]) for where, fields in table], dtype=np.int64)
-    return TrajectoryRows(stamps, *_arrays([_pose(floats(where, fields[1:])) for where, fields in table]))
+
+
+def _near_origin(path: Path, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
+    """The rows with positions relative to an origin. Raises InputError for coordinates such as UTM without one."""
+    positions = found.positions if origin is None else found.positions - np.asarray(origin)
+    largest = np.abs(positions[np.isfinite(positions)]).max(initial=0.0)
+    if largest > LARGEST_POSITION:
+        first = positions[np.isfinite(positions).all(axis=1)][0] if origin is None else np.asarray(origin)
+        raise InputError(
+            f"{path}: its positions reach {largest:,.0f} m, such as UTM coordinates, too large for a map; give "
+            f"pose_origin: {_origin_text(first, -3)}, the same for every robot of the team"
+        )
+    return dataclasses.replace(found, positions=positions)
+
+
+def _in_axes(path: Path, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
+    """The rows with positions east, north and up of an origin instead of latitude, longitude and height."""
+    used = np.isfinite(found.positions).all(axis=1)
+    if not used.any() or (np.abs(found.positions[used][:, :2]) > (90.0, 360.0)).any():
+        raise InputError(f"{path}: its positions are not latitudes and longitudes in degrees")
+    if origin is None:
+        raise InputError(
+            f"{path}: its positions are latitudes and longitudes; give pose_origin: "
+            f"{_origin_text(found.positions[used][0], 5)}, the same for every robot of the team"
+        )
+    return dataclasses.replace(found, positions=enu_points(found.positions, np.asarray(origin)))
+
+
+def _origin_text(position: Float64Array, digits: int) -> str:
+    """A rounded origin as it is written in a team file."""
+    x, y, z = position.tolist()
+    return f"[{round(x, digits):.{max(digits, 0)}f}, {round(y, digits):.{max(digits, 0)}f}, {round(z):d}]"
 
 
 def read_times(path: Path) -> Int64Array:
-    """Return the times [ns] of a text file with one time in seconds per line. Raises InputError with the line."""
-    return np.array([seconds_to_ns(where, fields[0]) for where, fields in rows(path)], dtype=np.int64)
+    """Return the times [ns] of a text file with one time per line (``time_to_ns``). Raises InputError with the line."""
+    return np.array([time_to_ns(where, fields[0]) for where, fields in rows(path)], dtype=np.int64)
 
 
 def rigid(where: str, T: Float64Array) -> Float64Array:
     """Return a (4, 4) matrix unchanged. Raises InputError where it is not a rigid transform."""
     rotation = T[:3, :3]
-    # Files round their numbers, so rotations are not exactly orthogonal.
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=0.02) or np.linalg.det(rotation) < 0:
+    # No element of a rotation is above 1, and products of large numbers overflow. Files round numbers, so rotations
+    # are not exactly orthogonal.
+    is_rotation = np.abs(rotation).max() < 2.0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=0.02)
+    if not is_rotation or np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: its upper left 3x3 part is not a rotation")
     return T
 

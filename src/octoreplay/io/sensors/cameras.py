@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import lru_cache
 
 import cv2
@@ -58,6 +59,11 @@ def check_camera(calibration: Calibration, where: str, *, is_rectified: bool) ->
     if _distorts(calibration, is_rectified):
         _check_lens(calibration, where)
     return matrix
+
+
+def has_rectified_name(topic: str) -> bool:
+    """Return True for a topic of rectified images by its name."""
+    return re.search(r"(^|[/_])rect", topic.lower()) is not None
 
 
 def image_size(calibration: Calibration) -> tuple[int, int]:

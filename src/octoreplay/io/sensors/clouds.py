@@ -16,12 +16,16 @@ from octoreplay.io.sensors.images import MAX_PIXELS, confidences
 from octoreplay.records import BoolArray, Int64Array, UInt8Array
 
 LABEL_FIELDS = (
-    "label", "labels", "semantic", "semantic_label", "semantic_id", "class", "class_id", "category", "semantic_color",
+    "label", "labels", "label_id", "semantic", "semantic_label", "semantic_id", "class", "class_id", "category",
+    "semantic_color",
 )  # fmt: skip
 """Names of fields with raw labels, in order of preference; colours are palette entries."""
 
 COLOR_FIELDS = ("rgb", "rgba", "semantic_color")
 """Names of fields with packed colours: four bytes blue, green, red, alpha, as an integer or a float (PCL)."""
+
+TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
+"""Names of fields with the time of each point: drivers of Ouster, Velodyne, Hesai, RoboSense and Livox."""
 
 CONFIDENCE_FIELDS = ("confidence", "label_confidence", "semantic_confidence", "probability", "prob", "conf")
 """Names of fields with label confidences, in order of preference."""
@@ -35,12 +39,14 @@ class Points:
     """Points (P, 3) float32 or float64 in the sensor's frame [m], with their labels and confidences.
 
     ``labels`` are raw labels (P,) int64, or colours (P, 3) uint8 red, green, blue; ``confidences`` (P,) uint8 in
-    255ths; None where the message has none.
+    255ths; None where the message has none. ``times`` (P,) are the points' times as the message has them, of any unit
+    and origin; None unless they are wanted and present.
     """
 
     points: npt.NDArray[Any]
     labels: Int64Array | UInt8Array | None = None
     confidences: UInt8Array | None = None
+    times: npt.NDArray[Any] | None = None
 
 
 def label_field(names: Iterable[str], wanted: str | None = None) -> str | None:
@@ -50,7 +56,12 @@ def label_field(names: Iterable[str], wanted: str | None = None) -> str | None:
 
 
 def decode_cloud(
-    cloud: Cloud, where: str, *, wanted_labels: str | None = None, wanted_confidences: str | None = None
+    cloud: Cloud,
+    where: str,
+    *,
+    wanted_labels: str | None = None,
+    wanted_confidences: str | None = None,
+    wants_times: bool = False,
 ) -> Points:
     """Return the points of a cloud in its own frame, with labels and confidences where it has them.
 
@@ -71,12 +82,14 @@ def decode_cloud(
     with np.errstate(invalid="ignore"):
         for axis, column in enumerate(columns):
             points[:, axis] = column
-    usable = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
+        usable = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
+    time = _first(TIME_FIELDS, fields) if wants_times else None
     keep: slice | BoolArray = slice(None) if bool(usable.all()) else usable
     return Points(
         points[keep],
         None if label is None else _labels(cloud, fields[label], where, keep),
         None if confidence is None else confidences(_column(cloud, fields[confidence], where)[keep]),
+        None if time is None else _column(cloud, fields[time], where)[keep],
     )
 
 

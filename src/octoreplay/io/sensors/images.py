@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -19,6 +21,8 @@ from PIL.WebPImagePlugin import WebPImageFile
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import CompressedImage, Image
+from octoreplay.io.sensors.rvl import decode_rvl
+from octoreplay.io.sensors.tiff import MAGICS, read_tiff_header
 from octoreplay.records import UInt8Array
 
 DEPTH_ENCODINGS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
@@ -30,30 +34,48 @@ COLOR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8")
 LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1", "16SC1", "32SC1", *COLOR_ENCODINGS)
 """Encodings of label images: ids or colours."""
 
+_BAYER = {
+    "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB, "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB, "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
+}  # fmt: skip
+_YUV = {
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY, "uyvy": cv2.COLOR_YUV2RGB_UYVY, "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+}  # fmt: skip
+
+COLOR_IMAGE_ENCODINGS = (
+    *COLOR_ENCODINGS, "8UC3", "8UC4", "mono8", "8UC1", *_BAYER, *_YUV, "jpeg rgb8", "jpeg 8UC1", "webp rgb8",
+)  # fmt: skip
+"""Encodings of colour and grey images that ``decode_color`` can read, as ``encoding_and_size`` gives them."""
+
 MAX_PIXELS = 1 << 26
 """Largest number of pixels of an image and of points of a cloud; larger ones are refused before decoding."""
 
-# Upper bound for PNG and JPEG: deflate expands a byte to at most 1032 bytes of eight 1-bit pixels each, and JPEG needs
-# at least one bit for every block of 64 pixels.
-_MAX_PIXELS_PER_BYTE = 8 * 1032
+SMALL_IMAGE = 1 << 25
+"""Number of pixels that a compressed image may have however small it is; an image without depth takes a few kB."""
+MAX_PIXELS_PER_BYTE = 64
+"""Largest number of pixels for each byte of a compressed image above SMALL_IMAGE."""
 
 _ELEMENTS = {
     "mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "16SC1": "i2", "32SC1": "i4", "32FC1": "f4",
     "rgb8": "3u1", "bgr8": "3u1", "rgba8": "4u1", "bgra8": "4u1", "8UC3": "3u1", "8UC4": "4u1",
+    **dict.fromkeys(_BAYER, "u1"), **dict.fromkeys(_YUV, "2u1"),
 }  # fmt: skip
 # Encodings of Pillow's pixel modes.
 _MODES = {"P": "palette", "L": "8UC1", "1": "8UC1", "F": "32FC1"}
-# Exceptions that Pillow's readers raise for damaged bytes.
-_UNREADABLE = (
+UNREADABLE = (
     OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, ArithmeticError, LookupError, TypeError,
     AttributeError, RuntimeError, MemoryError,
 )  # fmt: skip
+"""Exceptions that Pillow's readers raise for damaged bytes."""
 # These classes read headers without the size limit of PIL.Image.open, which warns before it raises.
-_FILES = (
+_FILES: tuple[tuple[bytes, Callable[[IO[bytes]], Any]], ...] = (
     (b"\x89PNG\r\n\x1a\n", PngImageFile), (b"\xff\xd8\xff", JpegImageFile), (b"RIFF", WebPImageFile),
+    *((magic, read_tiff_header) for magic in MAGICS),
 )  # fmt: skip
-# compressed_depth_image_transport: format number and two quantisation parameters, followed by a PNG.
-_DEPTH_HEADER = struct.Struct("<iff")
+# compressed_depth_image_transport: format number and two quantisation parameters, followed by a PNG, or by the numbers
+# of columns and rows and an RVL stream.
+_DEPTH_HEADER, _RVL_SIZE = struct.Struct("<iff"), struct.Struct("<ii")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +94,19 @@ class LabelImage:
 def encoding_and_size(image: Image | CompressedImage, where: str) -> tuple[str, tuple[int, int]]:
     """Return an image's encoding and size (width, height); of a compressed image only the header is read.
 
-    PNGs have the encodings of raw images (``16UC1``, ``8UC1``, ``rgb8``), other formats precede it (``jpeg rgb8``).
+    PNG and TIFF have the encodings of raw images (``16UC1``, ``8UC1``, ``rgb8``), other formats precede it
+    (``jpeg rgb8``).
     Raises DamagedMessageError where the header cannot be read.
     """
     if isinstance(image, Image):
         return image.encoding, (image.width, image.height)
     data = bytes(image.data)
-    is_depth = "compresseddepth" in image.format.lower()
-    head, size = _read_header(image, data[_DEPTH_HEADER.size :] if is_depth else data, where)
-    if is_depth:
-        return image.format.split(";")[0], size
-    return head.removeprefix("png "), size
+    if not _is_compressed_depth(image):
+        head, size = _read_header(image, data, where)
+        return head.removeprefix("png ").removeprefix("tiff "), size
+    content = data[_DEPTH_HEADER.size :]
+    size = _rvl_size(image, content, where) if _is_rvl(image) else _read_header(image, content, where)[1]
+    return image.format.split(";")[0], size
 
 
 def decode_depth(
@@ -105,7 +129,8 @@ def decode_depth(
     holds_depth = pixels.ndim == 2 and pixels.dtype.str[1:] in ("u1", "u2", "f4")
     if not holds_depth or (unit is None and depth_unit is None):
         raise InputError(
-            f"{where}: {found} holds no depth; {', '.join(DEPTH_ENCODINGS)}, PNG and compressedDepth can be read, "
+            f"{where}: {found} holds no depth; {', '.join(DEPTH_ENCODINGS)}, PNG, TIFF and compressedDepth can be "
+            f"read, "
             f"and one channel of 8 bits with depth_unit"
         )
     return pixels, float(depth_unit if depth_unit is not None else unit or 0.0)
@@ -136,6 +161,39 @@ def decode_labels(image: Image | CompressedImage, where: str) -> LabelImage:
     return LabelImage(pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., :3]), is_lossy)
 
 
+def decode_color(image: Image | CompressedImage, where: str) -> UInt8Array:
+    """Return a colour image (H, W, 3) uint8 red, green, blue; a grey image has three equal channels.
+
+    8UC3 and 8UC4 have OpenCV's channel order. Raises InputError for another encoding, DamagedMessageError for damaged
+    bytes.
+    """
+    if isinstance(image, CompressedImage):
+        pixels, _ = _decode_file(image, bytes(image.data), where)
+        encoding = f"{image.format} of {pixels.dtype}"
+    else:
+        encoding = image.encoding
+        pixels = _pixels(image, where) if encoding in COLOR_IMAGE_ENCODINGS else np.empty(0, dtype=np.uint8)
+        if encoding in ("bgr8", "bgra8", "8UC3", "8UC4"):
+            pixels = pixels[..., [2, 1, 0]]
+        elif encoding in _BAYER or encoding in _YUV:
+            pixels = _demosaiced(pixels, encoding, where)
+    if pixels.ndim < 2 or pixels.dtype != np.uint8:
+        raise InputError(
+            f"{where}: image encoding '{encoding}' holds no colours of 8 bits; {', '.join(COLOR_ENCODINGS)}, mono8, "
+            "8-bit Bayer patterns, YUV 4:2:2, PNG, JPEG and WebP can be read"
+        )
+    return np.ascontiguousarray(np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., :3])
+
+
+def _demosaiced(pixels: npt.NDArray[Any], encoding: str, where: str) -> npt.NDArray[Any]:
+    """Colours (H, W, 3) of a Bayer pattern (H, W) or of YUV 4:2:2 (H, W, 2)."""
+    try:
+        return np.asarray(cv2.cvtColor(pixels, (_BAYER | _YUV)[encoding]))
+    except cv2.error as error:
+        size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise DamagedMessageError(f"{where}: an image of {size} {encoding} cannot be decoded") from error
+
+
 def decode_confidences(image: Image | CompressedImage, where: str) -> UInt8Array:
     """Return the label confidences (H, W) uint8 in 255ths of an image of 8 or 16 bits, or of floats from 0 to 1.
 
@@ -144,7 +202,8 @@ def decode_confidences(image: Image | CompressedImage, where: str) -> UInt8Array
     if isinstance(image, CompressedImage):
         pixels, _ = _decode_file(image, bytes(image.data), where)
     else:
-        pixels = _pixels(image, where) if image.encoding in _ELEMENTS else np.empty(0)
+        is_plain = image.encoding in _ELEMENTS and image.encoding not in _BAYER
+        pixels = _pixels(image, where) if is_plain else np.empty(0)
     if pixels.ndim != 2 or pixels.dtype.str[1:] not in ("u1", "u2", "f4"):
         raise InputError(f"{where}: the image holds no confidences; one channel of 8UC1, 16UC1 or 32FC1 can be read")
     return confidences(pixels)
@@ -158,6 +217,11 @@ def confidences(values: npt.NDArray[Any]) -> UInt8Array:
     with np.errstate(invalid="ignore"):
         shares = np.clip(np.nan_to_num(values.astype(np.float64) / scale), 0.0, 1.0)
     return np.rint(255.0 * shares).astype(np.uint8)
+
+
+def most_pixels(num_bytes: int) -> int:
+    """Return the largest number of pixels of a compressed image of ``num_bytes``."""
+    return min(MAX_PIXELS, max(SMALL_IMAGE, MAX_PIXELS_PER_BYTE * num_bytes))
 
 
 def _pixels(image: Image, where: str) -> npt.NDArray[Any]:
@@ -189,15 +253,14 @@ def _decode_depth_file(image: CompressedImage, where: str) -> tuple[npt.NDArray[
     compressedDepth begins with a header; its quantised inverse depth is depth = A / (value - B) in metres, 0 where
     nothing was measured (compressed_depth_image_transport).
     """
-    if "compresseddepth" not in image.format.lower():
-        return _decode_file(image, bytes(image.data), where)
-    if "rvl" in image.format.lower():
-        raise InputError(f"{where}: depth compressed with RVL is not supported; record it with format: png")
     data = bytes(image.data)
+    if not _is_compressed_depth(image):
+        return _decode_file(image, data, where)
     if len(data) <= _DEPTH_HEADER.size:
         raise DamagedMessageError(f"{where}: the compressed depth image is empty")
     _, a, b = _DEPTH_HEADER.unpack_from(data)
-    pixels, _ = _decode_file(image, data[_DEPTH_HEADER.size :], where)
+    content = data[_DEPTH_HEADER.size :]
+    pixels = _decode_rvl(image, content, where) if _is_rvl(image) else _decode_file(image, content, where)[0]
     if not image.format.startswith("32FC1"):
         return pixels, False
     values = pixels.astype(np.float32)
@@ -206,8 +269,37 @@ def _decode_depth_file(image: CompressedImage, where: str) -> tuple[npt.NDArray[
     return np.where(values > 0, depth, np.float32(np.nan)), False
 
 
+def _is_compressed_depth(image: CompressedImage) -> bool:
+    """True for an image of compressed_depth_image_transport."""
+    return "compresseddepth" in image.format.lower()
+
+
+def _is_rvl(image: CompressedImage) -> bool:
+    """True for a compressedDepth image whose content is RVL."""
+    return "rvl" in image.format.lower()
+
+
+def _rvl_size(image: CompressedImage, content: bytes, where: str) -> tuple[int, int]:
+    """Width and height of an RVL image. Raises DamagedMessageError where its bytes cannot hold them."""
+    if len(content) < _RVL_SIZE.size:
+        raise _undecodable(image, where)
+    width, height = _RVL_SIZE.unpack_from(content)
+    if min(width, height) < 1 or width * height > most_pixels(len(content)):
+        raise _undecodable(image, where)
+    return width, height
+
+
+def _decode_rvl(image: CompressedImage, content: bytes, where: str) -> npt.NDArray[Any]:
+    """The values of an RVL image (H, W) uint16."""
+    width, height = _rvl_size(image, content, where)
+    try:
+        return decode_rvl(content[_RVL_SIZE.size :], width * height).reshape(height, width)
+    except ValueError as error:
+        raise _undecodable(image, where) from error
+
+
 def _decode_file(image: CompressedImage, data: bytes, where: str) -> tuple[npt.NDArray[Any], bool]:
-    """The pixels of a PNG, JPEG or WebP file, colours as RGB, and whether they are lossy.
+    """The pixels of a PNG, JPEG, WebP or TIFF file, colours as RGB, and whether they are lossy.
 
     A PNG with a palette gives the indices, which are the ids of a label image.
     """
@@ -215,17 +307,29 @@ def _decode_file(image: CompressedImage, data: bytes, where: str) -> tuple[npt.N
     if width * height > MAX_PIXELS:
         raise InputError(f"{where}: an image of {width}x{height} pixels is too large to decode")
     # The decoder allocates all pixels before it finds the file cut.
-    if width * height > _MAX_PIXELS_PER_BYTE * len(data) and head.startswith(("png", "jpeg")):
+    if width * height > most_pixels(len(data)):
         raise _undecodable(image, where)
     try:
         if head == "png palette":
             return np.array(PIL.Image.open(io.BytesIO(data))), False
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (*_UNREADABLE, cv2.error) as error:
+        with _quiet_opencv() if head.startswith("tiff") else nullcontext():
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (*UNREADABLE, cv2.error) as error:
         raise _undecodable(image, where) from error
-    if pixels is None:
+    if pixels is None or pixels.shape[:2] != (height, width):
         raise _undecodable(image, where)
     return (pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0]]), head.startswith("jpeg")
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV from writing libtiff's warnings about damaged files to the terminal."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _read_header(image: CompressedImage, data: bytes, where: str) -> tuple[str, tuple[int, int]]:
@@ -237,7 +341,7 @@ def _read_header(image: CompressedImage, data: bytes, where: str) -> tuple[str, 
         with reader(io.BytesIO(data)) as header:
             pixels = _MODES.get(header.mode, "16UC1" if header.mode.startswith("I") else "rgb8")
             return f"{str(header.format).lower()} {pixels}", header.size
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise _undecodable(image, where) from error
 
 

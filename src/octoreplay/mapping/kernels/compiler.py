@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
+import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,35 +15,54 @@ from typing import Any
 import numba
 from numba import njit
 
+from octoreplay.mapping.kernels.kernel_cache import SUFFIX, KernelCache
+
 logger = logging.getLogger(__name__)
 
 
-def _cache_folder() -> str | None:
+_MAX_IDLE_SECONDS = 7 * 86_400
+"""Time since its last use after which a folder of another version is removed from a shared place."""
+
+
+def _cache_folder() -> Path | None:
     """Folder of the compiled kernels, named after the content of all kernel files; None where none is writable.
 
-    numba's own cache looks at one file at a time, and would keep a kernel whose callee in another file has changed.
+    A kernel contains its callees, so that a change in one file concerns the kernels of all.
     """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    places = [Path(__file__).parent / "__pycache__"]
+    # No other version uses the package's own folder.
+    places = {Path(__file__).parent / "__pycache__": 0}
     if os.environ.get("HOME"):
-        places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "octoreplay")
+        places[Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "octoreplay"] = _MAX_IDLE_SECONDS
     if numba.config.CACHE_DIR:
-        places = [Path(numba.config.CACHE_DIR)]
-    for place in places:
+        places = {Path(numba.config.CACHE_DIR): _MAX_IDLE_SECONDS}
+    for place, max_idle_seconds in places.items():
         folder = place / f"kernels-{digest.hexdigest()[:16]}"
         is_new = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            # The time of the last use; refused where the folder is not writable.
+            os.utime(folder)
         except OSError:
             continue
         if os.access(folder, os.W_OK):
             if is_new:
                 logger.info("compiling kernels for this machine, which takes about 15 seconds; they are kept")
-            return str(folder)
+            _remove_others(folder, max_idle_seconds)
+            return folder
     logger.warning("no folder for compiled kernels can be written; they are compiled anew in every run")
     return None
+
+
+def _remove_others(folder: Path, max_idle_seconds: int) -> None:
+    """Remove the cache folders beside this one that were not used for some time."""
+    for other in folder.parent.glob("kernels-" + "[0-9a-f]" * 16):
+        # Another process may remove it at the same time.
+        with contextlib.suppress(OSError):
+            if other != folder and time.time() - other.stat().st_mtime >= max_idle_seconds:
+                shutil.rmtree(other, ignore_errors=True)
 
 
 _CACHE_FOLDER = _cache_folder()
@@ -48,7 +70,7 @@ _CACHE_FOLDER = _cache_folder()
 
 def cache_is_empty() -> bool:
     """Return True where the cache folder is writable and holds no compiled kernel."""
-    return _CACHE_FOLDER is not None and not any(Path(_CACHE_FOLDER).rglob("*.nbi"))
+    return _CACHE_FOLDER is not None and not any(_CACHE_FOLDER.glob(f"*{SUFFIX}"))
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Any:
@@ -57,15 +79,10 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
     Without fast-math: reordered sums differ between callees linked from the cache and inlined ones, and the same input
     must give the same bytes. Loops over a brick compile to vector instructions where they sum element by element.
     """
-    settings = {"nogil": True, "error_model": "numpy", **options}
-    if _CACHE_FOLDER is None:
-        return njit(**settings)(function)
-    users_folder = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_FOLDER
-    try:
-        return njit(cache=True, **settings)(function)
-    finally:
-        numba.config.CACHE_DIR = users_folder
+    compiled = njit(**{"nogil": True, "error_model": "numpy", **options})(function)
+    if _CACHE_FOLDER is not None and not numba.config.DISABLE_JIT:
+        compiled._cache = KernelCache(function, _CACHE_FOLDER)  # noqa: SLF001 - numba offers no other way
+    return compiled
 
 
 def kernel(function: Callable[..., Any]) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from octoreplay.config.packets import PacketConfig
 from octoreplay.mapping import codec
 from octoreplay.mapping.codec import MapVersion, PacketFormat
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.octree import MAX_BYTES, SemanticOctree
 from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.records import Int64Array
 from octoreplay.replay.exchange.messages import HeldMap, Source
@@ -107,11 +107,11 @@ def _decoded(data: bytes, mine: HeldMap | None) -> HeldMap:
     header = codec.read_header(data)
     stamp = header.map_version
     if header.kind == codec.FULL:
-        octree = codec.decode_packet(data)
+        octree = codec.decode_packet(data, MAX_BYTES)
         octree.revisions[:] = stamp.version - 1
     else:
         octree = mine.octree.copy() if mine else SemanticOctree(header.resolution, header.num_classes)
         # Bricks outside the delta did not change after its base.
         octree.revisions[octree.revisions >= stamp.base] = stamp.base - 1
-        codec.apply_delta(octree, data, stamp.version - 1)
+        codec.apply_delta(octree, data, stamp.version - 1, MAX_BYTES)
     return HeldMap(octree, stamp.version, stamp.weight)

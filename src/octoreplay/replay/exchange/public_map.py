@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -68,6 +69,14 @@ class PublicMap:
         self._snapshots: WeakSet[Snapshot] = WeakSet()
         self._comparer = MapComparer(2, 0.0)
         self._bytes_per_brick = 100.0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for ``pickle``."""
+        return {**vars(self), "_snapshots": list(self._snapshots)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state from ``pickle``."""
+        vars(self).update(state, _snapshots=WeakSet(state["_snapshots"]))
 
     def advance(self, octree: SemanticOctree, since: int, version: int, *, num_shares: int = 1) -> HeldMap:
         """Next version of the map. Bricks that change get the revision ``version`` - 1.

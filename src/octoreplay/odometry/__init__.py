@@ -1,0 +1,1 @@
+"""Poses of a robot's sensor from its own measurements: LiDAR odometry, and odometry of depth images."""

@@ -1,0 +1,1 @@
+"""Results in other programs: layouts for Foxglove and RViz, recordings for Rerun."""
