@@ -24,6 +24,19 @@ def replay_with_bar(config: RunConfig, output: Path, **options: Any) -> RunSumma
         return replay_team(config, output, progress=show, **options)
 
 
+def replay_tiles_with_bar(config: RunConfig, output: Path, edge: float, **options: Any) -> RunSummary:
+    """Replay in tiles with a progress bar for each stage; ``options`` are those of ``replay_tiles``."""
+    from octoreplay.study.tiles.run import replay_tiles
+
+    with progress_bar("replay") as update:
+
+        def show(stage: str, num_done: int, num_all: int) -> None:
+            unit = "ticks" if stage == "write" else "tiles"
+            update(num_done / num_all, None, f"{stage}: {num_done} of {num_all} {unit}")
+
+        return replay_tiles(config, output, edge, progress=show, **options)
+
+
 @contextlib.contextmanager
 def replay_bar() -> Iterator[Callable[[Progress], None]]:
     """Progress bar of a replay; gives a callback for the progress of every tick."""

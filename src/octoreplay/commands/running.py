@@ -23,7 +23,7 @@ from octoreplay.commands.options import (
     preset_option,
     with_parameters,
 )
-from octoreplay.commands.progress import replay_with_bar, show_results, simulate_with_bar
+from octoreplay.commands.progress import replay_tiles_with_bar, replay_with_bar, show_results, simulate_with_bar
 from octoreplay.commands.suggestions import Choice
 from octoreplay.commands.team_options import (
     base_config,
@@ -95,6 +95,10 @@ def _check_input(word: str) -> None:
               help="least time between check points, 0 for none  [default: at most 3 % of the run's time]")  # fmt: skip
 @click.option("--memory-limit", cls=RareOption, callback=parse_size, metavar="SIZE",
               help="end the run above this memory, such as 8GB; --resume continues it")  # fmt: skip
+@click.option("--tiles", type=float, metavar="METRES",
+              help="replay tiles of the space with this edge one after the other; the maps are the same")  # fmt: skip
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N",
+              help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
               help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
@@ -116,7 +120,8 @@ def _check_input(word: str) -> None:
 @prints
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
-    checkpoint_every: float | None, memory_limit: int | None, report: Path | None, save_team: Path | None,
+    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None,
+    report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
@@ -133,6 +138,10 @@ def run(
         )
     if resume and restart:
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
+    if tiles is None and jobs is not None:
+        raise click.UsageError("--jobs needs --tiles")
+    if tiles is not None and (checkpoint_every is not None or memory_limit is not None):
+        raise click.UsageError("--checkpoint-every and --memory-limit are for runs without --tiles")
     if output is not None:
         _check_result(output, config_from, resume=resume, restart=restart)
     if report is not None:
@@ -170,9 +179,12 @@ def run(
         here.give(team_file=save_team)
     if output is None:
         return 0
-    summary = replay_with_bar(
-        config, output, restart=restart, resume=resume, checkpoint_every=checkpoint_every, memory_limit=memory_limit
-    )
+    if tiles is not None:
+        summary = replay_tiles_with_bar(config, output, tiles, num_jobs=jobs or 1, restart=restart, resume=resume)
+    else:
+        summary = replay_with_bar(
+            config, output, restart=restart, resume=resume, checkpoint_every=checkpoint_every, memory_limit=memory_limit
+        )
     document = show_results(summary)
     here.line(f"wrote {output} ({size(output.stat().st_size)})")
     if report is not None:

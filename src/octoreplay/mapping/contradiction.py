@@ -14,7 +14,8 @@ import numpy as np
 from octoreplay.config.sensor import SensorConfig
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.kernels import contradiction as kernels
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.kernels.storage import BRICK_CELLS, BRICK_EDGE
+from octoreplay.mapping.octree import SemanticOctree, codes_to_keys
 from octoreplay.records import (
     ArrayT,
     BoolArray,
@@ -129,15 +130,40 @@ def _is_near_occupied(octree: SemanticOctree, coords: Float64Array, limits: Stat
     return np.asarray(is_occupied.reshape(len(coords), len(steps)).any(axis=1))
 
 
+class BorderStates(NamedTuple):
+    """States of bricks at the sides of a tile in one robot's evidence: codes (n,) and masks (n, W)."""
+
+    robot: int
+    codes: Int64Array
+    states: UInt64Array
+
+
+class EvidencePart(NamedTuple):
+    """Comparison of the evidence in one tile.
+
+    - ``counts`` (N, N, NUM_COUNTS): counts of the pairs, for which nothing is occupied outside the tile.
+    - ``is_new``: True where the comparison began anew.
+    - ``border``: states of bricks at the tile's sides that changed since the part before.
+    """
+
+    counts: Int64Array
+    is_new: bool
+    border: tuple[BorderStates, ...]
+
+
 class EvidenceComparer:
     """Incremental comparison of the robots' evidence: only bricks that changed are compared again.
 
     ``robot_ids`` are the names of the N robots, ``limits`` those of ``state_limits``. The ``revisions`` of the evidence
-    must increase with every change.
+    must increase with every change. ``tile_cells`` is the edge of the tile that the evidence lies in, where a whole is
+    compared in tiles.
     """
 
-    def __init__(self, robot_ids: Sequence[str], num_classes: int, limits: StateLimits) -> None:
+    def __init__(
+        self, robot_ids: Sequence[str], num_classes: int, limits: StateLimits, *, tile_cells: int | None = None
+    ) -> None:
         self._robot_ids = tuple(robot_ids)
+        self._tile_cells = tile_cells
         self._num_classes = num_classes
         self._limits = limits
         self._num_masks = kernels.LABEL + num_classes.bit_length()
@@ -153,6 +179,8 @@ class EvidenceComparer:
         self._latest = self._counted
         self._num_slots = 0
         self._counts: Int64Array = np.zeros((num_robots, num_robots, kernels.NUM_COUNTS), np.int64)
+        self._is_new = True
+        self._changed_border: list[BorderStates] = []
 
     def compare(
         self, evidence: Sequence[SemanticOctree], since: int, threads: Executor | None = None
@@ -163,9 +191,10 @@ class EvidenceComparer:
         result does not depend on ``threads``.
         """
         since = since if self._num_slots else 0
+        self._changed_border = []
         changed = [np.flatnonzero(octree.revisions >= since) for octree in evidence]
         if not any(new.size for new in changed):
-            return self._pairs()
+            return pairs_of(self._robot_ids, self._counts)
         rows = [self._bricks.find_or_add(octree.codes[new]) for octree, new in zip(evidence, changed, strict=True)]
         self._add_slots(rows)
 
@@ -175,7 +204,21 @@ class EvidenceComparer:
         marks = (map if threads is None else threads.map)(refresh, range(len(evidence)))
         for robot, stale in enumerate(marks):
             kernels.update_counts(self._slots, self._counted, self._latest, robot, stale, self._counts)
-        return self._pairs()
+            if self._tile_cells is not None:
+                self._changed_border.append(self._border_states(robot, np.flatnonzero(stale), self._tile_cells))
+        return pairs_of(self._robot_ids, self._counts)
+
+    def part(self) -> EvidencePart:
+        """Return what the last call of ``compare`` gives to ``JoinedEvidence``; call it once after each."""
+        is_new, self._is_new = self._is_new, False
+        return EvidencePart(self._counts.copy(), is_new, tuple(self._changed_border))
+
+    def _border_states(self, robot: int, rows: Int64Array, tile_cells: int) -> BorderStates:
+        """States of one robot's bricks at the sides of the tile, of the bricks in some rows."""
+        codes = self._bricks.codes[rows]
+        places = codes_to_keys(codes * BRICK_CELLS)[:, :2] % tile_cells
+        at_side = np.flatnonzero(((places == 0) | (places == tile_cells - BRICK_EDGE)).any(axis=1))
+        return BorderStates(robot, codes[at_side], self._latest[self._slots[rows[at_side], robot]])
 
     def _add_slots(self, rows: Sequence[Int64Array]) -> None:
         """Add a slot with an unknown state where a robot has a brick for the first time."""
@@ -201,28 +244,30 @@ class EvidenceComparer:
         kernels.update_near(team, self._slots, self._latest, robot, marks, neighbours, np.empty((3, 3, 3), np.uint64))
         return marks
 
-    def _pairs(self) -> tuple[PairMetrics, ...]:
-        """Metrics of the pairs with known cells in common."""
-        overlaps = self._counts[:, :, kernels.OVERLAP]
-        return tuple(self._pair(i, j) for i, j in np.argwhere(np.triu(overlaps, 1) > 0).tolist())
 
-    def _pair(self, i: int, j: int) -> PairMetrics:
-        """Metrics of the robots i < j."""
-        overlap, first_free, first_clear, both, other_label = self._counts[i, j].tolist()
-        _, second_free, second_clear, _, _ = self._counts[j, i].tolist()
-        occupied = first_free + second_free + both
-        return PairMetrics(
-            first=self._robot_ids[i],
-            second=self._robot_ids[j],
-            overlap_cells=overlap,
-            occupied_cells=occupied,
-            contradiction=_share(first_free + second_free, occupied),
-            clear_contradiction=_share(first_clear + second_clear, occupied),
-            contradiction_of_first=_share(first_free, first_free + both),
-            contradiction_of_second=_share(second_free, second_free + both),
-            both_occupied_cells=both,
-            label_contradiction=_share(other_label, both),
-        )
+def pairs_of(robot_ids: Sequence[str], counts: Int64Array) -> tuple[PairMetrics, ...]:
+    """Return the metrics of the pairs with known cells in common from their counts (N, N, NUM_COUNTS)."""
+    overlaps = counts[:, :, kernels.OVERLAP]
+    return tuple(_pair(robot_ids, counts, i, j) for i, j in np.argwhere(np.triu(overlaps, 1) > 0).tolist())
+
+
+def _pair(robot_ids: Sequence[str], counts: Int64Array, i: int, j: int) -> PairMetrics:
+    """Metrics of the robots i < j."""
+    overlap, first_free, first_clear, both, other_label = counts[i, j].tolist()
+    _, second_free, second_clear, _, _ = counts[j, i].tolist()
+    occupied = first_free + second_free + both
+    return PairMetrics(
+        first=robot_ids[i],
+        second=robot_ids[j],
+        overlap_cells=overlap,
+        occupied_cells=occupied,
+        contradiction=_share(first_free + second_free, occupied),
+        clear_contradiction=_share(first_clear + second_clear, occupied),
+        contradiction_of_first=_share(first_free, first_free + both),
+        contradiction_of_second=_share(second_free, second_free + both),
+        both_occupied_cells=both,
+        label_contradiction=_share(other_label, both),
+    )
 
 
 def _share(part: int, whole: int) -> float:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from octoreplay.log_odds import TIE_TOLERANCE
 from octoreplay.mapping.block_sums import BlockSums
@@ -19,17 +21,78 @@ from octoreplay.records import Float64Array, Int64Array
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """Result of a comparison, cell by cell; arrays are (N,) over the robots. Distances are squared log-odds."""
+    """Counts of a comparison, cell by cell. Comparisons of different cells add up.
+
+    Attributes
+    ----------
+    total_distance, total_distance_all : float
+        Phi over the links, and over all pairs of robots [squared log-odds].
+    num_known_cells : int
+        Cells known to any robot.
+    num_disagreeing_cells : int
+        Of these, cells with different labels, unknown included, of any two robots.
+    num_link_cells : int
+        Cells that both ends of a link know, summed over the links.
+    num_cells : (N,) int64 array
+        Cells that each robot knows.
+    num_compared, num_agreeing : (N,) int64 arrays
+        Known cells that each robot is compared in, and of these the ones with the centralised map's label.
+    num_compared_occupied, num_agreeing_occupied : (N,) int64 arrays
+        The same over the cells that the centralised map calls occupied.
+    entropies : (N,) float64 array
+        Sum of the entropies of each robot's cells [nat].
+    """
 
     total_distance: float
     total_distance_all: float
     num_known_cells: int
-    label_disagreement: float
+    num_disagreeing_cells: int
     num_link_cells: int
     num_cells: Int64Array
-    agreement: Float64Array
-    agreement_occupied: Float64Array
-    entropy_bits: Float64Array
+    num_compared: Int64Array
+    num_agreeing: Int64Array
+    num_compared_occupied: Int64Array
+    num_agreeing_occupied: Int64Array
+    entropies: Float64Array
+
+    def __add__(self, other: MapComparison) -> MapComparison:
+        return MapComparison(
+            **{item.name: getattr(self, item.name) + getattr(other, item.name) for item in fields(MapComparison)}
+        )
+
+    def spread(self, members: Sequence[int], num_robots: int) -> MapComparison:
+        """Return the comparison of a team of ``num_robots`` of which only the ``members`` (N,) were compared."""
+
+        def spread(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            of_all = np.zeros(num_robots, values.dtype)
+            of_all[list(members)] = values
+            return of_all
+
+        arrays: dict[str, Any] = {
+            name: spread(value) for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return replace(self, **arrays)
+
+    @property
+    def label_disagreement(self) -> float:
+        """Share of the known cells in which robots have different labels; 0 without known cells."""
+        return self.num_disagreeing_cells / self.num_known_cells if self.num_known_cells else 0.0
+
+    @property
+    def agreement(self) -> Float64Array:
+        """Share (N,) of the compared cells in which a robot agrees with the centralised map; 1 without cells."""
+        return _shares(self.num_agreeing, self.num_compared)
+
+    @property
+    def agreement_occupied(self) -> Float64Array:
+        """The same over the cells that the centralised map calls occupied."""
+        return _shares(self.num_agreeing_occupied, self.num_compared_occupied)
+
+    @property
+    def entropy_bits(self) -> Float64Array:
+        """Mean entropy (N,) of a robot's cells [bit]; 0 without cells."""
+        cells = self.num_cells
+        return np.divide(self.entropies / math.log(2.0), cells, out=np.zeros(len(cells)), where=cells > 0)
 
 
 class MapComparer:
@@ -151,21 +214,21 @@ class MapComparer:
         """Sum over all bricks."""
         distances, counts = self._distances.total(), self._counts.total()
         per_robot = counts[4:].reshape(-1, 3)
-        cells = per_robot[:, 0]
-        entropies = self._entropies.total() / math.log(2.0)
         return MapComparison(
             total_distance=float(distances[0]),
             total_distance_all=float(distances[1]),
             num_known_cells=int(counts[0]),
-            label_disagreement=float(counts[2] / counts[0]) if counts[0] else 0.0,
+            num_disagreeing_cells=int(counts[2]),
             num_link_cells=int(counts[3]),
-            num_cells=cells,
-            agreement=_share(per_robot[:, 1], counts[0]),
-            agreement_occupied=_share(per_robot[:, 2], counts[1]),
-            entropy_bits=np.divide(entropies, cells, out=np.zeros(len(cells)), where=cells > 0),
+            num_cells=per_robot[:, 0].copy(),
+            num_compared=np.full(len(per_robot), counts[0]),
+            num_agreeing=per_robot[:, 1].copy(),
+            num_compared_occupied=np.full(len(per_robot), counts[1]),
+            num_agreeing_occupied=per_robot[:, 2].copy(),
+            entropies=self._entropies.total(),
         )
 
 
-def _share(parts: Int64Array, whole: int) -> Float64Array:
-    """Return parts / whole; 1 where the whole is 0."""
-    return parts / whole if whole else np.ones(len(parts))
+def _shares(parts: Int64Array, wholes: Int64Array) -> Float64Array:
+    """Return parts / wholes (N,); 1 where the whole is 0."""
+    return np.divide(parts, wholes, out=np.ones(len(parts)), where=wholes > 0)

@@ -15,7 +15,6 @@ import platform
 import struct
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
 from importlib.metadata import version
 from pathlib import Path
@@ -67,16 +66,6 @@ def can_resume(output: Path) -> bool:
     return checkpoint_path(output).exists() and partial_path(output).exists()
 
 
-@dataclass(frozen=True)
-class _Content:
-    """Content of a check point: the versions of the software, and the states of a run's parts."""
-
-    versions: dict[str, str]
-    written: Written
-    session: dict[str, Any]
-    recorder: dict[str, Any]
-
-
 class Checkpoints:
     """Check points of one run.
 
@@ -94,10 +83,10 @@ class Checkpoints:
 
     def restore(self) -> None:
         """Continue the run after its check point. Raises InputError and ConfigError where that is not possible."""
-        content = _load(self.path, self._session.shared)
-        self._writer.take_over(content.written)
-        self._session.restore(content.session)
-        self._recorder.restore(content.recorder)
+        content = load_state(self.path, self._session.shared)
+        self._writer.take_over(content["written"])
+        self._session.restore(content["session"])
+        self._recorder.restore(content["recorder"])
         last = self._recorder.last
         assert last is not None
         elapsed = (last.stamp_ns - self._recorder.start_ns) / 1e9
@@ -119,10 +108,9 @@ class Checkpoints:
             return
         started = time.monotonic()
         recorder = self._recorder.state()
-        content = _Content(_versions(), self._writer.sync(), self._session.state(), recorder)
+        content = {"recorder": recorder, "written": self._writer.sync(), "session": self._session.state()}
         # It is also saved after an interrupt.
-        with replacing(self.path) as temporary, OutputFile(temporary) as file:
-            _write(file, content, self._session.shared)
+        save_state(self.path, content, self._session.shared)
         self._ended = time.monotonic()
         self._spent += self._ended - started
         self._expected = GROWTH * (self._ended - started)
@@ -146,17 +134,22 @@ class _SummedFile:
         return self._file.write(data)
 
 
-def _write(file: OutputFile, content: _Content, shared: Mapping[str, object]) -> None:
-    """Write a check point: magic, zstd frame with a pickle, CRC-32 of both."""
-    summed = _SummedFile(file)
-    summed.write(_MAGIC)
-    with zstandard.ZstdCompressor(level=_ZSTD_LEVEL).stream_writer(cast("IO[bytes]", summed), closefd=False) as stream:
-        _Pickler(stream, shared).dump(content)
-    file.write(_CHECKSUM.pack(summed.crc))
+def save_state(path: Path, content: Mapping[str, Any], shared: Mapping[str, object]) -> None:
+    """Write a check point with the states of a run's parts: magic, zstd frame with a pickle, CRC-32 of both.
+
+    ``shared`` are the objects that the states refer to, but do not contain, by name. Raises OutputError.
+    """
+    with replacing(path) as temporary, OutputFile(temporary) as file:
+        summed = _SummedFile(file)
+        summed.write(_MAGIC)
+        stream = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).stream_writer(cast("IO[bytes]", summed), closefd=False)
+        with stream:
+            _Pickler(stream, shared).dump({**content, "versions": _versions()})
+        file.write(_CHECKSUM.pack(summed.crc))
 
 
-def _load(path: Path, shared: Mapping[str, object]) -> _Content:
-    """Read a check point."""
+def load_state(path: Path, shared: Mapping[str, object]) -> dict[str, Any]:
+    """Return the content of a check point. Raises InputError and ConfigError where it cannot be used."""
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(path.open("rb"))
@@ -173,11 +166,26 @@ def _load(path: Path, shared: Mapping[str, object]) -> _Content:
             raise InputError(
                 f"{path}: cannot be read by this version; run with --restart to start from the beginning"
             ) from error
-    if not isinstance(content, _Content) or content.versions != _versions():
+    if not isinstance(content, dict) or content.get("versions") != _versions():
         raise ConfigError(
             f"{path}: was written by other versions of octoreplay, Python or NumPy, which may give another result; use"
             " those, or run with --restart to start from the beginning"
         )
+    return content
+
+
+def pickled(content: Mapping[str, Any]) -> bytes:
+    """Return the pickle of a mapping without shared objects."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, {}).dump(content)
+    return buffer.getvalue()
+
+
+def unpickled(data: bytes) -> dict[str, Any]:
+    """Return the mapping of a pickle. Raises UnpicklingError for other data, and for names that are not allowed."""
+    content = _Unpickler(io.BytesIO(data), {}).load()
+    if not isinstance(content, dict):
+        raise pickle.UnpicklingError("holds no mapping")
     return content
 
 

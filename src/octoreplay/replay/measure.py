@@ -1,26 +1,28 @@
-"""Metrics of a tick: comparisons of the team's maps and of the robots' evidence, and the radio's counts."""
+"""Counts of a tick: comparisons of the team's maps and of the robots' evidence, and the radio's counts."""
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.run import RunConfig
 from octoreplay.mapping.consensus import sum_of_evidence
-from octoreplay.mapping.contradiction import EvidenceComparer, state_limits
+from octoreplay.mapping.contradiction import EvidenceComparer, EvidencePart, state_limits
 from octoreplay.mapping.metrics import MapComparer, MapComparison
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.stream_size import StreamPart
 from octoreplay.replay.exchange.messages import Receipt
 from octoreplay.replay.network.graph import CommunicationGraph, Link, step_size
 from octoreplay.replay.network.links import LinkCounts
-from octoreplay.replay.robots.robot import MapSizes, Publication, Robot, Team
-from octoreplay.run_metrics import LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
+from octoreplay.replay.robots.robot import Publication, Robot, Team
+from octoreplay.replay.tick_counts import RobotCounts, TickCounts, TileParts
+from octoreplay.run_metrics import LinkMetrics, PairMetrics
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +35,12 @@ class Traffic:
 
 
 class _Component:
-    """Comparison of the maps and of the evidence of robots in one frame; ``oracle`` is the sum of their evidence."""
+    """Comparison of the maps and of the evidence of robots in one frame; ``oracle`` is the sum of their evidence.
 
-    def __init__(self, config: ResolvedRun, members: Sequence[int], threads: Executor) -> None:
+    ``tile_cells`` is None but for a tile of a run.
+    """
+
+    def __init__(self, config: ResolvedRun, members: Sequence[int], threads: Executor, tile_cells: int | None) -> None:
         num_classes = config.classes.num_classes
         ids = [config.robots[index].robot_id for index in members]
         self.oracle = SemanticOctree(config.map.resolution, num_classes)
@@ -45,7 +50,9 @@ class _Component:
         self._since = 0
         self._config = config
         self._comparer = MapComparer(len(ids), config.map.prior(num_classes))
-        self._evidence_comparer = EvidenceComparer(ids, num_classes, state_limits(config.effective_sensor))
+        self._evidence_comparer = EvidenceComparer(
+            ids, num_classes, state_limits(config.effective_sensor), tile_cells=tile_cells
+        )
 
     def forget(self) -> None:
         """Compare all bricks anew in the next tick: a robot's map and evidence were replaced."""
@@ -66,12 +73,17 @@ class _Component:
         return self._comparer.link_distance(maps, links, self._since, self._threads)
 
     def compare(self, team: Team[Robot], graph: CommunicationGraph) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
-        """Comparison of the maps after a tick, arrays over the members, and the metrics of the pairs of members."""
+        """Comparison of the maps after a tick, arrays over all robots, and the metrics of the pairs of members."""
         maps, links = self._maps_and_links(team, graph)
         least_tie = len(team.robots) * rest_difference(self._config, graph)
         comparison = self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
         evidence = [team.robots[index].evidence.octree for index in self.members]
-        return comparison, self._evidence_comparer.compare(evidence, self._since, self._threads)
+        pairs = self._evidence_comparer.compare(evidence, self._since, self._threads)
+        return comparison.spread(self.members, len(team.robots)), pairs
+
+    def evidence_part(self) -> EvidencePart:
+        """What the last comparison of the evidence of a tile gives to that of the whole."""
+        return self._evidence_comparer.part()
 
     def _maps_and_links(
         self, team: Team[Robot], graph: CommunicationGraph
@@ -80,12 +92,6 @@ class _Component:
         position = {index: place for place, index in enumerate(self.members)}
         links = [(position[i], position[j]) for i, j in graph.pairs if i in position and j in position]
         return [team.robots[index].map for index in self.members], links
-
-    def spread(self, values: npt.NDArray[Any], num_robots: int) -> npt.NDArray[Any]:
-        """Return values (M,) of the members as an array (N,) over the robots, 0 for other robots."""
-        spread = np.zeros(num_robots, values.dtype)
-        spread[list(self.members)] = values
-        return spread
 
 
 def rest_difference(config: RunConfig, graph: CommunicationGraph) -> float:
@@ -97,17 +103,20 @@ def rest_difference(config: RunConfig, graph: CommunicationGraph) -> float:
 
 
 class TickMeasurer:
-    """Metrics tick by tick, updated where maps changed.
+    """Counts tick by tick, updated where maps changed.
 
     ``oracle`` is the centralised map: the sum of the evidence of all robots, evidence from before restarts included. Of
-    several components of robots, it is that of the first one.
+    several components of robots, it is that of the first one. For a tile of a run, with an edge of ``tile_cells``, the
+    counts have ``parts``.
     """
 
-    def __init__(self, config: ResolvedRun, threads: Executor) -> None:
+    def __init__(self, config: ResolvedRun, threads: Executor, tile_cells: int | None = None) -> None:
         self._config = config
         self._threads = threads
+        self._tile_cells = tile_cells
         self._robot_ids = tuple(robot.robot_id for robot in config.robots)
         self._period_ns = round(config.network.publish_period * 1e9)
+        self._published_parts: list[StreamPart] = []
         self._components: list[_Component] = []
         self.regroup([range(len(self._robot_ids))])
 
@@ -120,7 +129,8 @@ class TickMeasurer:
         """Compare robots with those of their component only from the next tick on; each has an oracle of its own."""
         kept = {component.members: component for component in self._components}
         self._components = [
-            kept.get(tuple(members)) or _Component(self._config, members, self._threads) for members in components
+            kept.get(tuple(members)) or _Component(self._config, members, self._threads, self._tile_cells)
+            for members in components
         ]
 
     def forget(self) -> None:
@@ -130,105 +140,64 @@ class TickMeasurer:
 
     def published_distance(self, number: int, team: Team[Robot], graph: CommunicationGraph) -> float:
         """Phi of the maps as published in tick ``number``; ``measure`` must follow after the iterations."""
+        if self._tile_cells is not None:
+            self._published_parts = [robot.stream_part(self._tile_cells) for robot in team.robots]
         return sum(component.published_distance(number, team, graph) for component in self._components)
 
     def measure(
         self,
-        number: int,
-        stamp_ns: int,
         team: Team[Robot],
         graph: CommunicationGraph,
         traffic: Traffic,
         published_distance: float,
         max_change: float,
-        *,
-        settling: bool,
-    ) -> TickMetrics:
-        """Metrics of the team after tick ``number`` (docs/metrics.md).
-
-        ``max_change`` is the largest change of a log-odds by the iterations.
-        """
+    ) -> TickCounts:
+        """Counts of the team after a tick. ``max_change`` is the largest change of a log-odds by the iterations."""
         compared = [component.compare(team, graph) for component in self._components]
-        comparison = self._combined([of_maps for of_maps, _ in compared])
         links = self._link_metrics(graph, traffic)
         robots = tuple(
-            self._robot_metrics(robot, robot.index in graph.active, traffic.published[robot.index], links, comparison)
+            self._robot_counts(robot, robot.index in graph.active, traffic.published[robot.index], links)
             for robot in team.robots
         )
-        num_leaves = sum(robot.num_leaves for robot in robots)
-        return TickMetrics(
-            tick=number,
-            stamp_ns=stamp_ns,
-            settling=settling,
-            total_distance_published=published_distance,
-            total_distance=comparison.total_distance,
-            total_distance_all=comparison.total_distance_all,
-            distance_per_leaf=comparison.total_distance / max(num_leaves, 1),
-            distance_per_cell_and_link=comparison.total_distance / max(comparison.num_link_cells, 1),
-            num_known_cells=comparison.num_known_cells,
-            label_disagreement=comparison.label_disagreement,
+        return TickCounts(
+            published_distance=published_distance,
+            comparison=functools.reduce(operator.add, (of_maps for of_maps, _ in compared)),
             max_change=max_change,
             robots=robots,
             links=links,
             pairs=tuple(pair for _, pairs in compared for pair in pairs),
+            parts=None if self._tile_cells is None else self._parts(team, traffic, self._tile_cells),
         )
 
-    def _combined(self, comparisons: Sequence[MapComparison]) -> MapComparison:
-        """Comparison of the whole team: sums over the components, and the robots' numbers within theirs."""
-        if len(comparisons) == 1:
-            return comparisons[0]
-        num_robots, num_cells = len(self._robot_ids), [c.num_known_cells for c in comparisons]
-        parts = list(zip(self._components, comparisons, strict=True))
-        disagreeing = sum(c.label_disagreement * c.num_known_cells for c in comparisons)
-
-        def joined(name: str) -> Any:
-            return sum(component.spread(getattr(c, name), num_robots) for component, c in parts)
-
-        return MapComparison(
-            total_distance=sum(c.total_distance for c in comparisons),
-            total_distance_all=sum(c.total_distance_all for c in comparisons),
-            num_known_cells=sum(num_cells),
-            label_disagreement=disagreeing / max(sum(num_cells), 1),
-            num_link_cells=sum(c.num_link_cells for c in comparisons),
-            num_cells=joined("num_cells"),
-            agreement=joined("agreement"),
-            agreement_occupied=joined("agreement_occupied"),
-            entropy_bits=joined("entropy_bits"),
+    def _parts(self, team: Team[Robot], traffic: Traffic, tile_cells: int) -> TileParts:
+        """What the counts of a tile need to be joined with those of others."""
+        published = (
+            part if publication and publication.sizes else None
+            for part, publication in zip(self._published_parts, traffic.published, strict=True)
+        )  # fmt: skip
+        (component,) = self._components
+        return TileParts(
+            tuple(robot.stream_part(tile_cells) for robot in team.robots), tuple(published), component.evidence_part()
         )
 
-    def _robot_metrics(
-        self,
-        robot: Robot,
-        active: bool,
-        published: Publication | None,
-        links: Sequence[LinkMetrics],
-        comparison: MapComparison,
-    ) -> RobotMetrics:
-        """One robot's part of the metrics."""
-        num_cells = int(comparison.num_cells[robot.index])
-        sizes = published.sizes if published else MapSizes()
+    def _robot_counts(
+        self, robot: Robot, is_active: bool, published: Publication | None, links: Sequence[LinkMetrics]
+    ) -> RobotCounts:
+        """One robot's part of the counts."""
         sent_bytes = sum(link.sent_bytes for link in links if link.sender == robot.robot_id)
         if published and self._config.effective_packet.cast == "broadcast":
             # One packet reaches all its receivers.
             sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.messages)
-        return RobotMetrics(
+        return RobotCounts(
             robot_id=robot.robot_id,
-            active=active,
+            is_active=is_active,
             num_scans=robot.num_scans,
             num_iterations=robot.num_iterations,
-            agreement=float(comparison.agreement[robot.index]),
-            agreement_occupied=float(comparison.agreement_occupied[robot.index]),
-            num_leaves=robot.size.num_leaves,
-            num_cells=num_cells,
-            observed_volume=num_cells * robot.map.resolution**3,
-            entropy_bits=float(comparison.entropy_bits[robot.index]),
+            stream=robot.size,
+            sizes=published.sizes if published else None,
             memory_bytes=robot.memory_bytes,
             sent_bytes=sent_bytes,
             packet_bytes=published.packet_bytes if published else 0,
-            octree_bytes=sizes.octree_bytes,
-            grid_bytes=sizes.grid_bytes,
-            unpruned_bytes=sizes.unpruned_bytes,
-            unpruned_compressed_bytes=sizes.unpruned_compressed_bytes,
         )
 
     def _link_metrics(self, graph: CommunicationGraph, traffic: Traffic) -> tuple[LinkMetrics, ...]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay.config.output import OutputConfig
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import OutputError
@@ -86,6 +87,17 @@ _SHOWN: Mapping[str, _Form] = {
     "OctoMap tree": _Form("octomap_every", _octomap, "write_octomap"),
 }
 """Forms of the maps for other programs by name."""
+
+
+def shown_periods(output: OutputConfig) -> dict[str, float]:
+    """Return the period [s] of each form of the maps that is stored for other programs."""
+    periods = {name: getattr(output, form.period) for name, form in _SHOWN.items()}
+    return {name: every for name, every in periods.items() if every is not None}
+
+
+def map_periods(output: OutputConfig) -> tuple[float, ...]:
+    """Return the periods [s] at which maps are stored in any form."""
+    return (output.state_every, *shown_periods(output).values())
 
 
 class _StateSeries:
@@ -238,7 +250,7 @@ class Recorder:
             self._store_maps(tick, self._writer)
         if self._config.output.evidence_every and self._is_due(tick, self._config.output.evidence_every):
             self._store_evidence(tick, self._writer)
-        for name, every in self._shown_periods().items():
+        for name, every in shown_periods(self._config.output).items():
             if self._is_due(tick, every):
                 self._write_shown(name, tick, self._writer)
         self._queue.start()
@@ -262,7 +274,7 @@ class Recorder:
                 self._store_maps(tick, self._writer)
             if self._evidence.last_tick < tick.number:
                 self._store_evidence(tick, self._writer)
-            for name in self._shown_periods():
+            for name in shown_periods(self._config.output):
                 if self._shown_ticks[name] < tick.number:
                     self._write_shown(name, tick, self._writer)
             self._queue.start()
@@ -336,11 +348,6 @@ class Recorder:
         """Store every robot's evidence."""
         for states in self._evidence.encode(tick, tick.graph.robot_ids, tick.evidence, [1] * len(tick.evidence)):
             self._write_each(writer.write_evidence, ((state,) for state in states))
-
-    def _shown_periods(self) -> dict[str, float]:
-        """Period [s] of each form of the maps that is stored for other programs."""
-        periods = {name: getattr(self._config.output, form.period) for name, form in _SHOWN.items()}
-        return {name: every for name, every in periods.items() if every is not None}
 
     def _write_shown(self, name: str, tick: Tick, writer: ResultWriter) -> None:
         """Store every robot's map in a form for other programs; maps that the form cannot hold are left out."""

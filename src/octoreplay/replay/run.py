@@ -77,7 +77,7 @@ def replay_team(
     if config.alignment.is_on_air:
         config = without_computed_frames(config)
     total_ns = config.total_ns
-    _check_num_ticks(config, total_ns)
+    check_num_ticks(config, total_ns)
     num_threads = num_threads or min(len(config.robots), os.cpu_count() or 1)
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
@@ -116,7 +116,7 @@ def replay_team(
                 raise
             except InputError as error:
                 if recorder.last is None:
-                    raise InputError(f"{error}: {_causes(team.counts, config.time)}") from error
+                    raise InputError(f"{error}: {frame_causes(team.counts, config.time)}") from error
                 raise
             team.leave_out(session.num_frames_off)
             warnings = (
@@ -136,7 +136,7 @@ def replay_team(
         return summary
 
 
-def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
+def check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
     """Raise ConfigError where a run would have more than MAX_TICKS ticks."""
     num_ticks = (total_ns or 0) / 1e9 / config.network.publish_period
     if config.consensus.settle:
@@ -155,7 +155,7 @@ def _check_num_ticks(config: RunConfig, total_ns: int | None) -> None:
         )
 
 
-def _causes(counts: Mapping[str, FrameCounts], time: TimeConfig) -> str:
+def frame_causes(counts: Mapping[str, FrameCounts], time: TimeConfig) -> str:
     """Causes for which frames were not used, robot by robot, with the remedy."""
 
     def text(of_robot: FrameCounts) -> str:

@@ -12,8 +12,9 @@ from octoreplay.config.fields import MAX_TICKS
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import InputError
+from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster
-from octoreplay.records import Frame, RobotPose
+from octoreplay.records import CENTRAL, Frame, RobotPose
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
 from octoreplay.replay.exchange.neighbours import Exchange
 from octoreplay.replay.exchange.packet_codec import PacketCodec
@@ -22,15 +23,16 @@ from octoreplay.replay.joining import Joining
 from octoreplay.replay.measure import TickMeasurer, Traffic
 from octoreplay.replay.network.graph import CommunicationGraph, Link, TeamNetwork, check_team_graph, step_weights_of
 from octoreplay.replay.network.links import Links
-from octoreplay.replay.robots.robot import REPLAY, MapSizes, Phase, Publication, Robot, Turn
+from octoreplay.replay.robots.robot import REPLAY, Phase, Publication, Robot, Turn
 from octoreplay.replay.robots.team import make_team
 from octoreplay.replay.settling import NO_SETTLING, Settling
 from octoreplay.replay.tick import Tick, falls_due
+from octoreplay.replay.tick_counts import tick_metrics
 from octoreplay.replay.timeline import Bodies, FrameSource, Position, Timeline
 
 _STATE = (
     "is_symmetric", "num_frames_off", "team", "joining", "_network", "_links", "_measurer", "_graph", "_num_ticks",
-    "_settling", "_reopened",
+    "_settling", "_reopened", "_start_ns",
 )  # fmt: skip
 """Attributes of a session that change from tick to tick."""
 
@@ -53,7 +55,7 @@ class Session:
     config : ResolvedRun
         Configuration of the run.
     sources : sequence of FrameSource
-        Frames of each robot, in the order of ``config.robots``.
+        Frames of each robot, in the order of ``config.robots``; none for a session that only settles.
     threads : Executor
         Threads for the work of a tick. The result does not depend on them.
     bodies : Bodies, optional
@@ -61,6 +63,8 @@ class Session:
     reopen : function, optional
         New source of the frames of a robot, given by its index, with another ``T_team_map`` (7 numbers); needed where
         robots begin in their own frames (``align: on-air``). ``sources`` are then in the frames of ``joining``.
+    tile : optional
+        Part of the space that ``config.map.bounds`` cut out of a run in tiles; the counts of a tick then have parts.
 
     Attributes
     ----------
@@ -91,6 +95,7 @@ class Session:
         *,
         bodies: Bodies | None = None,
         reopen: Callable[[int, tuple[float, ...]], FrameSource] | None = None,
+        tile_cells: int | None = None,
     ) -> None:
         self.config = config
         self.stop_reason = ""
@@ -109,7 +114,7 @@ class Session:
         self._reopen = reopen
         self._of_thread = _ThreadCaster(config)
         self._links: Links[Content] = Links(config)
-        self._measurer = TickMeasurer(config, threads)
+        self._measurer = TickMeasurer(config, threads, tile_cells)
         if self.joining is not None:
             self._measurer.regroup(self.joining.frames.components)
         self._period_ns = round(config.network.publish_period * 1e9)
@@ -118,30 +123,61 @@ class Session:
         self._settling: Settling | None = None
         # Transform of each robot whose log was opened again.
         self._reopened: dict[int, tuple[float, ...]] = {}
+        self._start_ns = self._timeline.first_stamp_ns
 
     def ticks(self) -> Iterator[Tick]:
         """The team after every tick, settling included; after ``restore``, every further tick."""
-        start_ns = self._start_ns()
-        while self._settling is None and self._has_scans():
-            self._check_next_frame(start_ns)
-            number, stamp_ns = self._num_ticks, start_ns + self._num_ticks * self._period_ns
+        if self._settling is None:
+            yield from self.log_ticks()
+        # The scans of the last period are integrated, but not published yet.
+        yield from self.settling_ticks()
+
+    def log_ticks(self) -> Iterator[Tick]:
+        """The team after every tick before settling. Raises InputError without frames."""
+        if self._start_ns is None:
+            raise InputError("no robot has a frame that can be used")
+        while self._has_scans():
+            self._check_next_frame(self._start_ns)
+            number, stamp_ns = self._num_ticks, self._stamp_of(self._num_ticks)
             self._join(number)
             self._integrate(number, stamp_ns)
             yield self._exchange(number, stamp_ns)
-        # The scans of the last period are integrated, but not published yet.
-        yield from self._settle(start_ns)
 
-    def _settle(self, start_ns: int) -> Iterator[Tick]:
-        """Ticks over the last graph with gamma ramped to 0, until no log-odds changes (Alg. 1's stopping rule)."""
+    @property
+    def num_ticks(self) -> int:
+        """Number of ticks so far."""
+        return self._num_ticks
+
+    @property
+    def maps(self) -> dict[str, SemanticOctree]:
+        """The robots' octrees h_i - h_0 by robot_id, and the centralised map."""
+        return {**{robot.robot_id: robot.map for robot in self.team.robots}, CENTRAL: self._measurer.oracle}
+
+    @property
+    def evidence(self) -> dict[str, SemanticOctree]:
+        """The robots' octrees s_i by robot_id."""
+        return {robot.robot_id: robot.evidence.octree for robot in self.team.robots}
+
+    @property
+    def largest_log_odds(self) -> float:
+        """Largest |log-odds| of any robot's map, relative to the prior."""
+        return max(robot.largest_log_odds() for robot in self.team.robots)
+
+    def settling_ticks(self, largest: float | None = None, least_ticks: int = 0) -> Iterator[Tick]:
+        """The team after every tick over the last graph with gamma ramped to 0, until no log-odds changes.
+
+        This is the stopping rule of Alg. 1. ``largest`` (default: ``largest_log_odds``) is that of the whole team where
+        this is a tile of it. A team that has settled before tick ``least_ticks`` of settling goes on until then.
+        """
         if self.config.consensus.settle == 0:
             self.stop_reason = NO_SETTLING
             return
         if self._settling is None:
-            largest = max(robot.largest_log_odds() for robot in self.team.robots)
+            largest = self.largest_log_odds if largest is None else largest
             self._settling = Settling(self._graph, self.config, self._links.longest_transmission, largest)
-        for phase in self._settling.phases():
+        for phase in self._settling.phases(least_ticks):
             number = self._num_ticks
-            tick = self._exchange(number, start_ns + number * self._period_ns, phase)
+            tick = self._exchange(number, self._stamp_of(number), phase)
             self._settling.note(tick.metrics.max_change)
             yield tick
             # Frees the versions of maps in its messages.
@@ -162,6 +198,7 @@ class Session:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue a new session after the tick of a ``state``; reads the logs up to there again.
 
+        A session without ``sources`` can only settle.
         Raises InputError where the logs hold fewer frames than were used.
         """
         position: Position = state["position"]
@@ -169,11 +206,12 @@ class Session:
             setattr(self, name, state[name])
         if self._bodies is not None and self._settling is None:
             for number in range(self._num_ticks):
-                self._advance_bodies(self._start_ns() + number * self._period_ns)
+                self._advance_bodies(self._stamp_of(number))
         if self._reopen is not None:
             for index, T_team_map in self._reopened.items():
                 self._timeline.rewind(index, self._reopen(index, T_team_map))
-        self._each(lambda index: self._timeline.skip_to(index, position), range(len(self.team.robots)))
+        if self._timeline.first_stamp_ns is not None:
+            self._each(lambda index: self._timeline.skip_to(index, position), range(len(self.team.robots)))
 
     # --- one tick -----------------------------------------------------------------------------------------------------
 
@@ -186,9 +224,8 @@ class Session:
         published_distance = self._measurer.published_distance(number, self.team, graph)
         max_change = self._iterate(graph, phase, number)
         traffic = Traffic(published, self._links.take_counts(), receipts)
-        metrics = self._measurer.measure(
-            number, stamp_ns, self.team, graph, traffic, published_distance, max_change, settling=settling
-        )
+        counts = self._measurer.measure(self.team, graph, traffic, published_distance, max_change)
+        metrics = tick_metrics(self.config, number, stamp_ns, counts, settling=settling)
         if self.joining is not None:
             metrics = dataclasses.replace(metrics, places=self.joining.frames.places)
             if not settling:
@@ -202,7 +239,7 @@ class Session:
         )
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots),
-            tuple(robot.evidence.octree for robot in robots), self._measurer.oracle, tuple(poses), metrics,
+            tuple(robot.evidence.octree for robot in robots), self._measurer.oracle, tuple(poses), metrics, counts,
         )  # fmt: skip
 
     # --- the steps of a tick ------------------------------------------------------------------------------------------
@@ -291,7 +328,7 @@ class Session:
         messages = self._each(lambda index: outbox(robots[index], receivers[index], number), graph.active)
         for index, own_evidence in zip(graph.active, messages, strict=True):
             if own_evidence:
-                others = published.get(index, Publication((), MapSizes()))
+                others = published.get(index, Publication((), None))
                 published[index] = dataclasses.replace(others, own_evidence=own_evidence)
 
     def _deliver(self, graph: CommunicationGraph, stamp_ns: int) -> dict[Link, Receipt]:
@@ -327,12 +364,10 @@ class Session:
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 
-    def _start_ns(self) -> int:
-        """Stamp of the first tick. Raises InputError without frames."""
-        start_ns = self._timeline.first_stamp_ns
-        if start_ns is None:
-            raise InputError("no robot has a frame that can be used")
-        return start_ns
+    def _stamp_of(self, number: int) -> int:
+        """Stamp of a tick."""
+        assert self._start_ns is not None
+        return self._start_ns + number * self._period_ns
 
     def _has_scans(self) -> bool:
         """True before the first tick, while scans are left, and while robots may still find each other's frames."""

@@ -64,13 +64,13 @@ class Settling:
         self._num_quiet = 0
         self._num_ticks = 0
 
-    def phases(self) -> Iterator[Phase]:
-        """Phase of each settling tick that is left.
+    def phases(self, least_ticks: int = 0) -> Iterator[Phase]:
+        """Phase of each settling tick that is left, up to tick ``least_ticks`` at least.
 
         In tick n the factor of gamma is 1 - n / settle, and 0 after the ramp. Flows have 2 n bits more, until every
         step is the quantum.
         """
-        while self._num_ticks < self._most and not self._has_converged():
+        while self._num_ticks < self._most and not (self._num_ticks >= least_ticks and self._has_converged()):
             self._num_ticks += 1
             n = self._num_ticks
             if n <= self._num_finer:

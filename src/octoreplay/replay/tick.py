@@ -8,6 +8,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import RobotPose
 from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.robots.robot import Publication
+from octoreplay.replay.tick_counts import TickCounts
 from octoreplay.run_metrics import TickMetrics
 
 
@@ -15,7 +16,8 @@ from octoreplay.run_metrics import TickMetrics
 class Tick:
     """The team after one tick.
 
-    ``maps`` are the robots' octrees h_i - h_0, and ``evidence`` their octrees s_i; the next tick changes both.
+    ``counts`` are those that the ``metrics`` were computed from. ``maps`` are the robots' octrees h_i - h_0, and
+    ``evidence`` their octrees s_i; the next tick changes both.
     """
 
     number: int
@@ -28,6 +30,7 @@ class Tick:
     oracle: SemanticOctree
     poses: tuple[RobotPose, ...]
     metrics: TickMetrics
+    counts: TickCounts
 
 
 def falls_due(elapsed_ns: int, period_ns: int, every: float) -> bool:

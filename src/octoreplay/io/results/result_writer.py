@@ -146,14 +146,23 @@ class ResultWriter:
         Raises ConfigError where the settings or the inputs of that run were different, and InputError where its file is
         damaged.
         """
-        for (name, values), (_, earlier) in zip(self._writer.written.metadata, written.metadata, strict=True):
-            if values != earlier:
-                raise ConfigError(f"{self.path}: cannot be continued: {_difference(name, values, earlier)}")
+        self.check_same(dict(written.metadata))
         self._writer.take_over(self.partial_path, written)
         self._started = self._has_ticks = True
         with interrupts.deferred(), writing(self.partial_path):
             publish(self._work_path, self.partial_path)
             self._work_path = self.partial_path
+
+    @property
+    def description(self) -> dict[str, dict[str, str]]:
+        """Metadata that describe the run and its inputs, by name."""
+        return dict(self._writer.written.metadata)
+
+    def check_same(self, earlier: Mapping[str, Mapping[str, str]]) -> None:
+        """Raise ConfigError where an ``earlier`` run, by its description, had other settings or inputs."""
+        for name, values in self.description.items():
+            if values != earlier[name]:
+                raise ConfigError(f"{self.path}: cannot be continued: {_difference(name, values, earlier[name])}")
 
     def write_state(self, state: MapState) -> None:
         """Write one robot's map, a key frame or a delta, to ``/<robot>/map_state``."""

@@ -24,7 +24,8 @@ class SensorLogs:
     """Frames of one robot, read lazily, a ``RobotLog`` for each of its sensors; a context manager.
 
     The frames of several sensors are merged in the order of their stamps, equal stamps in the order of the sensors. The
-    poses are those of the first sensor. Arguments and errors are those of ``RobotLog``.
+    poses are those of the first sensor. Arguments and errors are those of ``RobotLog``; ``elsewhere`` has an entry for
+    each sensor, or none.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class SensorLogs:
         *,
         reach: float = math.inf,
         logs: Sequence[LogReader] | None = None,
+        elsewhere: Sequence[Mapping[int, Float64Array]] = (),
     ) -> None:
         self.robot = robot
         self._used = FrameCounts()
@@ -42,7 +44,10 @@ class SensorLogs:
         with ExitStack() as stack:
             if logs is None:
                 logs = [stack.enter_context(open_log(path)) for path in robot.logs]
-            self._sensors = tuple(RobotLog(view, time, class_table, reach=reach, logs=logs) for view in robot.views)
+            self._sensors = tuple(
+                RobotLog(view, time, class_table, reach=reach, logs=logs, elsewhere=elsewhere[n] if elsewhere else None)
+                for n, view in enumerate(robot.views)
+            )
             self._closing = stack.pop_all()
         self.first_stamp_ns = min(sensor.first_stamp_ns for sensor in self._sensors)
         """First stamp of any sensor, clock offset applied."""

@@ -22,7 +22,7 @@ from octoreplay.mapping.sensor import (
     unclamped_increments,
 )
 from octoreplay.mapping.snapshot import Snapshot
-from octoreplay.mapping.stream_size import StreamMeter
+from octoreplay.mapping.stream_size import StreamMeter, StreamPart
 from octoreplay.mapping.streams import StreamSize
 from octoreplay.records import Float64Array, Frame, Int64Array
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
@@ -72,23 +72,36 @@ class Turn(Generic[RobotT_co]):
 
 @dataclass(frozen=True)
 class MapSizes:
-    """Sizes of a published map in other encodings [bytes]: as octree, as uniform grid, as octree without pruning."""
+    """Sizes of a published map in other encodings.
 
-    octree_bytes: int = 0
-    grid_bytes: int = 0
-    unpruned_bytes: int = 0
-    unpruned_compressed_bytes: int = 0
+    Attributes
+    ----------
+    stream : StreamSize
+        Size of the map's stream.
+    num_cells : int
+        Known cells.
+    unpruned : StreamSize or None
+        Size of the stream without pruning; None where it was not measured.
+    unpruned_compressed_bytes : int
+        Size of the packet without pruning; 0 where it was not measured.
+    """
+
+    stream: StreamSize
+    num_cells: int
+    unpruned: StreamSize | None
+    unpruned_compressed_bytes: int
 
 
 @dataclass(frozen=True, eq=False)
 class Publication:
     """Messages of a robot in one tick, each with its receivers, and the sizes of the robot's map.
 
-    ``outbox`` are the messages of the rule, ``own_evidence`` those to robots in other frames.
+    ``outbox`` are the messages of the rule, ``own_evidence`` those to robots in other frames. ``sizes`` are None where
+    the rule published nothing.
     """
 
     outbox: Sequence[tuple[tuple[int, ...], MapMessage]]
-    sizes: MapSizes
+    sizes: MapSizes | None
     own_evidence: Sequence[tuple[tuple[int, ...], MapMessage]] = ()
 
     @property
@@ -159,9 +172,9 @@ class Robot(ABC):
         self.map = octree()
         self.size = StreamSize()
         self._meter = StreamMeter(self.map)
-        # Sizes of the map without pruning as of a tick: plain and compressed.
+        # Sizes of the map without pruning as of a tick: stream, and compressed [bytes].
         self._unpruned_tick: int | None = None
-        self._unpruned_bytes = (0, 0)
+        self._unpruned: tuple[StreamSize | None, int] = (None, 0)
 
     @property
     def evidence(self) -> Evidence:
@@ -228,20 +241,18 @@ class Robot(ABC):
         return Publication(self.publish(receivers, tick), self.map_sizes(tick, with_unpruned=with_unpruned))
 
     def map_sizes(self, tick: int, *, with_unpruned: bool) -> MapSizes:
-        """Sizes of the robot's map. The sizes without pruning are costly, and 0 unless ``with_unpruned``."""
-        num_classes = self.map.num_classes
+        """Sizes of the robot's map. Those without pruning are costly, and not measured unless ``with_unpruned``."""
         measured = self._unpruned_tick
         if with_unpruned and (measured is None or (self.map.revisions >= measured).any()):
             unpruned = self.map.streams(prune=False)
             packed = codec.pack(self.map, unpruned, codec.FULL)
-            self._unpruned_bytes, self._unpruned_tick = (unpruned.size.num_bytes(num_classes), len(packed)), tick
-        plain, compressed = self._unpruned_bytes
-        return MapSizes(
-            octree_bytes=codec.HEADER_BYTES + self.size.num_bytes(num_classes),
-            grid_bytes=codec.grid_bytes(self.map.num_cells, num_classes),
-            unpruned_bytes=codec.HEADER_BYTES + plain if with_unpruned else 0,
-            unpruned_compressed_bytes=compressed if with_unpruned else 0,
-        )
+            self._unpruned, self._unpruned_tick = (unpruned.size, len(packed)), tick
+        unpruned_size, compressed = self._unpruned if with_unpruned else (None, 0)
+        return MapSizes(self.size, self.map.num_cells, unpruned_size, compressed)
+
+    def stream_part(self, tile_cells: int) -> StreamPart:
+        """The size of the map's stream as of the last ``size``, for a map in tiles with an edge of ``tile_cells``."""
+        return self._meter.part(tile_cells)
 
     @abstractmethod
     def advance_map(self, tick: int) -> None:

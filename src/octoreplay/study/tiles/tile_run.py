@@ -1,0 +1,192 @@
+"""Replay of one tile of a run, in stages: its logs, and settling up to a tick on which all tiles agree."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from octoreplay.config.resolved import ResolvedRun
+from octoreplay.io.output_file import write_whole
+from octoreplay.io.robots.team_bodies import TeamBodies
+from octoreplay.mapping import codec
+from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.records import CENTRAL, Float64Array
+from octoreplay.replay.checkpoint import load_state, save_state
+from octoreplay.replay.recorder import map_periods
+from octoreplay.replay.session import Session
+from octoreplay.replay.sources import TeamSources
+from octoreplay.replay.tick import Tick, falls_due
+from octoreplay.study.tiles.geometry import Tile
+from octoreplay.study.tiles.work import StoredMaps, TickFile, TileTick
+
+MAPS, EVIDENCE = "maps", "evidence"
+"""Kinds of stored maps."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How far a tile is.
+
+    Attributes
+    ----------
+    num_ticks, num_settling : int
+        Ticks, and those of them in which the tile settled.
+    length : int
+        Length of the file of ticks [byte].
+    largest : float
+        Largest |log-odds| of any map at the end of the logs.
+    stop_reason : str
+        Reason for the end; empty before settling.
+    is_symmetric : bool
+        True where all links carried both ways with the same weight.
+    num_frames_off : list of dict
+        Frames that were left out because the schedule had the robot off, by robot and sensor.
+    """
+
+    num_ticks: int
+    num_settling: int
+    length: int
+    largest: float
+    stop_reason: str
+    is_symmetric: bool
+    num_frames_off: list[dict[int, int]]
+
+
+class TileFiles:
+    """Paths of the work files of a tile in a folder."""
+
+    def __init__(self, folder: Path, tile: Tile) -> None:
+        self.ticks = folder / f"{tile.name}.ticks"
+        self.state = folder / f"{tile.name}.state"
+        self.stage = folder / f"{tile.name}.json"
+
+    def read_stage(self) -> Stage | None:
+        """Return how far the tile is; None where it has not finished its logs."""
+        try:
+            values = json.loads(self.stage.read_text(encoding="utf-8"))
+            values["num_frames_off"] = [{int(k): n for k, n in off.items()} for off in values["num_frames_off"]]
+            stage = Stage(**values)
+            return stage if self.ticks.stat().st_size >= stage.length and self.state.exists() else None
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+
+class TileRun:
+    """Replay of one tile in its own process.
+
+    ``config`` is the configuration of the whole run, ``folder`` that of the work files.
+    """
+
+    def __init__(self, config: ResolvedRun, tile: Tile, folder: Path) -> None:
+        self._config = tile.config(config)
+        self._tile = tile
+        self._files = TileFiles(folder, tile)
+
+    def replay_logs(self, elsewhere: Sequence[Sequence[Mapping[int, Float64Array]]], num_threads: int) -> Stage:
+        """Replay the logs up to their end. ``elsewhere`` are the frames that do not touch the tile (``TeamSources``).
+
+        Raises ConfigError, InputError and OutputError.
+        """
+        config = self._config
+        with ExitStack() as stack:
+            team = stack.enter_context(TeamSources(config, elsewhere))
+            hides = config.sensor.hide_robots
+            bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
+            threads = stack.enter_context(ThreadPoolExecutor(num_threads))
+            session = Session(config, team.sources, threads, bodies=bodies, tile_cells=self._tile.num_cells)
+            recorder = _TileRecorder(config)
+            with TickFile(self._files.ticks, 0) as file:
+                for tick in session.log_ticks():
+                    file.write(recorder.record(tick))
+                return self._pause(session, recorder, file, num_settling=0)
+
+    def settle(self, largest: float, least_ticks: int, num_threads: int) -> Stage:
+        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles."""
+        stage = self._files.read_stage()
+        assert stage is not None
+        with ThreadPoolExecutor(num_threads) as threads:
+            session = Session(self._config, (), threads, tile_cells=self._tile.num_cells)
+            content = load_state(self._files.state, session.shared)
+            session.restore(content["session"])
+            recorder = _TileRecorder(self._config, content["stored"])
+            num_settling = stage.num_settling
+            with TickFile(self._files.ticks, stage.length) as file:
+                for tick in session.settling_ticks(largest, least_ticks):
+                    num_settling += 1
+                    file.write(recorder.record(tick))
+                return self._pause(session, recorder, file, num_settling=num_settling)
+
+    def _pause(self, session: Session, recorder: _TileRecorder, file: TickFile, *, num_settling: int) -> Stage:
+        """Save the state, from which the next stage continues."""
+        length = file.flush()
+        # The stage describes the state only once that is complete.
+        self._files.stage.unlink(missing_ok=True)
+        save_state(self._files.state, {"session": session.state(), "stored": recorder.stored}, session.shared)
+        stage = Stage(
+            session.num_ticks, num_settling, length, session.largest_log_odds, session.stop_reason,
+            session.is_symmetric, session.num_frames_off,
+        )  # fmt: skip
+        write_whole(self._files.stage, json.dumps(asdict(stage)))
+        return stage
+
+
+class _TileRecorder:
+    """Recorder of the ticks of a tile. ``stored`` is its state, which refers to octrees of the session."""
+
+    def __init__(self, config: ResolvedRun, stored: dict[str, Any] | None = None) -> None:
+        self._config = config
+        self._period_ns = round(config.network.publish_period * 1e9)
+        self.stored: dict[str, Any] = stored or {"start_ns": None, MAPS: (-1, {}), EVIDENCE: (-1, {})}
+
+    def record(self, tick: Tick) -> TileTick:
+        """Return what the work file holds of a tick."""
+        if self.stored["start_ns"] is None:
+            self.stored["start_ns"] = tick.stamp_ns
+        output = self._config.output
+        names = tick.graph.robot_ids
+        maps, evidence = None, None
+        if self._is_due(tick, map_periods(output)):
+            maps = self.changes(MAPS, tick.number, dict(zip((*names, CENTRAL), (*tick.maps, tick.oracle), strict=True)))
+        if output.evidence_every and self._is_due(tick, (output.evidence_every,)):
+            evidence = self.changes(EVIDENCE, tick.number, dict(zip(names, tick.evidence, strict=True)))
+        return TileTick(tick.number, tick.stamp_ns, tick.settling, tick.graph, tick.poses, tick.counts, maps, evidence)
+
+    def changes(self, kind: str, number: int, octrees: Mapping[str, SemanticOctree]) -> StoredMaps:
+        """Return the changes of octrees by name since they were stored before, and note that they are stored now."""
+        last_tick, before = self.stored[kind]
+        self.stored[kind] = (number, dict(octrees))
+        changes = {}
+        for name, octree in octrees.items():
+            # A robot that restarted has another octree.
+            is_new = before.get(name) is not octree
+            bricks = np.arange(octree.num_bricks) if is_new else np.flatnonzero(octree.revisions > last_tick)
+            changes[name] = (is_new, codec.encode_delta(octree, bricks))
+        return changes
+
+    def _is_due(self, tick: Tick, periods: Iterable[float]) -> bool:
+        elapsed_ns = tick.stamp_ns - self.stored["start_ns"]
+        return any(falls_due(elapsed_ns, self._period_ns, every) for every in periods)
+
+
+class LastMaps(NamedTuple):
+    """Changes of a tile's maps and evidence from when they were stored to its last tick."""
+
+    maps: StoredMaps
+    evidence: StoredMaps
+
+
+def last_maps(config: ResolvedRun, tile: Tile, folder: Path, threads: Executor) -> LastMaps:
+    """Return the last maps of a tile. Raises InputError where its work files are damaged."""
+    config = tile.config(config)
+    session = Session(config, (), threads, tile_cells=tile.num_cells)
+    content = load_state(TileFiles(folder, tile).state, session.shared)
+    session.restore(content["session"])
+    recorder, number = _TileRecorder(config, content["stored"]), session.num_ticks - 1
+    return LastMaps(recorder.changes(MAPS, number, session.maps), recorder.changes(EVIDENCE, number, session.evidence))

@@ -1,0 +1,192 @@
+"""Worker processes that replay tiles: each waits for requests and answers them one by one."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from octoreplay.config.resolved import ResolvedRun
+from octoreplay.errors import InputError, OctoreplayError
+from octoreplay.study.tiles.geometry import Tile
+from octoreplay.study.tiles.tile_run import Stage, TileRun
+
+MAX_TRIES = 3
+"""Number of processes that may die on one request."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Request:
+    """Work on one tile: a method of ``TileRun`` and its arguments but the number of threads."""
+
+    tile: Tile
+    method: str
+    arguments: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What a worker process needs to know of a run."""
+
+    config: ResolvedRun
+    folder: Path
+    num_threads: int
+
+
+class _DiedError(Exception):
+    """The worker process ended without an answer."""
+
+
+class _Worker:
+    """A worker process, started with the first request and again after its death."""
+
+    def __init__(self, setup: _Setup) -> None:
+        self._setup = setup
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def answer(self, request: Request) -> Stage:
+        """Return the answer to a request. Raises the error of the request, and _DiedError."""
+        try:
+            if self._process is None:
+                # With -P nothing is imported from the working folder. In a session of its own the child gets no Ctrl-C.
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"], stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE, start_new_session=True,
+                )  # fmt: skip
+                self._send(self._setup)
+            self._send(request)
+            assert self._process.stdout is not None
+            answer = pickle.load(self._process.stdout)
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            code = self.stop()
+            raise _DiedError(f"ended with code {code}" if code >= 0 else f"was killed by signal {-code}") from error
+        if isinstance(answer, BaseException):
+            raise answer
+        assert isinstance(answer, Stage)
+        return answer
+
+    def _send(self, content: object) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        pickle.dump(content, self._process.stdin, protocol=5)
+        self._process.stdin.flush()
+
+    def stop(self) -> int:
+        """Kill the process; return its exit code."""
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        with contextlib.suppress(OSError):
+            process.kill()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+        return process.wait()
+
+
+class Workers:
+    """Worker processes for the tiles of one run; a context manager that ends them."""
+
+    def __init__(self, config: ResolvedRun, folder: Path, num_jobs: int, num_threads: int) -> None:
+        setup = _Setup(config, folder, num_threads)
+        self._all = [_Worker(setup) for _ in range(num_jobs)]
+        self._free: SimpleQueue[_Worker] = SimpleQueue()
+        for worker in self._all:
+            self._free.put(worker)
+        self._is_closed = threading.Event()
+        self._threads = ThreadPoolExecutor(num_jobs)
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._is_closed.set()
+        for worker in self._all:
+            worker.stop()
+        self._threads.shutdown(cancel_futures=True)
+
+    def answers(self, requests: Sequence[Request]) -> Iterator[tuple[Tile, Stage]]:
+        """Yield the answers to requests in the order in which they come.
+
+        A request whose process died is given to another one, MAX_TRIES times. Raises InputError where all of them died.
+        """
+        futures = {self._threads.submit(self._answer, request): request for request in requests}
+        for future in as_completed(futures):
+            yield futures[future].tile, future.result()
+
+    def _answer(self, request: Request) -> Stage:
+        """Answer of any free worker."""
+        worker = self._free.get()
+        try:
+            for number in range(MAX_TRIES):
+                try:
+                    return worker.answer(request)
+                except _DiedError as error:
+                    if self._is_closed.is_set() or number == MAX_TRIES - 1:
+                        raise InputError(
+                            f"{request.tile.name}: its process {error}, {MAX_TRIES} times; if memory ran out, give a"
+                            " smaller --tiles or fewer --jobs, and --resume"
+                        ) from error
+                    _log.warning("warning: %s: its process %s; it is started again", request.tile.name, error)
+        finally:
+            self._free.put(worker)
+        raise AssertionError
+
+
+def serve() -> None:
+    """Answer the requests of the parent process until it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The warnings of a run are those of all its tiles; the parent gives them once.
+    logging.disable(logging.WARNING)
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    # Whatever else prints must not mix with the answers.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    _end_with_parent()
+    setup = pickle.load(sys.stdin.buffer)
+    assert isinstance(setup, _Setup)
+    while True:
+        try:
+            request = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        pickle.dump(_answer_to(setup, request), answers, protocol=5)
+        answers.flush()
+
+
+def _answer_to(setup: _Setup, request: Request) -> Stage | BaseException:
+    """Answer to a request, or its error."""
+    try:
+        run = TileRun(setup.config, request.tile, setup.folder)
+        method: Callable[..., Stage] = getattr(run, request.method)
+        return method(*request.arguments, num_threads=setup.num_threads)
+    except OctoreplayError as error:
+        return error
+    except Exception:
+        return RuntimeError(f"{request.tile.name}:\n{traceback.format_exc()}")
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            threading.Event().wait(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
