@@ -122,7 +122,7 @@ def replay_team(
             warnings = (
                 *config.warnings,
                 *rule_warnings(config, session.is_symmetric),
-                *map_warnings(recorder.num_known_cells),
+                *map_warnings(0 if recorder.last is None else recorder.last.metrics.num_known_cells),
                 *recorder.frame_warnings(),
                 *coverage_warnings(team.counts),
             )

@@ -40,7 +40,7 @@ CONFIGURATIONS = {
     "plain floats": {"flow_bits": 0, "quantum": 0.0},
     "plain floats, loss": {"flow_bits": 0, "quantum": 0.0, "loss": 0.3},
     "random graph, other programs": {"topology": "random", "evidence_every": 1.0, "grid_every": 1.0},
-    "range": {"topology": "range", "comm_range": 4.0},
+    "range": {"topology": "range", "radio_range": 4.0, "range_hysteresis": 1.0},
     "broadcast": {"cast": "broadcast"},
     "no settling": {"settle": 0},
     "bounds": {"bounds": (-3.0, -4.0, 0.0, 9.0, 3.0, 2.0)},

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
+import math
 import os
 import shutil
 import time
@@ -21,13 +23,14 @@ from octoreplay.io.output_file import write_whole, writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.mapping.warm_up import second_compiler
-from octoreplay.records import CONVERGED, FilePath
-from octoreplay.replay.recorder import Recorder
+from octoreplay.records import CONVERGED, FilePath, FrameCounts
 from octoreplay.replay.run import check_num_ticks, frame_causes
-from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings
+from octoreplay.replay.team_recorder import TeamRecorder
+from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
-from octoreplay.study.tiles.joined import joined_ticks
+from octoreplay.study.tiles.joined_maps import JoinedMaps
+from octoreplay.study.tiles.joined_ticks import joined_ticks
 from octoreplay.study.tiles.survey import Survey
 from octoreplay.study.tiles.tile_run import Stage, TileFiles
 from octoreplay.study.tiles.worker import Request, Workers
@@ -99,16 +102,10 @@ def replay_tiles(
         workers = stack.enter_context(Workers(config, folder, num_jobs, num_threads))
         stages = _replay_logs(config, survey, tiles, workers, folder, progress)
         stages = _settle(tiles, stages, workers, progress)
-        threads = stack.enter_context(ThreadPoolExecutor(num_threads))
-        recorder = stack.enter_context(Recorder(config, writer, threads))
-        num_ticks = next(iter(stages.values())).num_ticks
+        counts = survey.counts(next(iter(stages.values())).num_frames_off)
         with interrupts.deferred() as deliver_interrupts:
-            for tick in joined_ticks(config, tiles, folder, threads):
-                recorder.record(tick)
-                if progress is not None:
-                    progress("write", tick.number + 1, num_ticks)
-                deliver_interrupts()
-            summary = _summary(config, recorder, survey, stages, time.monotonic() - started)
+            summary = _write(config, writer, tiles, stages, folder, counts, num_threads, progress, deliver_interrupts)
+            summary = dataclasses.replace(summary, wall_seconds=time.monotonic() - started)
             deliver_interrupts()
             writer.complete(summary)
         return summary
@@ -228,20 +225,34 @@ def _settle(
                 progress("settle", num_done, len(tiles))
 
 
-def _summary(
-    config: ResolvedRun, recorder: Recorder, survey: Survey, stages: Mapping[Tile, Stage], wall_seconds: float
-) -> RunSummary:
-    """Complete the result and return its summary."""
+def _write(
+    config: ResolvedRun, writer: ResultWriter, tiles: Sequence[Tile], stages: Mapping[Tile, Stage], folder: Path,
+    counts: Mapping[str, FrameCounts], num_threads: int, progress: Callable[[str, int, int], None] | None,
+    deliver_interrupts: Callable[[], None],
+) -> RunSummary:  # fmt: skip
+    """Write all ticks and maps of the run, and return its summary without the wall time."""
     first = next(iter(stages.values()))
-    reasons = {stage.stop_reason for stage in stages.values()}
-    counts = survey.counts(first.num_frames_off)
-    warnings = (
-        *config.warnings,
-        *rule_warnings(config, first.is_symmetric),
-        *map_warnings(recorder.num_known_cells),
-        *recorder.frame_warnings(),
-        *coverage_warnings(counts),
-    )
-    # A tile that has not settled stands for the team.
-    reason = next(iter(reasons - {CONVERGED}), CONVERGED)
-    return recorder.finish(reason, counts, warnings, wall_seconds)
+    maps = JoinedMaps(config, tiles, folder)
+    with ThreadPoolExecutor(num_threads) as threads, TeamRecorder(config, writer, threads) as recorder:
+        maps.encode(threads)
+        deliver_interrupts()
+        written_maps = maps.write(recorder.queue)
+        for tick in joined_ticks(config, tiles, folder):
+            recorder.record(tick.metrics, tick.graph, tick.poses)
+            next(written_maps)
+            recorder.queue.start()
+            if progress is not None:
+                progress("write", tick.metrics.tick + 1, first.num_ticks)
+            deliver_interrupts()
+        assert recorder.last is not None
+        warnings = (
+            *config.warnings,
+            *rule_warnings(config, first.is_symmetric),
+            *map_warnings(recorder.last.num_known_cells),
+            *team_frame_warnings(recorder.last, {name: n for name, n in maps.num_evidence_cells.items() if n}),
+            *coverage_warnings(counts),
+        )
+        # A tile that has not settled stands for the team.
+        reasons = {stage.stop_reason for stage in stages.values()}
+        reason = next(iter(reasons - {CONVERGED}), CONVERGED)
+        return recorder.finish(reason, counts, warnings, math.nan)

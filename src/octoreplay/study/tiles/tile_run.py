@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL, Float64Array
 from octoreplay.replay.checkpoint import load_state, save_state
-from octoreplay.replay.recorder import map_periods
+from octoreplay.replay.map_recorder import map_periods
 from octoreplay.replay.session import Session
 from octoreplay.replay.sources import TeamSources
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.work import StoredMaps, TickFile, TileTick
+from octoreplay.study.tiles.work import StoredMap, TileTick, WorkFile
 
 MAPS, EVIDENCE = "maps", "evidence"
 """Kinds of stored maps."""
@@ -38,8 +38,8 @@ class Stage:
     ----------
     num_ticks, num_settling : int
         Ticks, and those of them in which the tile settled.
-    length : int
-        Length of the file of ticks [byte].
+    lengths : (int, int)
+        Lengths of the files of ticks and of maps [byte].
     largest : float
         Largest |log-odds| of any map at the end of the logs.
     stop_reason : str
@@ -52,7 +52,7 @@ class Stage:
 
     num_ticks: int
     num_settling: int
-    length: int
+    lengths: tuple[int, int]
     largest: float
     stop_reason: str
     is_symmetric: bool
@@ -64,6 +64,8 @@ class TileFiles:
 
     def __init__(self, folder: Path, tile: Tile) -> None:
         self.ticks = folder / f"{tile.name}.ticks"
+        self.maps = folder / f"{tile.name}.maps"
+        self.last_maps = folder / f"{tile.name}.last"
         self.state = folder / f"{tile.name}.state"
         self.stage = folder / f"{tile.name}.json"
 
@@ -72,10 +74,13 @@ class TileFiles:
         try:
             values = json.loads(self.stage.read_text(encoding="utf-8"))
             values["num_frames_off"] = [{int(k): n for k, n in off.items()} for off in values["num_frames_off"]]
+            values["lengths"] = tuple(values["lengths"])
             stage = Stage(**values)
-            return stage if self.ticks.stat().st_size >= stage.length and self.state.exists() else None
+            sizes = self.ticks.stat().st_size, self.maps.stat().st_size
         except (OSError, ValueError, TypeError, KeyError):
             return None
+        is_whole = self.state.exists() and all(size >= n for size, n in zip(sizes, stage.lengths, strict=True))
+        return stage if is_whole else None
 
 
 class TileRun:
@@ -101,11 +106,10 @@ class TileRun:
             bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
             threads = stack.enter_context(ThreadPoolExecutor(num_threads))
             session = Session(config, team.sources, threads, bodies=bodies, tile_cells=self._tile.num_cells)
-            recorder = _TileRecorder(config)
-            with TickFile(self._files.ticks, 0) as file:
+            with _TileRecorder(config, self._files) as recorder:
                 for tick in session.log_ticks():
-                    file.write(recorder.record(tick))
-                return self._pause(session, recorder, file, num_settling=0)
+                    recorder.record(tick)
+                return self._pause(session, recorder, num_settling=0)
 
     def settle(self, largest: float, least_ticks: int, num_threads: int) -> Stage:
         """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles."""
@@ -115,22 +119,25 @@ class TileRun:
             session = Session(self._config, (), threads, tile_cells=self._tile.num_cells)
             content = load_state(self._files.state, session.shared)
             session.restore(content["session"])
-            recorder = _TileRecorder(self._config, content["stored"])
             num_settling = stage.num_settling
-            with TickFile(self._files.ticks, stage.length) as file:
+            with _TileRecorder(self._config, self._files, stage.lengths, content["stored"]) as recorder:
                 for tick in session.settling_ticks(largest, least_ticks):
                     num_settling += 1
-                    file.write(recorder.record(tick))
-                return self._pause(session, recorder, file, num_settling=num_settling)
+                    recorder.record(tick)
+                return self._pause(session, recorder, num_settling=num_settling)
 
-    def _pause(self, session: Session, recorder: _TileRecorder, file: TickFile, *, num_settling: int) -> Stage:
-        """Save the state, from which the next stage continues."""
-        length = file.flush()
-        # The stage describes the state only once that is complete.
+    def _pause(self, session: Session, recorder: _TileRecorder, *, num_settling: int) -> Stage:
+        """Save the state, from which the next stage continues, and the maps, in case that it is the last one."""
+        lengths = recorder.flush()
+        # The stage describes the other files only once they are complete.
         self._files.stage.unlink(missing_ok=True)
+        with WorkFile(self._files.last_maps, 0) as file:
+            for stored in recorder.last_maps(session):
+                file.write_map(stored)
+            file.flush()
         save_state(self._files.state, {"session": session.state(), "stored": recorder.stored}, session.shared)
         stage = Stage(
-            session.num_ticks, num_settling, length, session.largest_log_odds, session.stop_reason,
+            session.num_ticks, num_settling, lengths, session.largest_log_odds, session.stop_reason,
             session.is_symmetric, session.num_frames_off,
         )  # fmt: skip
         write_whole(self._files.stage, json.dumps(asdict(stage)))
@@ -138,55 +145,69 @@ class TileRun:
 
 
 class _TileRecorder:
-    """Recorder of the ticks of a tile. ``stored`` is its state, which refers to octrees of the session."""
+    """Recorder of the ticks and maps of a tile, after the first ``lengths`` bytes of its files; a context manager.
 
-    def __init__(self, config: ResolvedRun, stored: dict[str, Any] | None = None) -> None:
-        self._config = config
+    ``stored`` is its state, which refers to octrees of the session.
+    """
+
+    def __init__(
+        self,
+        config: ResolvedRun,
+        files: TileFiles,
+        lengths: tuple[int, int] = (0, 0),
+        stored: dict[str, Any] | None = None,
+    ) -> None:
+        self._output = config.output
         self._period_ns = round(config.network.publish_period * 1e9)
         self.stored: dict[str, Any] = stored or {"start_ns": None, MAPS: (-1, {}), EVIDENCE: (-1, {})}
+        with ExitStack() as stack:
+            self._ticks = stack.enter_context(WorkFile(files.ticks, lengths[0]))
+            self._maps = stack.enter_context(WorkFile(files.maps, lengths[1]))
+            self._closing = stack.pop_all()
 
-    def record(self, tick: Tick) -> TileTick:
-        """Return what the work file holds of a tick."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._closing.close()
+
+    def record(self, tick: Tick) -> None:
+        """Write one tick, and the maps that are due in it."""
         if self.stored["start_ns"] is None:
             self.stored["start_ns"] = tick.stamp_ns
-        output = self._config.output
         names = tick.graph.robot_ids
-        maps, evidence = None, None
-        if self._is_due(tick, map_periods(output)):
-            maps = self.changes(MAPS, tick.number, dict(zip((*names, CENTRAL), (*tick.maps, tick.oracle), strict=True)))
-        if output.evidence_every and self._is_due(tick, (output.evidence_every,)):
-            evidence = self.changes(EVIDENCE, tick.number, dict(zip(names, tick.evidence, strict=True)))
-        return TileTick(tick.number, tick.stamp_ns, tick.settling, tick.graph, tick.poses, tick.counts, maps, evidence)
+        self._ticks.write_tick(TileTick(tick.number, tick.stamp_ns, tick.settling, tick.graph, tick.poses, tick.counts))
+        if self._is_due(tick, map_periods(self._output)):
+            maps = dict(zip((*names, CENTRAL), (*tick.maps, tick.oracle), strict=True))
+            self._write(self._changes(MAPS, tick.number, maps))
+        if self._output.evidence_every and self._is_due(tick, (self._output.evidence_every,)):
+            self._write(self._changes(EVIDENCE, tick.number, dict(zip(names, tick.evidence, strict=True))))
 
-    def changes(self, kind: str, number: int, octrees: Mapping[str, SemanticOctree]) -> StoredMaps:
-        """Return the changes of octrees by name since they were stored before, and note that they are stored now."""
+    def last_maps(self, session: Session) -> Iterator[StoredMap]:
+        """Yield the changes of all maps and evidence up to the last tick; they do not count as stored."""
+        stored, number = dict(self.stored), session.num_ticks - 1
+        yield from self._changes(MAPS, number, session.maps)
+        yield from self._changes(EVIDENCE, number, session.evidence)
+        self.stored = stored
+
+    def flush(self) -> tuple[int, int]:
+        """Return the lengths of the files, which hold everything that was recorded."""
+        return self._ticks.flush(), self._maps.flush()
+
+    def _write(self, changes: Iterable[StoredMap]) -> None:
+        for stored in changes:
+            self._maps.write_map(stored)
+
+    def _changes(self, kind: str, number: int, octrees: Mapping[str, SemanticOctree]) -> Iterator[StoredMap]:
+        """Yield the changes of octrees by name since they were stored before, and note that they are stored now."""
         last_tick, before = self.stored[kind]
         self.stored[kind] = (number, dict(octrees))
-        changes = {}
         for name, octree in octrees.items():
             # A robot that restarted has another octree.
             is_new = before.get(name) is not octree
             bricks = np.arange(octree.num_bricks) if is_new else np.flatnonzero(octree.revisions > last_tick)
-            changes[name] = (is_new, codec.encode_delta(octree, bricks))
-        return changes
+            yield StoredMap(number, kind == EVIDENCE, name, is_new, codec.encode_delta(octree, bricks))
 
     def _is_due(self, tick: Tick, periods: Iterable[float]) -> bool:
         elapsed_ns = tick.stamp_ns - self.stored["start_ns"]
         return any(falls_due(elapsed_ns, self._period_ns, every) for every in periods)
-
-
-class LastMaps(NamedTuple):
-    """Changes of a tile's maps and evidence from when they were stored to its last tick."""
-
-    maps: StoredMaps
-    evidence: StoredMaps
-
-
-def last_maps(config: ResolvedRun, tile: Tile, folder: Path, threads: Executor) -> LastMaps:
-    """Return the last maps of a tile. Raises InputError where its work files are damaged."""
-    config = tile.config(config)
-    session = Session(config, (), threads, tile_cells=tile.num_cells)
-    content = load_state(TileFiles(folder, tile).state, session.shared)
-    session.restore(content["session"])
-    recorder, number = _TileRecorder(config, content["stored"]), session.num_ticks - 1
-    return LastMaps(recorder.changes(MAPS, number, session.maps), recorder.changes(EVIDENCE, number, session.evidence))

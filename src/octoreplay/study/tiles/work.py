@@ -6,11 +6,13 @@ They belong to one run on one machine or one shared file system, and are removed
 from __future__ import annotations
 
 import contextlib
+import io
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import NamedTuple, Self
 
 import zstandard
 
@@ -22,18 +24,30 @@ from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick_counts import TickCounts
 
 _LENGTH = struct.Struct("<I")
+_MAP = struct.Struct("<IBBHI")
+"""Tick, whether it is evidence, whether it is new, and the lengths of name and packet."""
 
 
-StoredMaps = dict[str, tuple[bool, bytes]]
-"""Changes of maps in one tile since they were stored before, by robot_id, 'central' for the centralised map.
+class StoredMap(NamedTuple):
+    """Change of one map in one tile since it was stored before.
 
-Each is a delta packet, and True where the map begins anew: the robot restarted, or the map was not stored before.
-"""
+    - ``number``: the tick.
+    - ``is_evidence``: True for evidence s_i, False for a map h_i - h_0.
+    - ``name``: robot_id, or 'central'.
+    - ``is_new``: True where the map begins anew: the robot restarted, or the map was not stored before.
+    - ``delta``: delta packet.
+    """
+
+    number: int
+    is_evidence: bool
+    name: str
+    is_new: bool
+    delta: bytes
 
 
 @dataclass(frozen=True, eq=False)
 class TileTick:
-    """One tick of one tile. ``maps`` and ``evidence`` are None where they are not stored."""
+    """One tick of one tile."""
 
     number: int
     stamp_ns: int
@@ -41,12 +55,10 @@ class TileTick:
     graph: CommunicationGraph
     poses: tuple[RobotPose, ...]
     counts: TickCounts
-    maps: StoredMaps | None
-    evidence: StoredMaps | None
 
 
-class TickFile:
-    """File of the ticks of a tile, written after the first ``length`` bytes; a context manager."""
+class WorkFile:
+    """Work file, written after the first ``length`` bytes; a context manager. Methods raise OutputError."""
 
     def __init__(self, path: Path, length: int) -> None:
         self._path = path
@@ -55,35 +67,63 @@ class TickFile:
             self._file.truncate(length)
             self._file.seek(length)
 
-    def __enter__(self) -> TickFile:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         with contextlib.suppress(OSError):
             self._file.close()
 
-    def write(self, tick: TileTick) -> None:
-        """Write one tick. Raises OutputError."""
+    def write_tick(self, tick: TileTick) -> None:
+        """Write one tick."""
         data = zstandard.compress(pickled({item.name: getattr(tick, item.name) for item in fields(TileTick)}), 1)
         with writing(self._path):
             self._file.write(_LENGTH.pack(len(data)) + data)
 
+    def write_map(self, stored: StoredMap) -> None:
+        """Write the change of one map."""
+        name = stored.name.encode()
+        head = _MAP.pack(stored.number, stored.is_evidence, stored.is_new, len(name), len(stored.delta))
+        with writing(self._path):
+            self._file.write(head + name + stored.delta)
+
     def flush(self) -> int:
-        """Hand what was written to the operating system; return the length of the file [byte]. Raises OutputError."""
+        """Hand what was written to the operating system; return the length of the file [byte]."""
         with writing(self._path):
             self._file.flush()
             return self._file.tell()
 
 
+def read_maps(path: Path, name: str) -> Iterator[StoredMap]:
+    """Yield the changes of one map and of its robot's evidence. Raises InputError for a file that cannot be read."""
+    wanted = name.encode()
+    with _reading(path), path.open("rb") as file:
+        while head := file.read(_MAP.size):
+            number, is_evidence, is_new, name_length, length = _MAP.unpack(head)
+            if file.read(name_length) != wanted:
+                file.seek(length, io.SEEK_CUR)
+                continue
+            delta = file.read(length)
+            if len(delta) != length:
+                raise struct.error("it is cut")
+            yield StoredMap(number, bool(is_evidence), name, bool(is_new), delta)
+
+
 def read_ticks(path: Path) -> Iterator[TileTick]:
-    """Yield the ticks of a tile. Raises InputError for a file that is cut or cannot be read."""
+    """Yield the ticks of a tile. Raises InputError for a file that cannot be read."""
+    with _reading(path), path.open("rb") as file:
+        while head := file.read(_LENGTH.size):
+            (length,) = _LENGTH.unpack(head)
+            data = file.read(length)
+            if len(data) != length:
+                raise struct.error("it is cut")
+            yield TileTick(**unpickled(zstandard.decompress(data)))
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn errors of a work file into InputError."""
     try:
-        with path.open("rb") as file:
-            while head := file.read(_LENGTH.size):
-                (length,) = _LENGTH.unpack(head)
-                data = file.read(length)
-                if len(data) != length:
-                    raise InputError(f"{path}: is cut; run with --restart to start from the beginning")
-                yield TileTick(**unpickled(zstandard.decompress(data)))
+        yield
     except (OSError, struct.error, zstandard.ZstdError, UnpicklingError, TypeError) as error:
         raise InputError(f"{path}: cannot be read: {error}; run with --restart to start from the beginning") from error

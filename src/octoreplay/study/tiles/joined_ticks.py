@@ -1,4 +1,4 @@
-"""Ticks of a whole run from those of its tiles."""
+"""Metrics of a whole run from the counts of its tiles."""
 
 from __future__ import annotations
 
@@ -6,78 +6,40 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from pathlib import Path
+from typing import NamedTuple
 
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.mapping import codec
 from octoreplay.mapping.joined_contradiction import JoinedEvidence
-from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.stream_size import joined_size, joined_unpruned_size
-from octoreplay.records import CENTRAL
+from octoreplay.records import RobotPose
+from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.robots.robot import MapSizes
-from octoreplay.replay.tick import Tick
 from octoreplay.replay.tick_counts import RobotCounts, TickCounts, TileParts, tick_metrics
-from octoreplay.run_metrics import LinkMetrics
+from octoreplay.run_metrics import LinkMetrics, TickMetrics
 from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.tile_run import TileFiles, last_maps
-from octoreplay.study.tiles.work import StoredMaps, TileTick, read_ticks
+from octoreplay.study.tiles.tile_run import TileFiles
+from octoreplay.study.tiles.work import read_ticks
 
 
-def joined_ticks(config: ResolvedRun, tiles: Sequence[Tile], folder: Path, threads: Executor) -> Iterator[Tick]:
+class JoinedTick(NamedTuple):
+    """Tick of a whole run: its metrics, graph and poses."""
+
+    metrics: TickMetrics
+    graph: CommunicationGraph
+    poses: tuple[RobotPose, ...]
+
+
+def joined_ticks(config: ResolvedRun, tiles: Sequence[Tile], folder: Path) -> Iterator[JoinedTick]:
     """Yield the ticks of a run whose tiles have all settled with the same number of ticks.
 
-    Maps are those of the last tick in which tiles stored them, which the next tick changes; after the last tick they
-    are the last ones. Raises InputError where work files are damaged.
+    Raises InputError where work files are damaged.
     """
-    team = _Team(config)
     joiner = _CountsJoiner(config)
-    rows = zip(*(read_ticks(TileFiles(folder, tile).ticks) for tile in tiles), strict=True)
-    row = next(rows, None)
-    while row is not None:
-        following = next(rows, None)
-        for of_tile in row:
-            team.apply(of_tile.number, of_tile.maps, of_tile.evidence)
-        if following is None:
-            for tile in tiles:
-                last = last_maps(config, tile, folder, threads)
-                team.apply(row[0].number, last.maps, last.evidence)
-        yield team.tick(row[0], joiner.joined([of_tile.counts for of_tile in row]))
-        row = following
-
-
-class _Team:
-    """Maps of the whole team."""
-
-    def __init__(self, config: ResolvedRun) -> None:
-        self._config = config
-        self._robot_ids = tuple(robot.robot_id for robot in config.robots)
-        self._maps = {name: self._octree() for name in (*self._robot_ids, CENTRAL)}
-        self._evidence = {name: self._octree() for name in self._robot_ids}
-        # Tick in which each octree began anew.
-        self._begun: dict[int, int] = {}
-
-    def _octree(self) -> SemanticOctree:
-        return SemanticOctree(self._config.map.resolution, self._config.classes.num_classes)
-
-    def apply(self, number: int, maps: StoredMaps | None, evidence: StoredMaps | None) -> None:
-        """Apply the changes that a tile stored in a tick."""
-        for octrees, stored in ((self._maps, maps), (self._evidence, evidence)):
-            for name, (is_new, delta) in (stored or {}).items():
-                # All tiles of a robot begin anew in the same tick.
-                if is_new and self._begun.get(id(octrees[name])) != number:
-                    octrees[name] = self._octree()
-                    self._begun[id(octrees[name])] = number
-                codec.apply_delta(octrees[name], delta, number)
-
-    def tick(self, first: TileTick, counts: TickCounts) -> Tick:
-        """Tick of the team; what is alike in all tiles is that of the ``first``."""
-        metrics = tick_metrics(self._config, first.number, first.stamp_ns, counts, settling=first.settling)
-        return Tick(
-            first.number, first.stamp_ns, first.settling, first.graph, (),
-            tuple(self._maps[name] for name in self._robot_ids),
-            tuple(self._evidence[name] for name in self._robot_ids), self._maps[CENTRAL], first.poses, metrics, counts,
-        )  # fmt: skip
+    for row in zip(*(read_ticks(TileFiles(folder, tile).ticks) for tile in tiles), strict=True):
+        first, counts = row[0], joiner.joined([of_tile.counts for of_tile in row])
+        metrics = tick_metrics(config, first.number, first.stamp_ns, counts, settling=first.settling)
+        yield JoinedTick(metrics, first.graph, first.poses)
 
 
 class _CountsJoiner:
