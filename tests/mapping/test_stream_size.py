@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.mapping.kernels import storage
-from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.mapping.stream_size import StreamMeter
+from octoreplay.mapping.octree import SemanticOctree, codes_to_keys
+from octoreplay.mapping.stream_size import StreamMeter, joined_size, joined_unpruned_size
 from octoreplay.mapping.streams import StreamSize
 from support.long_suite import examples, long
 from support.octree_factory import cube, octree_of
@@ -86,3 +86,54 @@ def test_unchanged_chunks_are_not_counted_again():
     # A change without a new revision stays unseen.
     octree.bricks.values[:1] = 3.0
     assert meter.update(2) == before
+
+
+def tiles_of(octree, num_cells):
+    """Parts of an octree in columns with an edge of ``num_cells``, and the sizes of their streams without pruning."""
+    keys = codes_to_keys(octree.codes * storage.BRICK_CELLS)[:, :2] // num_cells
+    for tile in np.unique(keys, axis=0):
+        part = SemanticOctree(octree.resolution, octree.num_classes)
+        part.overwrite(octree, np.flatnonzero((keys == tile).all(axis=1)), 1)
+        yield part
+
+
+def check_joined(octree, num_cells):
+    parts, unpruned = [], []
+    for tile in tiles_of(octree, num_cells):
+        meter = StreamMeter(tile)
+        meter.update(0)
+        parts.append(meter.part(num_cells))
+        unpruned.append(tile.streams(prune=False).size)
+    assert joined_size(parts) == octree.streams().size
+    assert joined_unpruned_size(unpruned, parts) == octree.streams(prune=False).size
+
+
+@examples(60)
+@given(octree=octrees(), num_cells=st.sampled_from([16, 32, 128]))
+def test_sizes_of_tiles_are_joined(octree, num_cells):
+    if octree.num_bricks:
+        check_joined(octree, num_cells)
+
+
+@pytest.mark.parametrize("num_cells", [16, 32, 64])
+def test_leaves_above_the_tiles_are_merged(num_cells):
+    octree = uniform(32, -2.0)
+    check_joined(octree, num_cells)
+    parts = []
+    for tile in tiles_of(octree, num_cells):
+        meter = StreamMeter(tile)
+        meter.update(0)
+        parts.append(meter.part(num_cells))
+    assert joined_size(parts).num_leaves == 1
+    octree.bricks.values[octree.find(np.array([octree.codes.max()]))[0]] = 1.5
+    check_joined(octree, num_cells)
+
+
+def test_an_empty_tile_has_no_size():
+    empty, octree = SemanticOctree(0.25, 2), uniform(8, 1.0)
+    meters = [StreamMeter(empty), StreamMeter(octree)]
+    for meter in meters:
+        meter.update(0)
+    parts = [meter.part(32) for meter in meters]
+    assert joined_size(parts[:1]) == StreamSize()
+    assert joined_size(parts) == octree.streams().size

@@ -14,7 +14,6 @@ from octoreplay.mapping.kernels import consensus as consensus_kernels
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.metrics import MapComparer
 from octoreplay.replay import session as session_module
-from octoreplay.replay.measure import TickMeasurer
 from octoreplay.replay.robots import anchor as anchor_module
 from octoreplay.replay.robots import consensus as consensus_module
 from octoreplay.replay.robots import robot as robot_module
@@ -341,12 +340,12 @@ def _each_robot(robots, name, change):
     ],
 )  # fmt: skip
 def test_the_comparison_fails_with_a_wrong_metric(monkeypatch, name, wrong):
-    right = TickMeasurer.measure
+    right = session_module.tick_metrics
 
-    def measure(self, *args, **kwargs):
-        metrics = right(self, *args, **kwargs)
+    def measured(*args, **kwargs):
+        metrics = right(*args, **kwargs)
         return dataclasses.replace(metrics, **{name: wrong(getattr(metrics, name))})
 
-    monkeypatch.setattr(TickMeasurer, "measure", measure)
+    monkeypatch.setattr(session_module, "tick_metrics", measured)
     with pytest.raises(AssertionError):
         compare(SMALL, topology="line", rule="gradient", settle=0, every=50, with_metrics=True)
