@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from octoreplay.records import ClassTable, LeafTable, SemanticClass
     from octoreplay.replay.alignment import Alignment, RobotFrame, align_logs, aligned_config
     from octoreplay.replay.run import Progress, replay_team
+    from octoreplay.study.tiles.run import replay_tiles
     from octoreplay.report.export import export_map
     from octoreplay.result import PointQuery, Result, StoredMap, open_result
     from octoreplay.run_metrics import RunSummary, TickMetrics
@@ -81,6 +82,7 @@ _MODULES = {
     "open_log": "io.containers.logs",
     "open_result": "result",
     "replay_team": "replay.run",
+    "replay_tiles": "study.tiles.run",
     "resolve": "io.robots.discover",
     "run_sweep": "study.sweep",
     "simulate_team": "simulate.team",
@@ -93,8 +95,8 @@ __all__ = [
     "Progress", "Result", "ResultComparison", "RobotConfig", "RobotFrame", "RunConfig", "RunSummary", "SemanticClass",
     "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "Table", "TickMetrics", "__version__", "align_logs",
     "aligned_config", "check_result", "compare_results", "discover", "evaluate_result", "export_map", "import_clouds",
-    "import_rgbd", "load_frames_file", "load_team_file", "open_log", "open_result", "replay_team", "resolve",
-    "run_sweep", "simulate_team",
+    "import_rgbd", "load_frames_file", "load_team_file", "open_log", "open_result", "replay_team", "replay_tiles",
+    "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 
