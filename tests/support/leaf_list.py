@@ -69,4 +69,4 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stored maps be leaf lists."""
     monkeypatch.setattr("octoreplay.result.decode_packet", decode)
     monkeypatch.setattr("octoreplay.result.apply_delta", apply)
-    monkeypatch.setattr("octoreplay.result.scaled_map", scaled)
+    monkeypatch.setattr("octoreplay.stored_map.scaled_map", scaled)

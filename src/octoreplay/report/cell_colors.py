@@ -12,7 +12,8 @@ from octoreplay.errors import InputError
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.mapping.contradiction import CellContradiction, cell_contradictions, state_limits
 from octoreplay.records import MEAN, BoolArray, ClassTable, Color, Float64Array, FloatArray, LeafTable, UInt8Array
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 COLORS = ("label", "height", "robot", "seen-by", "disagreement", "contradiction", "probability")
 """Quantities that colours show:

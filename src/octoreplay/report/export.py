@@ -21,7 +21,8 @@ from octoreplay.log_odds import best_labels
 from octoreplay.mapping.merged_faces import merged_faces
 from octoreplay.records import MAP_KINDS, POSTERIOR, BoolArray, ClassTable, FilePath, Int64Array, LeafTable, UInt8Array
 from octoreplay.report.cell_colors import COLORS, LeafColors, check_one_frame, default_color, leaf_colors
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
+from octoreplay.stored_map import StoredMap
 
 _log = logging.getLogger(__name__)
 

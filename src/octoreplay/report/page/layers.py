@@ -30,7 +30,8 @@ from octoreplay.report.page.tiles import (
     tile_places,
     tiles_of,
 )
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 TEAM_LAYER = "/team"
 """Name of the layer of the team's map; names of robots do not begin with a slash."""

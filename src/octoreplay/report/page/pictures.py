@@ -15,7 +15,8 @@ from octoreplay.records import UInt8Array
 from octoreplay.report.cell_colors import FREE_COLOR
 from octoreplay.report.map_view import cube_faces, draw, opacities, overlay, view_of
 from octoreplay.report.page.team_map import together
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 _SIZE = (900, 560)
 _VIEWS = ((-60.0, "seen from the south-east"), (120.0, "seen from the north-west"))

@@ -26,7 +26,8 @@ from octoreplay.report.page.tiles import (
     runs_hold,
     union,
 )
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 SEVERAL = 255
 """Value of the field ``first`` where several robots knew a cell in the same period."""

@@ -27,8 +27,9 @@ from octoreplay.log_odds import best_labels
 from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, FilePath, Float64Array, LeafTable
 from octoreplay.report.figures import COLORS
 from octoreplay.report.viewers.scene import Scene, scene_of
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
 from octoreplay.run_metrics import TickMetrics
+from octoreplay.stored_map import StoredMap
 
 TIMELINE = "elapsed"
 """Main time axis: time since the run's start. The others are ``stamp`` (log time) and ``tick``."""
