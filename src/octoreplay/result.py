@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -25,6 +25,7 @@ from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.mapping.codec import apply_delta, decode_packet, max_memory
+from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.metric_tables import METRIC_TABLES, POSES, metrics_table, pose_table
 from octoreplay.records import (
@@ -37,7 +38,7 @@ from octoreplay.records import (
     public_names,
 )
 from octoreplay.run_metrics import FramePlace, RunSummary, TickMetrics
-from octoreplay.stored_map import StoredMap
+from octoreplay.stored_map import StoredMap, key_box
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,13 +73,15 @@ class Result:
     def plot(
         self, what: str, *, label: str | None = None, beside: Mapping[str, Result] | None = None, style: str = "screen",
         robot: str | None = None, at: float | None = None, color: str | None = None,
+        max_depth: int | None = None,
     ) -> Figure:  # fmt: skip
         """Return a matplotlib figure of the run, as ``octoreplay plot`` draws it.
 
         ``what`` is 'phi', 'packets', 'agreement', 'coverage', 'links', 'contradiction' or 'map'. ``label`` is the name
         of this result in the figure, by default that of its file; ``beside`` are further results by label. ``style`` is
         'screen', 'one-column', 'two-column' or 'talk'. Of a map, ``robot`` is its robot (default: the first one),
-        ``at`` its time since the run's start in seconds (default: the end), and ``color`` as in ``export_map``.
+        ``at`` its time since the run's start in seconds (default: the end), and ``color`` and ``max_depth`` are as in
+        ``export_map``.
 
         Raises ConfigError for an unknown name, and InputError for a result without what the figure shows.
         """
@@ -86,7 +89,7 @@ class Result:
         from octoreplay.report.result_figures import result_figure
 
         results = {label or self.path.stem: self, **(beside or {})}
-        return result_figure(what, results, style, robot=robot, at=at, color=color)
+        return result_figure(what, results, style, robot=robot, at=at, color=color, max_depth=max_depth)
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -195,44 +198,56 @@ class Result:
         """
         return self._reader.poses(robot_id)
 
-    def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
+    def map(
+        self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None, bounds: Sequence[float] = (),
+    ) -> StoredMap:  # fmt: skip
         """Return a robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
-        ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then.
+        ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then. ``bounds`` are those
+        of a run, (zmin, zmax) or (xmin, ymin, zmin, xmax, ymax, zmax) in the map's frame [m]: the map has the cells
+        with centres in this box only, bit for bit as in the whole map. Its packets are decompressed as a whole, and
+        only the bricks near the box are made.
 
         Raises InputError for an unknown robot, a tick without a stored map, or a time before the first stored map.
         Raises PacketError where a stored map is damaged or has another format version.
+        Raises ConfigError for other bounds, as ``StoredMap.cut``.
         Raises ValueError for both ``at_ns`` and ``tick``.
         """
-        return self._last_state(robot_id, at_ns, tick, evidence=False)
+        return self._last_state(robot_id, at_ns, tick, bounds, evidence=False)
 
-    def evidence(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
+    def evidence(
+        self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None, bounds: Sequence[float] = (),
+    ) -> StoredMap:  # fmt: skip
         """Return a robot's evidence s_i: the sum of its own scans' log-odds, without anything that others sent.
 
-        ``at_ns`` and ``tick`` are as in ``map``. The evidence at the end of a run is always stored, earlier one every
-        ``evidence_every`` seconds. It is that of the robot's current restart epoch, clamped to ``clamp_min`` and
-        ``clamp_max`` with ``evidence: sum``, else unclamped.
+        ``at_ns``, ``tick`` and ``bounds`` are as in ``map``. The evidence at the end of a run is always stored, earlier
+        one every ``evidence_every`` seconds. It is that of the robot's current restart epoch, clamped to ``clamp_min``
+        and ``clamp_max`` with ``evidence: sum``, else unclamped.
 
         The octree of the returned map (``octree``) has the values s_i [log-odds], (C,) in each cell, in the team's
         frame; ``leaves`` and ``query`` return h_0 + s_i, the posterior of the robot's own scans.
         ``config.robots[i].T_team_map`` is the robot's map frame in the team's frame, as the run used it.
 
         Raises InputError as ``map`` does, and where the result holds no evidence of the robot, which is the case for an
-        interrupted run and for results of octoreplay before evidence was stored. Raises PacketError and ValueError as
-        ``map`` does.
+        interrupted run and for results of octoreplay before evidence was stored. Raises PacketError, ConfigError and
+        ValueError as ``map`` does.
         """
-        return self._last_state(robot_id, at_ns, tick, evidence=True)
+        return self._last_state(robot_id, at_ns, tick, bounds, evidence=True)
 
-    def _last_state(self, robot_id: str, at_ns: int | None, tick: int | None, *, evidence: bool) -> StoredMap:
-        """Last map or evidence stored at or before ``at_ns``, or exactly at ``tick``."""
+    def _last_state(
+        self, robot_id: str, at_ns: int | None, tick: int | None, bounds: Sequence[float], *, evidence: bool
+    ) -> StoredMap:
+        """Last map or evidence stored at or before ``at_ns``, or exactly at ``tick``, in a box."""
+        box = key_box(bounds, self.config.map.resolution) if len(bounds) else None
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
         states = self._reader.states(robot_id, until_ns, evidence=evidence)
-        octree = self._updated(None, states[0])
+        octree = self._updated(None, states[0], box)
         for state in states[1:]:
-            octree = self._updated(octree, state)
-        return self._stored_map(octree, states[-1], is_evidence=evidence)
+            octree = self._updated(octree, state, box)
+        stored = self._stored_map(octree, states[-1], is_evidence=evidence)
+        return stored.cut(bounds) if len(bounds) else stored
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
@@ -251,12 +266,15 @@ class Result:
         if maps:
             yield maps
 
-    def _updated(self, octree: SemanticOctree | None, state: MapState) -> SemanticOctree:
-        """Octree after a stored state. All octrees in use have at most the memory that fits the size of the file."""
+    def _updated(self, octree: SemanticOctree | None, state: MapState, box: KeyBox | None = None) -> SemanticOctree:
+        """Octree, near a box, after a stored state.
+
+        All octrees in use have at most the memory that fits the size of the file.
+        """
         room = self._most_bytes - sum(held.memory_bytes for held in self._octrees)
         try:
             if state.is_key_frame:
-                octree = decode_packet(state.data, room)
+                octree = decode_packet(state.data, room, box)
                 cells = (self.config.map.resolution, self.class_table.num_classes)
                 if (octree.resolution, octree.num_classes) != cells:
                     raise PacketError("damaged: the map has another resolution or number of classes than the run")
@@ -264,7 +282,7 @@ class Result:
             elif octree is None:
                 raise PacketError("damaged: the first stored state is a delta")
             else:
-                apply_delta(octree, state.data, most_bytes=room)
+                apply_delta(octree, state.data, most_bytes=room, box=box)
         except PacketError as error:
             raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; replay the logs again") from error
         return octree

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from octoreplay.config.sensor import region_of
 from octoreplay.data_table import Table
-from octoreplay.errors import InputError
+from octoreplay.errors import ConfigError, InputError
 from octoreplay.log_odds import best_labels, class_probabilities, label_probabilities
 from octoreplay.mapping.consensus import scaled_map
-from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.key_box import KeyBox
+from octoreplay.mapping.octree import KEY_BITS, SemanticOctree
+from octoreplay.mapping.regions import coarsened, cut
 from octoreplay.records import (
     CENTRAL,
     MAP_KINDS,
@@ -98,6 +102,38 @@ class StoredMap:
         """Edge of the finest leaf in metres."""
         return float(self.octree.resolution)
 
+    def cut(self, bounds: Sequence[float]) -> StoredMap:
+        """Return the cells of the map in a box; all other cells are unknown.
+
+        ``bounds`` are those of a run, in the map's frame [m]: (zmin, zmax) or (xmin, ymin, zmin, xmax, ymax, zmax). A
+        cell is inside where its centre is, or where it is on a minimum. ``Result.map`` with ``bounds`` reads less.
+
+        Raises ConfigError for other numbers, a minimum that is not below its maximum, and a box without a cell's
+        centre.
+        """
+        return self._with_octree(cut(self.octree, key_box(bounds, self.resolution)))
+
+    def coarsened(self, max_depth: int | None) -> StoredMap:
+        """Return the map with the nodes at a depth of the octree as its finest cells; all cells for None.
+
+        ``max_depth`` is from 1 to 19, counted from the root as in OctoMap: 19 are the finest cells, and each level less
+        doubles their edge (``resolution``). Larger leaves stay. A coarse cell takes the values of that known cell in it
+        whose label has the largest log-odds, so that it is occupied if one of its cells is. Raises ConfigError for
+        another depth.
+        """
+        if max_depth is None:
+            return self
+        if not 1 <= max_depth <= KEY_BITS:
+            raise ConfigError(f"max_depth: {max_depth} is not a depth from 1 to {KEY_BITS}, the finest cells")
+        return self._with_octree(coarsened(self.octree, max_depth))
+
+    def _with_octree(self, octree: SemanticOctree) -> StoredMap:
+        """Map with another octree."""
+        return StoredMap(
+            octree, self.robot_id, self.tick, self.stamp_ns, self.prior, self.num_robots, self.frame_id,
+            self._most_bytes,
+        )  # fmt: skip
+
     def shown_octree(self, map_kind: str = POSTERIOR) -> SemanticOctree:
         """Return the octree of a form of the map: N (h - h_0) or h - h_0. Raises ValueError for another form."""
         if map_kind not in MAP_KINDS:
@@ -158,3 +194,13 @@ class StoredMap:
         half = table.sizes[:, None] / 2
         inside = ((table.centers + half > low) & (table.centers - half < high)).all(axis=1)
         return LeafTable(table.centers[inside], table.sizes[inside], table.log_odds[inside])
+
+
+def key_box(bounds: Sequence[float], resolution: float) -> KeyBox:
+    """Return the cells in a box that ``StoredMap.cut`` takes. Raises ConfigError as ``StoredMap.cut``."""
+    box = KeyBox.of(region_of(bounds), resolution)
+    if box.is_empty:
+        raise ConfigError(
+            f"bounds: no cell of the map has its centre in the box; give a box with edges of at least {resolution:g} m"
+        )
+    return box
