@@ -10,6 +10,7 @@ from plyfile import PlyData
 from octoreplay.commands.results import export
 from octoreplay.mapping.octree import KEY_BITS
 from support.command_line import assert_fails, octoreplay, octoreplay_process
+from support.long_suite import long
 
 
 def test_export_of_voxels(pair_result: Path, tmp_path: Path) -> None:
@@ -34,6 +35,7 @@ def test_refused_exports_write_nothing(pair_result: Path, tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+@long
 def test_a_part_of_a_map_in_tiles(pair_result: Path, tmp_path: Path) -> None:
     done = octoreplay_process(
         "export", pair_result, "-o", tmp_path / "map.ply", "--tile", 5, "--bounds", "-6,-6,0.3,6,6,2.1",

@@ -69,7 +69,7 @@ def test_a_cut_keeps_the_cells_with_centres_in_the_box(cells, region):
         np.testing.assert_array_equal(getattr(piece.leaves(), name), getattr(alone, name))
 
 
-@examples(60)
+@examples(40)
 @given(cells=cell_maps(), later=cell_maps(), region=regions())
 def test_packets_decoded_in_a_box_have_the_same_cells_in_it(cells, later, region):
     box = KeyBox.of(region, RESOLUTION)

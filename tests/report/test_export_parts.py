@@ -17,6 +17,7 @@ from octoreplay.report.cell_colors import COLORS, CONTRADICTION_COLORS, leaf_col
 from octoreplay.report.export import export_map
 from octoreplay.report.map_part import MapPart
 from octoreplay.result import open_result
+from support.long_suite import long
 from support.octomap_reader import read_octomap
 from support.octree_factory import cube, octree_of
 from support.result_factory import state, write_result
@@ -46,7 +47,7 @@ def table(path: Path) -> dict[tuple[float, ...], tuple[int, ...]]:
     return dict(zip(map(tuple, places.tolist()), map(tuple, colors.tolist()), strict=True))
 
 
-@pytest.mark.parametrize("split", [None, "class", "robot"])
+@pytest.mark.parametrize("split", [None, "class", pytest.param("robot", marks=long)])
 def test_tiles_are_the_exports_of_their_boxes(walls: Path, tmp_path: Path, split: str | None) -> None:
     whole = export_map(walls, tmp_path / "map.ply", free=True, split=split)
     tiles = export_map(walls, tmp_path / "tile.ply", free=True, split=split, tile=1.5)

@@ -156,6 +156,7 @@ def test_a_page_loads_nothing_from_elsewhere(trio_page: Page) -> None:
     assert "default-src 'none'" in text
 
 
+@long
 def test_a_page_of_a_depth_has_the_coarse_maps(trio_result: Path, tmp_path: Path) -> None:
     path = tmp_path / "coarse.html"
     done = octoreplay("report", trio_result, "-o", path, "--max-depth", 17)
