@@ -34,9 +34,10 @@ if TYPE_CHECKING:
     from octoreplay.replay.run import Progress, replay_team
     from octoreplay.study.tiles.run import replay_tiles
     from octoreplay.report.export import export_map
-    from octoreplay.result import PointQuery, Result, StoredMap, open_result
+    from octoreplay.result import Result, open_result
     from octoreplay.run_metrics import RunSummary, TickMetrics
     from octoreplay.simulate.team import SimulationConfig, simulate_team
+    from octoreplay.stored_map import PointQuery, StoredMap
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
 
 _MODULES = {
@@ -53,7 +54,7 @@ _MODULES = {
     "OctoreplayError": "errors",
     "OutputError": "errors",
     "PacketError": "errors",
-    "PointQuery": "result",
+    "PointQuery": "stored_map",
     "Progress": "replay.run",
     "Result": "result",
     "ResultComparison": "evaluate.comparison",
@@ -63,7 +64,7 @@ _MODULES = {
     "RunSummary": "run_metrics",
     "SemanticClass": "records",
     "SimulationConfig": "simulate.team",
-    "StoredMap": "result",
+    "StoredMap": "stored_map",
     "Sweep": "study.sweep",
     "SweepProgress": "study.sweep",
     "Table": "data_table",

@@ -201,8 +201,8 @@ class LeafTable:
         columns = dict(zip("xyz", self.centers.T, strict=True)) | {"size": self.sizes}
         return Table(columns | {f"log_odds_{c}": values for c, values in enumerate(self.log_odds.T, start=1)})
 
-    def taken(self, chosen: BoolArray) -> LeafTable:
-        """Return the leaves where ``chosen`` (L,) is True."""
+    def taken(self, chosen: BoolArray | Int64Array) -> LeafTable:
+        """Return the leaves where ``chosen`` (L,) is True, or those at positions ``chosen`` (n,)."""
         return LeafTable(self.centers[chosen], self.sizes[chosen], self.log_odds[chosen])
 
     def between(self, low: float, high: float) -> BoolArray:

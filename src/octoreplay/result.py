@@ -12,182 +12,38 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 from weakref import WeakSet
 
-import numpy as np
-import numpy.typing as npt
-
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
-from octoreplay.log_odds import best_labels, class_probabilities, label_probabilities
 from octoreplay.mapping.codec import apply_delta, decode_packet, max_memory
-from octoreplay.mapping.consensus import scaled_map
+from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.metric_tables import METRIC_TABLES, POSES, metrics_table, pose_table
 from octoreplay.records import (
     CENTRAL,
-    MAP_KINDS,
-    MEAN,
-    POSTERIOR,
     TEAM,
-    BoolArray,
     ClassTable,
     FilePath,
-    Float32Array,
     Float64Array,
-    LeafTable,
     MapState,
-    UInt8Array,
     public_names,
 )
 from octoreplay.run_metrics import FramePlace, RunSummary, TickMetrics
+from octoreplay.stored_map import StoredMap, key_box
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class PointQuery:
-    """State of a map at P points.
-
-    Attributes
-    ----------
-    log_odds : (P, C) float32
-        log p(c) / p(free), including the prior.
-    probabilities : (P, C + 1) float32
-        Probabilities, free first.
-    labels : (P,) uint8
-        Most probable class_id, 0 for free.
-    known : (P,) bool
-        False in unknown space, where the other fields are those of the prior.
-    sizes : (P,) float64
-        Edge of the leaf around the point in metres, 0 in unknown space.
-    """
-
-    log_odds: Float32Array
-    probabilities: Float32Array
-    labels: UInt8Array
-    known: BoolArray
-    sizes: Float64Array
-
-    def as_table(self) -> Table:
-        """Return the columns label, known, size [m] and probability_0 (free) to probability_C, one row per point."""
-        columns = {"label": self.labels, "known": self.known, "size": self.sizes}
-        return Table(columns | {f"probability_{c}": values for c, values in enumerate(self.probabilities.T)})
-
-
-class StoredMap:
-    """Map of one robot after one tick, or the centralised map (``robot_id`` 'central').
-
-    ``frame_id`` is the name of its frame: 'team', or '<robot>/map' for the map frame of a robot where robots find each
-    other's frames during the run.
-
-    A map on which robots agree is the mean over ``num_robots`` robots, N: those that reached it over links at the time,
-    or all with rule 'flood'. ``map_kind`` 'posterior' (the default of all methods) gives h_0 + N (h - h_0), the
-    posterior of the evidence of these robots, and 'mean' the map h as the robot holds it. Both are the same where N is
-    1: for a robot without links, for the centralised map, for evidence, for rules whose map is no mean ('local',
-    'merge'), and where ``evidence`` is an average. ``octree`` holds h - h_0.
-    """
-
-    def __init__(
-        self,
-        octree: SemanticOctree,
-        robot_id: str,
-        tick: int,
-        stamp_ns: int,
-        prior: float,
-        num_robots: int,
-        frame_id: str = TEAM,
-        most_bytes: int | None = None,
-    ) -> None:
-        self.robot_id = robot_id
-        self.tick = tick
-        self.stamp_ns = stamp_ns
-        self.prior = prior
-        self.num_robots = num_robots
-        self.frame_id = frame_id
-        self.octree = octree
-        self._most_bytes = most_bytes
-
-    def __dir__(self) -> list[str]:
-        return public_names(self)
-
-    @property
-    def resolution(self) -> float:
-        """Edge of the finest leaf in metres."""
-        return float(self.octree.resolution)
-
-    def shown_octree(self, map_kind: str = POSTERIOR) -> SemanticOctree:
-        """Return the octree of a form of the map: N (h - h_0) or h - h_0. Raises ValueError for another form."""
-        if map_kind not in MAP_KINDS:
-            raise ValueError(f"map_kind: '{map_kind}' is not one of {', '.join(MAP_KINDS)}")
-        if map_kind == MEAN or self.num_robots == 1:
-            return self.octree
-        return scaled_map(self.octree, float(self.num_robots))
-
-    def title(self, map_kind: str = POSTERIOR) -> str:
-        """Return a phrase that says which form of the map is shown."""
-        if self.num_robots == 1:
-            return "centralised map" if self.robot_id == CENTRAL else "own map"
-        return f"{'mean' if map_kind == MEAN else 'posterior'} of {self.num_robots} robots"
-
-    def leaves(self, *, map_kind: str = POSTERIOR) -> LeafTable:
-        """Return all leaves, including free ones, in Morton order.
-
-        Raises InputError where they would take more memory than a map in a file of the result's size can.
-        """
-        octree = self.shown_octree(map_kind)
-        try:
-            return octree.leaves(prior=self.prior, most_bytes=self._most_bytes)
-        except ValueError as error:
-            raise InputError(f"map of robot '{self.robot_id}': {error}; the result is damaged") from error
-
-    def as_table(self, *, map_kind: str = POSTERIOR) -> Table:
-        """Return all leaves as a table, one row per leaf, in Morton order. Raises as ``leaves``.
-
-        The columns are x, y, z, size [m], label (0 for free), probability of that label, and log_odds_1 to log_odds_C.
-        """
-        leaves = self.leaves(map_kind=map_kind)
-        columns = dict(leaves.as_table().columns)
-        place = {name: columns.pop(name) for name in ("x", "y", "z", "size")}
-        labels = {"label": best_labels(leaves.log_odds), "probability": label_probabilities(leaves.log_odds)}
-        return Table({**place, **labels, **columns})
-
-    def query(self, points: npt.ArrayLike, *, map_kind: str = POSTERIOR) -> PointQuery:
-        """Return the state at points (P, 3), in metres in the team's frame. Raises ValueError for another shape."""
-        coords = np.asarray(points, dtype=np.float64)
-        if coords.ndim != 2 or coords.shape[1] != 3:
-            raise ValueError(f"points: expects an array (P, 3), got {coords.shape}")
-        deviation, known, sizes = self.shown_octree(map_kind).lookup(coords)
-        log_odds = (deviation + np.float32(self.prior)).astype(np.float32)
-        probabilities = class_probabilities(log_odds).astype(np.float32)
-        return PointQuery(log_odds, probabilities, best_labels(log_odds), known, np.where(known, sizes, 0.0))
-
-    def query_box(self, lower: npt.ArrayLike, upper: npt.ArrayLike, *, map_kind: str = POSTERIOR) -> LeafTable:
-        """Return the leaves that overlap a box with corners ``lower`` and ``upper`` (3,), metres in the team's frame.
-
-        Raises ValueError where a corner does not have three numbers, or a lower bound is above its upper bound.
-        """
-        low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-        if low.shape != (3,) or high.shape != (3,):
-            raise ValueError(f"box: expects two corners of three numbers, got {low.shape} and {high.shape}")
-        if not (low <= high).all():
-            raise ValueError("box: every lower bound must be at most its upper bound")
-        table = self.leaves(map_kind=map_kind)
-        half = table.sizes[:, None] / 2
-        inside = ((table.centers + half > low) & (table.centers - half < high)).all(axis=1)
-        return LeafTable(table.centers[inside], table.sizes[inside], table.log_odds[inside])
 
 
 class Result:
@@ -217,13 +73,15 @@ class Result:
     def plot(
         self, what: str, *, label: str | None = None, beside: Mapping[str, Result] | None = None, style: str = "screen",
         robot: str | None = None, at: float | None = None, color: str | None = None,
+        max_depth: int | None = None,
     ) -> Figure:  # fmt: skip
         """Return a matplotlib figure of the run, as ``octoreplay plot`` draws it.
 
         ``what`` is 'phi', 'packets', 'agreement', 'coverage', 'links', 'contradiction' or 'map'. ``label`` is the name
         of this result in the figure, by default that of its file; ``beside`` are further results by label. ``style`` is
         'screen', 'one-column', 'two-column' or 'talk'. Of a map, ``robot`` is its robot (default: the first one),
-        ``at`` its time since the run's start in seconds (default: the end), and ``color`` as in ``export_map``.
+        ``at`` its time since the run's start in seconds (default: the end), and ``color`` and ``max_depth`` are as in
+        ``export_map``.
 
         Raises ConfigError for an unknown name, and InputError for a result without what the figure shows.
         """
@@ -231,7 +89,7 @@ class Result:
         from octoreplay.report.result_figures import result_figure
 
         results = {label or self.path.stem: self, **(beside or {})}
-        return result_figure(what, results, style, robot=robot, at=at, color=color)
+        return result_figure(what, results, style, robot=robot, at=at, color=color, max_depth=max_depth)
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -340,44 +198,56 @@ class Result:
         """
         return self._reader.poses(robot_id)
 
-    def map(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
+    def map(
+        self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None, bounds: Sequence[float] = (),
+    ) -> StoredMap:  # fmt: skip
         """Return a robot's last map stored at or before ``at_ns``, or exactly at ``tick``; with neither, its last map.
 
-        ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then.
+        ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then. ``bounds`` are those
+        of a run, (zmin, zmax) or (xmin, ymin, zmin, xmax, ymax, zmax) in the map's frame [m]: the map has the cells
+        with centres in this box only, bit for bit as in the whole map. Its packets are decompressed as a whole, and
+        only the bricks near the box are made.
 
         Raises InputError for an unknown robot, a tick without a stored map, or a time before the first stored map.
         Raises PacketError where a stored map is damaged or has another format version.
+        Raises ConfigError for other bounds, as ``StoredMap.cut``.
         Raises ValueError for both ``at_ns`` and ``tick``.
         """
-        return self._last_state(robot_id, at_ns, tick, evidence=False)
+        return self._last_state(robot_id, at_ns, tick, bounds, evidence=False)
 
-    def evidence(self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None) -> StoredMap:
+    def evidence(
+        self, robot_id: str, *, at_ns: int | None = None, tick: int | None = None, bounds: Sequence[float] = (),
+    ) -> StoredMap:  # fmt: skip
         """Return a robot's evidence s_i: the sum of its own scans' log-odds, without anything that others sent.
 
-        ``at_ns`` and ``tick`` are as in ``map``. The evidence at the end of a run is always stored, earlier one every
-        ``evidence_every`` seconds. It is that of the robot's current restart epoch, clamped to ``clamp_min`` and
-        ``clamp_max`` with ``evidence: sum``, else unclamped.
+        ``at_ns``, ``tick`` and ``bounds`` are as in ``map``. The evidence at the end of a run is always stored, earlier
+        one every ``evidence_every`` seconds. It is that of the robot's current restart epoch, clamped to ``clamp_min``
+        and ``clamp_max`` with ``evidence: sum``, else unclamped.
 
         The octree of the returned map (``octree``) has the values s_i [log-odds], (C,) in each cell, in the team's
         frame; ``leaves`` and ``query`` return h_0 + s_i, the posterior of the robot's own scans.
         ``config.robots[i].T_team_map`` is the robot's map frame in the team's frame, as the run used it.
 
         Raises InputError as ``map`` does, and where the result holds no evidence of the robot, which is the case for an
-        interrupted run and for results of octoreplay before evidence was stored. Raises PacketError and ValueError as
-        ``map`` does.
+        interrupted run and for results of octoreplay before evidence was stored. Raises PacketError, ConfigError and
+        ValueError as ``map`` does.
         """
-        return self._last_state(robot_id, at_ns, tick, evidence=True)
+        return self._last_state(robot_id, at_ns, tick, bounds, evidence=True)
 
-    def _last_state(self, robot_id: str, at_ns: int | None, tick: int | None, *, evidence: bool) -> StoredMap:
-        """Last map or evidence stored at or before ``at_ns``, or exactly at ``tick``."""
+    def _last_state(
+        self, robot_id: str, at_ns: int | None, tick: int | None, bounds: Sequence[float], *, evidence: bool
+    ) -> StoredMap:
+        """Last map or evidence stored at or before ``at_ns``, or exactly at ``tick``, in a box."""
+        box = key_box(bounds, self.config.map.resolution) if len(bounds) else None
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
         states = self._reader.states(robot_id, until_ns, evidence=evidence)
-        octree = self._updated(None, states[0])
+        octree = self._updated(None, states[0], box)
         for state in states[1:]:
-            octree = self._updated(octree, state)
-        return self._stored_map(octree, states[-1], is_evidence=evidence)
+            octree = self._updated(octree, state, box)
+        stored = self._stored_map(octree, states[-1], is_evidence=evidence)
+        return stored.cut(bounds) if len(bounds) else stored
 
     def history(self) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
@@ -396,12 +266,15 @@ class Result:
         if maps:
             yield maps
 
-    def _updated(self, octree: SemanticOctree | None, state: MapState) -> SemanticOctree:
-        """Octree after a stored state. All octrees in use have at most the memory that fits the size of the file."""
+    def _updated(self, octree: SemanticOctree | None, state: MapState, box: KeyBox | None = None) -> SemanticOctree:
+        """Octree, near a box, after a stored state.
+
+        All octrees in use have at most the memory that fits the size of the file.
+        """
         room = self._most_bytes - sum(held.memory_bytes for held in self._octrees)
         try:
             if state.is_key_frame:
-                octree = decode_packet(state.data, room)
+                octree = decode_packet(state.data, room, box)
                 cells = (self.config.map.resolution, self.class_table.num_classes)
                 if (octree.resolution, octree.num_classes) != cells:
                     raise PacketError("damaged: the map has another resolution or number of classes than the run")
@@ -409,7 +282,7 @@ class Result:
             elif octree is None:
                 raise PacketError("damaged: the first stored state is a delta")
             else:
-                apply_delta(octree, state.data, most_bytes=room)
+                apply_delta(octree, state.data, most_bytes=room, box=box)
         except PacketError as error:
             raise PacketError(f"{self.path}: robot '{state.robot_id}': {error}; replay the logs again") from error
         return octree

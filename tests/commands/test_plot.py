@@ -34,6 +34,7 @@ def test_refused_figures_write_nothing(tmp_path: Path) -> None:
         (2, "two results have the label 'x'", (RESULT, OTHER, "--label", "x", "--label", "x", *phi)),
         (2, "label: expects one for each of the 2 results, got 1", (RESULT, OTHER, "--label", "x", *phi)),
         (2, "--robot belongs to --what map; leave it out for --what phi", (RESULT, "--robot", "a", *phi)),
+        (2, "--max-depth belongs to --what map; leave it out for --what phi", (RESULT, "--max-depth", 18, *phi)),
         (1, "no.mcap", (RESULT, tmp_path / "no.mcap", *phi)),
         (2, "must end in", (RESULT, "--what", "phi", "-o", RESULT)),
         (1, "robot 'x' not found", (RESULT, "--what", "map", "--robot", "x", "-o", out)),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from octoreplay.evaluate.repairs import Repairs, repairs
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import keys_to_codes
-from octoreplay.result import StoredMap
+from octoreplay.stored_map import StoredMap
 from support import octree_factory
 from support.long_suite import examples
 

@@ -67,6 +67,17 @@ def test_scales_are_shared(tmp_path: Path) -> None:
     assert bar.get_xlabel() == "height [m]"
 
 
+def test_a_map_of_a_depth_has_coarse_cells(tmp_path: Path) -> None:
+    path = result_of(tmp_path, "a", {(0, 0, 0): [2.0, 1.0], (1, 1, 1): [1.0, 3.0], (4, 0, 0): [2.0, 1.0]})
+    with open_result(path) as result:
+        figure = map_figure({"a": result}, LOOK, max_depth=18)
+        names = {text.get_text() for text in figure.legends[0].get_texts()}
+        heights = map_figure({"a": result}, LOOK, color="height", max_depth=18).axes[-1].get_xlim()
+    # The first coarse cell is a tree.
+    assert names == {"ground", "tree"}
+    np.testing.assert_allclose(heights, [0.2, 0.2], atol=0.05)
+
+
 def test_maps_that_cannot_be_drawn_are_refused(tmp_path: Path) -> None:
     path = result_of(tmp_path, "a", {(0, 0, 0): [-2.0, -1.0]})
     with open_result(path) as result:

@@ -10,7 +10,7 @@ import pytest
 
 from octoreplay.report import map_view
 from octoreplay.report.map_view import BACKGROUND, Faces, View, cube_faces, draw, mesh_faces, overlay, view_of
-from octoreplay.result import StoredMap
+from octoreplay.stored_map import StoredMap
 from support.octree_factory import octree_of
 
 DOWN = View(math.pi / 2, math.pi / 2, (0.0, 0.0, 0.0), 0.1, 80, 60)

@@ -9,7 +9,7 @@ import pytest
 
 from octoreplay.report import tables
 from octoreplay.report.query_tables import point_answers
-from octoreplay.result import PointQuery
+from octoreplay.stored_map import PointQuery
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 from octoreplay.io.robots.describe import LogDescription, LogSummary, RobotSummary, TopicSummary
 from octoreplay.report import log_tables, query_tables, tables
-from octoreplay.result import PointQuery
 from octoreplay.run_metrics import FramePlace, RobotMetrics
+from octoreplay.stored_map import PointQuery
 from support.result_factory import CLASSES, SECOND, START, leaf_table, summary, team, tick_metrics
 
 

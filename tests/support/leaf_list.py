@@ -42,14 +42,14 @@ def encode(leaves: LeafTable, resolution: float = 0.2) -> bytes:
     return stream.getvalue()
 
 
-def decode(data: bytes, most_bytes: int | None = None) -> LeafList:
+def decode(data: bytes, most_bytes: int | None = None, box: None = None) -> LeafList:
     """A leaf list from its bytes."""
     content = np.load(io.BytesIO(data))
     leaves = LeafTable(content["centers"], content["sizes"], content["log_odds"])
     return LeafList(float(content["resolution"]), leaves)
 
 
-def apply(octree: LeafList, data: bytes, most_bytes: int | None = None) -> None:
+def apply(octree: LeafList, data: bytes, most_bytes: int | None = None, box: None = None) -> None:
     """Append the delta's leaves."""
     more, old = decode(data).table, octree.table
     octree.table = LeafTable(
@@ -69,4 +69,4 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stored maps be leaf lists."""
     monkeypatch.setattr("octoreplay.result.decode_packet", decode)
     monkeypatch.setattr("octoreplay.result.apply_delta", apply)
-    monkeypatch.setattr("octoreplay.result.scaled_map", scaled)
+    monkeypatch.setattr("octoreplay.stored_map.scaled_map", scaled)

@@ -92,6 +92,18 @@ color_option = click.option(
 )  # fmt: skip
 
 
+max_depth_option = click.option(
+    "--max-depth", type=click.IntRange(1, 19), default=None,
+    help="depth of the finest cells shown, counted from the root as in OctoMap: 19 are the finest of the map, 18 have"
+         " twice their edge; a coarse cell is occupied if one of its cells is  [default: 19]",
+)  # fmt: skip
+
+
+def parse_bounds(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...]:
+    """Return the numbers of --bounds, none by default, as ``run`` reads them. Raises ConfigError."""
+    return () if value is None else PARAMETERS["bounds"].coerce(value)
+
+
 class _ParameterOption(click.Option):
     """Command line option of a configuration parameter."""
 
@@ -222,6 +234,18 @@ def _check_new(path: Path, *, is_present: bool) -> None:
     """Raise OutputError for an output that ``is_present``, unless --force is given."""
     if is_present and not click.get_current_context().meta.get(_FORCE, False):
         raise OutputError(f"{path}: already exists; give another name, or use --force to overwrite it")
+
+
+def check_new_tiles(output: Path) -> None:
+    """Check, before any work is done, that no file beside an output has the name of one of its tiles.
+
+    Raises OutputError. With --force they may exist.
+    """
+    name = re.compile(rf"{re.escape(output.stem)}-(.+-)?x-?[0-9.e+]+_y-?[0-9.e+]+{re.escape(output.suffix)}")
+    with writing(output):
+        entries = sorted(output.parent.iterdir())
+    for entry in entries:
+        _check_new(entry, is_present=name.fullmatch(entry.name) is not None)
 
 
 def check_new_folder(path: Path) -> None:

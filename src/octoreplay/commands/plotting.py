@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from octoreplay.commands.console import prints, terminal
-from octoreplay.commands.options import check_output, color_option, existing_path, force_option
+from octoreplay.commands.options import check_output, color_option, existing_path, force_option, max_depth_option
 from octoreplay.commands.suggestions import Choice
 from octoreplay.errors import ConfigError
 
@@ -29,6 +29,7 @@ from octoreplay.errors import ConfigError
 @click.option("--at", type=float, default=None, metavar="SECONDS",
               help="time of a map since the run's start [s]  [default: the end]")  # fmt: skip
 @color_option
+@max_depth_option
 @force_option
 @prints
 def plot(results: tuple[Path, ...], what: str, output: Path, labels: tuple[str, ...], style: str, **of_map: Any) -> int:
@@ -39,7 +40,7 @@ def plot(results: tuple[Path, ...], what: str, output: Path, labels: tuple[str, 
     """
     given = [name for name, value in of_map.items() if value is not None]
     if what != "map" and given:
-        raise click.UsageError(f"--{given[0]} belongs to --what map; leave it out for --what {what}")
+        raise click.UsageError(f"--{given[0].replace('_', '-')} belongs to --what map; leave it out for --what {what}")
     check_output(output, (".pdf", ".png", ".svg"), inputs=results)
 
     from octoreplay.report.figures import save_figure

@@ -11,12 +11,15 @@ import click
 from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.options import (
     check_new_folder,
+    check_new_tiles,
     check_output,
     color_option,
     existing_path,
     force_option,
     lock_folder,
     map_option,
+    max_depth_option,
+    parse_bounds,
 )
 from octoreplay.commands.progress import show_results
 from octoreplay.commands.suggestions import Choice
@@ -73,6 +76,13 @@ def metrics(result: Path, csv: Path | None, plot: Path | None) -> int:
               help="heights of the map to write [m]  [default: all]")  # fmt: skip
 @click.option("--split", type=click.Choice(("class", "robot")), default=None,
               help="write a file of each class, or of each robot's map")  # fmt: skip
+@click.option("--bounds", callback=parse_bounds, default=None, metavar="NUMBERS",
+              help="part of the map to write, ZMIN,ZMAX or XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX in the map's frame [m]; leaves"
+                   " are cut at its sides  [default: all]")  # fmt: skip
+@click.option("--tile", type=float, default=None, metavar="METRES",
+              help="write a file of each square tile of the x-y plane with this edge, FILE-xX_yY; leaves are cut at its"
+                   " borders")  # fmt: skip
+@max_depth_option
 @map_option
 @force_option
 @prints
@@ -89,11 +99,17 @@ def export(result: Path, output: Path, at: float | None, **options: Any) -> int:
     check_output(output, SUFFIXES)
     if output.suffix.lower() in (".yaml", ".yml"):
         check_output(output.with_suffix(".pgm"), ".pgm")
+    if options["tile"] is not None:
+        check_new_tiles(output)
     units = {".ply": "cubes" if options["what"] == "voxels" else "points", ".las": "points", ".laz": "points",
              ".yaml": "known cells", ".yml": "known cells", ".pgm": "known cells"}  # fmt: skip
     here, counts = terminal(), export_map(result, output, at=at, **options)
+    if options["tile"] is not None:
+        here.line(f"wrote {len(counts):,} file{'s' * (len(counts) > 1)} such as {next(iter(counts))}")
     for path, count in counts.items():
-        here.line(f"wrote {path} ({count:,} {units.get(path.suffix.lower(), 'leaves')}, {size(path.stat().st_size)})")
+        if options["tile"] is None or here.is_verbose:
+            unit = units.get(path.suffix.lower(), "leaves")
+            here.line(f"wrote {path} ({count:,} {unit}, {size(path.stat().st_size)})")
     here.give(result=result, written=list(counts), counts=list(counts.values()))
     return 0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from octoreplay.commands.console import prints, terminal
-from octoreplay.commands.options import check_output, existing_path, force_option, map_option
+from octoreplay.commands.options import check_output, existing_path, force_option, map_option, max_depth_option
 from octoreplay.commands.progress import progress_bar
 from octoreplay.io.output_file import write_whole
 
@@ -81,10 +81,13 @@ def rviz_config(result: Path, output: Path) -> int:
               help="robot whose maps are shown, or 'central'; may be repeated  [default: all and central]")  # fmt: skip
 @click.option("--every", type=click.FloatRange(min=0), default=0.0, metavar="SECONDS",
               help="least time between two maps of a robot [s]  [default: all stored maps]")  # fmt: skip
+@max_depth_option
 @map_option
 @force_option
 @prints
-def rerun(result: Path, output: Path, robots: tuple[str, ...], every: float, map_kind: str) -> int:
+def rerun(
+    result: Path, output: Path, robots: tuple[str, ...], every: float, max_depth: int | None, map_kind: str
+) -> int:
     """Write a result as a recording of the Rerun viewer: maps, poses, paths, links and metrics over time.
 
     Needs pip install 'octoreplay[rerun]'. 'rerun OUT.rrd' shows the recording.
@@ -96,7 +99,7 @@ def rerun(result: Path, output: Path, robots: tuple[str, ...], every: float, map
 
     with progress_bar("rerun") as update:
         summary = write_rerun(
-            result, output, robots=robots, every=every, map_kind=map_kind,
+            result, output, robots=robots, every=every, map_kind=map_kind, max_depth=max_depth,
             progress=lambda share: update(share, None, ""),
         )  # fmt: skip
     terminal().line(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 from octoreplay.config.fields import check_ranges, parameter
 from octoreplay.errors import ConfigError
@@ -64,6 +65,28 @@ def rounded_sensor(sensor: SensorConfig, quantum: float) -> SensorConfig:
     return dataclasses.replace(sensor, **rounded)
 
 
+Region: TypeAlias = tuple[float, float, float, float, float, float]
+"""Region (xmin, ymin, zmin, xmax, ymax, zmax) [m]."""
+
+
+def region_of(bounds: Sequence[float]) -> Region:
+    """Return the region of ``bounds``: zmin and zmax, all six numbers, or none for a region without limits [m].
+
+    Raises ConfigError for other numbers, and where a minimum is not below its maximum.
+    """
+    if not all(math.isfinite(number) for number in bounds):
+        raise ConfigError("bounds: expects finite numbers")
+    if len(bounds) not in (0, 2, 6):
+        raise ConfigError(f"bounds: expects 2 or 6 numbers, got {len(bounds)}")
+    half = len(bounds) // 2
+    if any(bounds[i] >= bounds[half + i] for i in range(half)):
+        raise ConfigError("bounds: every minimum must be below its maximum")
+    limits = [-math.inf] * 3 + [math.inf] * 3
+    for axis in range(half):
+        limits[3 - half + axis], limits[6 - half + axis] = bounds[axis], bounds[half + axis]
+    return cast("Region", tuple(limits))
+
+
 @dataclass(frozen=True)
 class MapConfig:
     """Configuration of the map: geometry, prior and pruning."""
@@ -83,23 +106,12 @@ class MapConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if not all(math.isfinite(number) for number in self.bounds):
-            raise ConfigError("bounds: expects finite numbers")
-        if len(self.bounds) not in (0, 2, 6):
-            raise ConfigError(f"bounds: expects 2 or 6 numbers, got {len(self.bounds)}")
-        half = len(self.bounds) // 2
-        if any(self.bounds[i] >= self.bounds[half + i] for i in range(half)):
-            raise ConfigError("bounds: every minimum must be below its maximum")
+        region_of(self.bounds)
 
     @property
-    def box(self) -> tuple[float, float, float, float, float, float]:
+    def box(self) -> Region:
         """Mapped region (xmin, ymin, zmin, xmax, ymax, zmax) in metres in the team's frame; infinite without bounds."""
-        infinity = math.inf
-        if len(self.bounds) == 2:
-            return (-infinity, -infinity, self.bounds[0], infinity, infinity, self.bounds[1])
-        if len(self.bounds) == 6:
-            return self.bounds
-        return (-infinity, -infinity, -infinity, infinity, infinity, infinity)
+        return region_of(self.bounds)
 
     def prior(self, num_classes: int) -> float:
         """h_0, the log-odds of each occupied class in an unobserved cell."""

@@ -24,7 +24,8 @@ from octoreplay.evaluate.morton_intervals import MortonIntervals, bounding_box, 
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys
 from octoreplay.records import CENTRAL, BoolArray, FilePath, Float64Array, Int64Array
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
+from octoreplay.stored_map import StoredMap
 
 Point: TypeAlias = tuple[float, float, float]
 

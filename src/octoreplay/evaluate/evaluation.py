@@ -22,8 +22,9 @@ from octoreplay.mapping.metrics import MapComparer
 from octoreplay.mapping.octree import LeafSpans, SemanticOctree
 from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, BoolArray, FilePath
 from octoreplay.replay.warnings import team_frame_warnings
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
 from octoreplay.run_metrics import PairMetrics, TickMetrics
+from octoreplay.stored_map import StoredMap
 
 
 def evaluate_result(

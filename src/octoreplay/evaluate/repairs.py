@@ -9,7 +9,7 @@ import numpy as np
 from octoreplay.evaluate.truth import Truth
 from octoreplay.log_odds import best_labels
 from octoreplay.records import NO_CLASS
-from octoreplay.result import StoredMap
+from octoreplay.stored_map import StoredMap
 
 
 class Repairs(NamedTuple):

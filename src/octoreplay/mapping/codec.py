@@ -14,6 +14,7 @@ import zstandard
 
 from octoreplay.errors import PacketError
 from octoreplay.mapping.kernels import packets
+from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import SemanticOctree, octree_from_streams
 from octoreplay.mapping.quantise import CONTENTS, INT8_MAX, content_numbers, content_values, is_step
 from octoreplay.mapping.streams import TreeStreams, mask_bytes
@@ -190,8 +191,11 @@ def read_header(data: bytes) -> PacketHeader:
     return PacketHeader(kind, CONTENTS[content], compression, resolution, num_classes, map_version, step, *sizes)
 
 
-def decode_packet(data: bytes, most_bytes: int | None = None) -> SemanticOctree:
-    """Return the map of a key-frame packet.
+def decode_packet(data: bytes, most_bytes: int | None = None, box: KeyBox | None = None) -> SemanticOctree:
+    """Return the map of a key-frame packet; with ``box``, without leaves and bricks that lie outside of it.
+
+    The whole payload is decompressed, since the words and codes of a packet have no index. The octree, which takes most
+    of the memory, has the bricks near the box only; ``regions.cut`` leaves the cells in the box.
 
     Raises PacketError for a delta, for damaged or other bytes, and for a map of more than ``most_bytes`` (None:
     ``max_memory`` of the packet).
@@ -199,11 +203,17 @@ def decode_packet(data: bytes, most_bytes: int | None = None) -> SemanticOctree:
     header = read_header(data)
     if header.kind != FULL:
         raise PacketError("map packet is a delta; it needs the map that it changes")
-    return _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes)
+    return _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes, box)
 
 
-def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0, most_bytes: int | None = None) -> None:
-    """Replace the bricks that a delta packet holds, in place.
+def apply_delta(
+    octree: SemanticOctree,
+    data: bytes,
+    revision: int = 0,
+    most_bytes: int | None = None,
+    box: KeyBox | None = None,
+) -> None:
+    """Replace the bricks that a delta packet holds, in place; with ``box``, those that overlap it.
 
     Raises PacketError for other packets and other bytes, and for new bricks of more than ``most_bytes`` (None:
     ``max_memory`` of the packet); it then leaves the map unchanged.
@@ -213,7 +223,7 @@ def apply_delta(octree: SemanticOctree, data: bytes, revision: int = 0, most_byt
         raise PacketError("map packet is a key frame, not a delta")
     if header.resolution != octree.resolution or header.num_classes != octree.num_classes:
         raise PacketError("map packet with another resolution or number of classes than the map that it changes")
-    changed = _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes)
+    changed = _decode(data, header, max_memory(len(data)) if most_bytes is None else most_bytes, box)
     octree.overwrite(changed, np.arange(changed.num_bricks), revision)
 
 
@@ -260,8 +270,8 @@ def _compressed(parts: list[bytes], level: int) -> bytes:
     return b"".join([*chunks, compressor.flush()])
 
 
-def _decode(data: bytes, header: PacketHeader, most_bytes: int) -> SemanticOctree:
-    """Return the octree of a packet with a valid header, of at most ``most_bytes``."""
+def _decode(data: bytes, header: PacketHeader, most_bytes: int, box: KeyBox | None) -> SemanticOctree:
+    """Return the octree of a packet with a valid header, of at most ``most_bytes``, in a box."""
     num_values = header.num_leaves + header.num_own_values
     most_bytes -= header.raw_bytes + VALUE_BYTES * num_values
     if most_bytes < 0:
@@ -275,7 +285,7 @@ def _decode(data: bytes, header: PacketHeader, most_bytes: int) -> SemanticOctre
     payload.check_end()
     try:
         streams = TreeStreams(np.require(words, np.uint16, "A"), values, masks, own_values)
-        return octree_from_streams(streams, header.resolution, header.num_classes, most_bytes)
+        return octree_from_streams(streams, header.resolution, header.num_classes, most_bytes, box)
     except ValueError as error:
         raise PacketError(f"map packet damaged: {error}") from error
 

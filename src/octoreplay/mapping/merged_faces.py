@@ -53,10 +53,9 @@ def finest_cells(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Int6
 
     ``resolution`` is the edge of a finest cell [m]. Raises ValueError for more than MAX_CELLS of them.
     """
-    edges = np.rint(leaves.sizes / resolution).astype(np.int64)
+    low, edges = first_cells(leaves, resolution)
     if float((edges.astype(np.float64) ** 3).sum()) > MAX_CELLS:
         raise ValueError(f"the leaves hold more than {MAX_CELLS:,} cells")
-    low = np.rint(leaves.centers / resolution - edges[:, None] / 2).astype(np.int64)
     keys, owners = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     for edge in np.unique(edges).tolist():
         chosen = np.flatnonzero(edges == edge)
@@ -64,6 +63,12 @@ def finest_cells(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Int6
         keys.append((low[chosen, None] + steps).reshape(-1, 3))
         owners.append(np.repeat(chosen, len(steps)))
     return np.concatenate(keys), np.concatenate(owners)
+
+
+def first_cells(leaves: LeafTable, resolution: float) -> tuple[Int64Array, Int64Array]:
+    """Return the lowest keys (L, 3) of the finest cells in each leaf, and the leaf's edge (L,) in finest cells."""
+    edges = np.rint(leaves.sizes / resolution).astype(np.int64)
+    return np.rint(leaves.centers / resolution - edges[:, None] / 2).astype(np.int64), edges
 
 
 def _packed(keys: Int64Array) -> Int64Array:

@@ -16,9 +16,12 @@ import numpy.typing as npt
 
 from octoreplay.mapping.kernels import packets, storage
 from octoreplay.mapping.kernels.storage import Bricks, BrickTable
+from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.streams import (
+    BrickMasks,
     TreeStreams,
     brick_masks,
+    chosen_bricks,
     chosen_leaves,
     class_bits,
     encode_bricks,
@@ -246,8 +249,9 @@ class SemanticOctree:
         if occupied_only:
             num_own = np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)
             occupied_own = np.repeat(np.arange(num_own.size), num_own)[streams.own_values + np.float32(prior) > 0]
-            chosen = streams.values + np.float32(prior) > 0
-            chosen[np.flatnonzero(is_vector)[occupied_own]] = True
+            is_occupied = streams.values + np.float32(prior) > 0
+            is_occupied[np.flatnonzero(is_vector)[occupied_own]] = True
+            chosen = np.flatnonzero(is_occupied)
             streams = chosen_leaves(streams, is_vector, chosen)
             codes, depths, is_vector = codes[chosen], depths[chosen], is_vector[chosen]
         if most_bytes is not None and codes.size * (LEAF_BYTES + 5 * self.num_classes) > most_bytes:
@@ -289,10 +293,11 @@ class SemanticOctree:
         known[known] = cell_codes[known] < (codes + spans)[leaf[known]]
         log_odds = np.zeros((len(keys), self.num_classes), np.float32)
         # Dense values of all leaves would take more memory than the map.
-        chosen = np.zeros(codes.size, np.bool_)
-        chosen[leaf[known]] = True
+        is_chosen = np.zeros(codes.size, np.bool_)
+        is_chosen[leaf[known]] = True
+        chosen = np.flatnonzero(is_chosen)
         values = leaf_values(chosen_leaves(streams, is_vector, chosen), is_vector[chosen], self.num_classes)
-        log_odds[known] = values[np.cumsum(chosen)[leaf[known]] - 1]
+        log_odds[known] = values[np.cumsum(is_chosen)[leaf[known]] - 1]
         sizes = np.zeros(len(keys))
         sizes[known] = np.exp2(KEY_BITS - depths[leaf[known]].astype(np.float64)) * self.resolution
         return log_odds, known, sizes
@@ -374,9 +379,13 @@ TABLE_BYTES = 16
 
 
 def octree_from_streams(
-    streams: TreeStreams, resolution: float, num_classes: int, most_bytes: int = MAX_BYTES
+    streams: TreeStreams,
+    resolution: float,
+    num_classes: int,
+    most_bytes: int = MAX_BYTES,
+    box: KeyBox | None = None,
 ) -> SemanticOctree:
-    """Return the octree of a depth-first stream.
+    """Return the octree of a depth-first stream; with ``box``, without leaves and bricks that lie outside of it.
 
     Raises ValueError where the stream is malformed, and where its octree would take more than ``most_bytes``.
     """
@@ -384,6 +393,19 @@ def octree_from_streams(
     num_own = int(np.bitwise_count(streams.masks).sum())
     if num_own != streams.own_values.size or class_bits(streams.masks)[:, num_classes:].any():
         raise ValueError("the masks do not match the numbers of values and classes")
+    if box is not None:
+        near = box.overlaps(bricks.codes << storage.CELL_BITS, bricks.spans << storage.CELL_BITS)
+        bricks, streams = chosen_bricks(bricks, streams, near)
+    return octree_from_bricks(bricks, streams, resolution, num_classes, most_bytes)
+
+
+def octree_from_bricks(
+    bricks: BrickMasks, streams: TreeStreams, resolution: float, num_classes: int, most_bytes: int = MAX_BYTES
+) -> SemanticOctree:
+    """Return the octree of bricks with the values of ``streams``, whose words are not read.
+
+    Raises ValueError where it would take more than ``most_bytes``.
+    """
     octree = SemanticOctree(resolution, num_classes)
     num_bricks = int(bricks.spans.sum())
     if num_bricks > MAX_BRICKS:

@@ -176,14 +176,42 @@ def leaf_values(streams: TreeStreams, is_vector: BoolArray, num_classes: int) ->
     return values
 
 
-def chosen_leaves(streams: TreeStreams, is_vector: BoolArray, chosen: BoolArray) -> TreeStreams:
-    """Return the values of the leaves where ``chosen`` (L,) is True, with all words; ``is_vector`` (L,) as above."""
-    chosen_vectors = chosen[is_vector]
+def bricks_of_leaves(codes: Int64Array, depths: Int32Array, is_vector: BoolArray) -> BrickMasks:
+    """Return the bricks of leaves (L,) that are given in the form of ``leaf_list``, in Morton order."""
+    num_cells = np.int64(1) << 3 * (storage.KEY_BITS - depths.astype(np.int64))
+    bricks = codes >> storage.CELL_BITS
+    firsts = np.flatnonzero(np.diff(bricks, prepend=-1))
+    starts = np.uint64(1) << (codes & (storage.BRICK_CELLS - 1)).astype(np.uint64)
+    # A leaf in a brick is one cell, an octet or the whole brick.
+    known = np.where(num_cells == 1, starts, np.where(num_cells == storage.OCTETS, starts * 0xFF, storage.ALL_CELLS))
+    vector = np.where(is_vector, starts, np.uint64(0))
+    masks = (np.bitwise_or.reduceat(cells, firsts) for cells in (known, starts, vector))
+    return BrickMasks(bricks[firsts], np.maximum(num_cells[firsts] >> storage.CELL_BITS, 1), *masks)
+
+
+def chosen_bricks(bricks: BrickMasks, streams: TreeStreams, chosen: BoolArray) -> tuple[BrickMasks, TreeStreams]:
+    """Return the bricks of a stream where ``chosen`` (n,) is True, and their values, with all words."""
+    leaves = np.repeat(chosen, np.bitwise_count(bricks.starts))
+    vectors = np.repeat(chosen, np.bitwise_count(bricks.vector))
+    own = np.repeat(vectors, np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64))
+    kept = BrickMasks(
+        bricks.codes[chosen], bricks.spans[chosen], bricks.known[chosen], bricks.starts[chosen], bricks.vector[chosen]
+    )
+    return kept, TreeStreams(streams.words, streams.values[leaves], streams.masks[vectors], streams.own_values[own])
+
+
+def chosen_leaves(streams: TreeStreams, is_vector: BoolArray, leaves: Int64Array) -> TreeStreams:
+    """Return the values of the leaves at positions ``leaves`` (n,), which may repeat, with all words.
+
+    ``is_vector`` (L,) is that of all leaves.
+    """
+    vectors = (np.cumsum(is_vector) - 1)[leaves[is_vector[leaves]]]
     num_own = np.bitwise_count(streams.masks).sum(axis=1, dtype=np.int64)
-    return TreeStreams(
-        streams.words, streams.values[chosen], streams.masks[chosen_vectors],
-        streams.own_values[np.repeat(chosen_vectors, num_own)],
-    )  # fmt: skip
+    counts = num_own[vectors]
+    # Places in the values of all vector leaves: those of each leaf, one after the other.
+    shifts = (np.cumsum(num_own) - num_own)[vectors] - (np.cumsum(counts) - counts)
+    own = np.arange(counts.sum()) + np.repeat(shifts, counts)
+    return TreeStreams(streams.words, streams.values[leaves], streams.masks[vectors], streams.own_values[own])
 
 
 def class_bits(masks: UInt8Array) -> BoolArray:

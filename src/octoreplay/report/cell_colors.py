@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.config.class_tables.palette import PALETTE
-from octoreplay.errors import InputError
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.mapping.contradiction import CellContradiction, cell_contradictions, state_limits
 from octoreplay.records import MEAN, BoolArray, ClassTable, Color, Float64Array, FloatArray, LeafTable, UInt8Array
-from octoreplay.result import Result, StoredMap
+from octoreplay.report.map_part import MapPart
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 COLORS = ("label", "height", "robot", "seen-by", "disagreement", "contradiction", "probability")
 """Quantities that colours show:
@@ -69,13 +70,14 @@ def default_color(classes: ClassTable) -> str:
 
 
 def leaf_colors(
-    result: Result, shown: Sequence[StoredMap], leaves: LeafTable, color: str, at_ns: int | None,
+    result: Result, shown: Sequence[StoredMap], leaves: LeafTable, color: str, part: MapPart,
     limits: tuple[float, float] | None = None,
 ) -> LeafColors:  # fmt: skip
-    """Return the colours of leaves of the maps ``shown``, by one of ``COLORS``; ``at_ns`` is the time of the maps.
+    """Return the colours of leaves of the maps ``shown``, by one of ``COLORS``; ``part`` is what they show.
 
-    ``limits`` are the ends of a scale; None for those of the values. Raises InputError where a colour compares robots
-    with maps in several frames, or without stored evidence.
+    The other maps that a colour compares are the same part of them. ``limits`` are the ends of a scale; None for those
+    of the values. Raises InputError where a colour compares robots with maps in several frames, or without stored
+    evidence.
     """
     if color == "label":
         return LeafColors(_label_colors(result.class_table, leaves), "the classes' own")
@@ -88,12 +90,12 @@ def leaf_colors(
         least = 1.0 / (result.class_table.num_classes + 1)
         values = (label_probabilities(leaves.log_odds) - least) / (1.0 - least)
         return LeafColors(ramp(values), f"dark {least:.3f}, yellow 1", (least, 1.0))
-    check_one_frame(result, at_ns)
+    part.check_one_frame(result)
     if color in ("seen-by", "contradiction"):
-        evidence = [result.evidence(robot_id, at_ns=at_ns) for robot_id in result.robots]
+        evidence = [part.evidence(result, robot_id) for robot_id in result.robots]
         return _seen_by(evidence, leaves) if color == "seen-by" else _contradiction(result, evidence, leaves)
     ids = {stored.robot_id: stored for stored in shown}
-    maps = [ids.get(robot_id) or result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
+    maps = [ids.get(robot_id) or part.map(result, robot_id) for robot_id in result.robots]
     if color == "robot":
         known = np.column_stack([stored.query(leaves.centers, map_kind=MEAN).known for stored in maps])
         return LeafColors(_mean_colors(known), _robot_names(maps))
@@ -102,17 +104,6 @@ def leaf_colors(
     return LeafColors(
         ramp(values / largest if largest > 0 else values), f"dark 0, yellow {largest:.6g}", (0.0, largest)
     )
-
-
-def check_one_frame(result: Result, at_ns: int | None) -> None:
-    """Raise InputError where the robots' maps are in several frames."""
-    maps = [result.map(robot_id, at_ns=at_ns) for robot_id in result.robots]
-    if len({stored.frame_id for stored in maps}) > 1:
-        frames = ", ".join(f"{stored.robot_id} in {stored.frame_id}" for stored in maps)
-        raise InputError(
-            f"{result.path}: the robots' maps are in different frames ({frames}); name a robot and color 'label' or"
-            " 'probability', or a later time"
-        )
 
 
 def ramp(values: FloatArray) -> UInt8Array:

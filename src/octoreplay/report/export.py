@@ -19,9 +19,12 @@ from octoreplay.io.results import glb, las, npz, octomap_trees, ply
 from octoreplay.io.results.occupancy_grid import OCCUPIED, grid_files, grid_of
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.merged_faces import merged_faces
+from octoreplay.mapping.regions import leaf_tiles
 from octoreplay.records import MAP_KINDS, POSTERIOR, BoolArray, ClassTable, FilePath, Int64Array, LeafTable, UInt8Array
-from octoreplay.report.cell_colors import COLORS, LeafColors, check_one_frame, default_color, leaf_colors
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.report.cell_colors import COLORS, LeafColors, default_color, leaf_colors
+from octoreplay.report.map_part import MapPart, finest_edge
+from octoreplay.result import Result, open_result
+from octoreplay.stored_map import StoredMap
 
 _log = logging.getLogger(__name__)
 
@@ -44,8 +47,8 @@ class _Content(NamedTuple):
     resolution: float
     day: datetime.date
 
-    def taken(self, chosen: BoolArray) -> _Content:
-        """Return the content with the leaves where ``chosen`` (L,) is True."""
+    def taken(self, chosen: BoolArray | Int64Array) -> _Content:
+        """Return the content with the leaves where ``chosen`` (L,) is True, or at positions ``chosen`` (n,)."""
         return self._replace(leaves=self.leaves.taken(chosen), colors=self.colors[chosen], robots=self.robots[chosen])
 
 
@@ -88,7 +91,13 @@ def _encode_tree(path: Path, content: _Content, _: str) -> _Files:
 
 
 def _encode_grid(path: Path, content: _Content, _: str) -> _Files:
-    """Occupancy grid and its image; warns where the ground seems to be in it."""
+    """Occupancy grid and its image."""
+    grid = grid_of(content.leaves, content.resolution)
+    return {name: (data, grid.num_known) for name, data in grid_files(path, grid).items()}
+
+
+def _warn_of_ground(path: Path, content: _Content) -> None:
+    """Warn where the ground seems to be in an occupancy grid."""
     grid = grid_of(content.leaves, content.resolution)
     share = np.count_nonzero(grid.cells == OCCUPIED) / max(grid.num_known, 1)
     if share > _MOST_OCCUPIED:
@@ -96,7 +105,6 @@ def _encode_grid(path: Path, content: _Content, _: str) -> _Files:
             "warning: %s: %.0f %% of the known cells are occupied, as with the ground in the grid; leave it out with"
             " --heights LOW HIGH, such as --heights 0.2 1.5", path, 100 * share,
         )  # fmt: skip
-    return {name: (data, grid.num_known) for name, data in grid_files(path, grid).items()}
 
 
 class _Format(NamedTuple):
@@ -124,7 +132,8 @@ SUFFIXES = tuple(_FORMATS)
 def export_map(
     result_path: FilePath, output: FilePath, robot: str | None = None, at: float | None = None,
     what: str = "points", color: str | None = None, *, free: bool = False, map_kind: str = POSTERIOR,
-    heights: tuple[float, float] = (-math.inf, math.inf), split: str | None = None,
+    heights: tuple[float, float] = (-math.inf, math.inf), split: str | None = None, bounds: Sequence[float] = (),
+    tile: float | None = None, max_depth: int | None = None,
 ) -> dict[Path, int]:  # fmt: skip
     """Write a map of a result; return the files with the number of leaves in each, of a grid of known cells.
 
@@ -159,6 +168,15 @@ def export_map(
     split : str, optional
         'class' for a file of each class, 'robot' for a file of each robot's map. They are ``NAME-CLASS_ID-CLASS`` and
         ``NAME-ROBOT`` with the suffix of ``output``, and get their names when all of them are complete.
+    bounds : sequence of float
+        Box of the map to write, (zmin, zmax) or (xmin, ymin, zmin, xmax, ymax, zmax) in the map's frame [m]; leaves are
+        cut at its sides (``Result.map``). Empty for the whole map.
+    tile : float, optional
+        Edge [m] of square tiles of the x-y plane: a file for each tile with leaves, ``NAME-xX_yY``, X and Y the tile's
+        lower limits [m], multiples of the edge. Leaves are cut at the borders of tiles. The files get their names as
+        those of ``split``.
+    max_depth : int, optional
+        Depth of the finest cells, from 1 to 19 (``StoredMap.coarsened``); all cells by default.
 
     Raises
     ------
@@ -173,9 +191,16 @@ def export_map(
     kind = _checked_format(output, what, color, map_kind, heights, split, robot)
     with open_result(result_path) as result:
         at_ns = None if at is None else result.time_ns(at)
+        part = MapPart(at_ns, bounds, max_depth)
+        _check_tile(tile, finest_edge(result, max_depth))
         with_free = free or kind.has_free
-        contents = _contents(result, robot, at_ns, color, map_kind, heights, split, with_free=with_free)
+        contents = _contents(result, robot, part, color, map_kind, heights, split, with_free=with_free)
         parts = dict(_parts(output, contents, result.class_table, split))
+    if kind.encode is _encode_grid:
+        for path, whole in parts.items():
+            _warn_of_ground(path, whole)
+    if tile is not None:
+        parts = {name: piece for path, whole in parts.items() for name, piece in _tiles(path, whole, tile)}
     files = _encoded(kind, parts, what)
     write_together({path: data for path, (data, _) in files.items()})
     mark_written(output)
@@ -217,8 +242,14 @@ def _checked_format(
     return kind
 
 
+def _check_tile(tile: float | None, edge: float) -> None:
+    """Raise ConfigError for tiles smaller than a cell of this edge [m], and for numbers that are no edge."""
+    if tile is not None and not edge <= tile < math.inf:
+        raise ConfigError(f"tile: expects an edge of at least one cell of the map, {edge:g} m, got {tile:g}")
+
+
 def _contents(
-    result: Result, robot: str | None, at_ns: int | None, color: str | None, map_kind: str,
+    result: Result, robot: str | None, part: MapPart, color: str | None, map_kind: str,
     heights: tuple[float, float], split: str | None, *, with_free: bool,
 ) -> dict[tuple[str, ...], _Content]:  # fmt: skip
     """Contents of the files by the robots of their maps; InputError where there is no leaf to write."""
@@ -227,31 +258,31 @@ def _contents(
     if split == "robot":
         groups = [(robot_id,) for robot_id in result.robots]
     elif robot is None and color == "robot":
-        check_one_frame(result, at_ns)
+        part.check_one_frame(result)
         groups = [result.robots]
     else:
         groups = [(robot or result.robots[0],)]
-    contents = {ids: _content(result, ids, at_ns, color, map_kind, heights, with_free=with_free) for ids in groups}
-    _check_leaves(result, contents, heights)
+    contents = {ids: _content(result, ids, part, color, map_kind, heights, with_free=with_free) for ids in groups}
+    _check_leaves(result, contents, part, heights)
     return contents
 
 
 def _content(
-    result: Result, robot_ids: Sequence[str], at_ns: int | None, color: str, map_kind: str,
+    result: Result, robot_ids: Sequence[str], part: MapPart, color: str, map_kind: str,
     heights: tuple[float, float], *, with_free: bool,
 ) -> _Content:  # fmt: skip
     """Content of the file of some robots' maps."""
-    shown = [result.map(robot_id, at_ns=at_ns) for robot_id in robot_ids]
+    shown = [part.map(result, robot_id) for robot_id in robot_ids]
     leaves, owners = _leaves(shown, map_kind)
     keep = leaves.between(*heights)
     if not with_free:
         keep &= best_labels(leaves.log_odds) > 0
     leaves = leaves.taken(keep)
-    colors = leaf_colors(result, shown, leaves, color, at_ns)
+    colors = leaf_colors(result, shown, leaves, color, part)
     indices = np.array([_index(result, stored) for stored in shown], np.int64)
     day = datetime.datetime.fromtimestamp(shown[0].stamp_ns // 10**9, datetime.UTC).date()
     return _Content(
-        leaves, colors.colors, indices[owners[keep]], _comments(result, shown, color, colors, map_kind),
+        leaves, colors.colors, indices[owners[keep]], _comments(result, shown, part, color, colors, map_kind),
         result.class_table, shown[0].resolution, day,
     )  # fmt: skip
 
@@ -262,7 +293,9 @@ def _index(result: Result, stored: StoredMap) -> int:
     return ids.index(stored.robot_id) if stored.robot_id in ids else len(ids)
 
 
-def _check_leaves(result: Result, contents: Mapping[tuple[str, ...], _Content], heights: tuple[float, float]) -> None:
+def _check_leaves(
+    result: Result, contents: Mapping[tuple[str, ...], _Content], part: MapPart, heights: tuple[float, float]
+) -> None:
     """Raise InputError where there is no leaf to write."""
     if any(len(content.leaves) for content in contents.values()):
         return
@@ -270,7 +303,8 @@ def _check_leaves(result: Result, contents: Mapping[tuple[str, ...], _Content], 
         low, high = heights
         raise InputError(f"{result.path}: the map holds nothing from {low:g} m to {high:g} m; give other heights")
     names = ", ".join(robot_id for ids in contents for robot_id in ids)
-    raise InputError(f"{result.path}: the map of {names} holds no occupied leaf; use --free, or a later time")
+    where, remedy = (" within the bounds", "other bounds") if len(part.bounds) else ("", "a later time")
+    raise InputError(f"{result.path}: the map of {names} holds no occupied leaf{where}; use --free, or {remedy}")
 
 
 def _parts(
@@ -287,6 +321,16 @@ def _parts(
                     yield _named(output, part), content.taken(labels == class_id)
         elif len(content.leaves):
             yield _named(output, ids[0]) if split else output, content
+
+
+def _tiles(path: Path, whole: _Content, edge: float) -> Iterator[tuple[Path, _Content]]:
+    """Content of each tile of a file."""
+    for tile in leaf_tiles(whole.leaves, whole.resolution, edge):
+        piece = whole.taken(tile.leaves)
+        leaves = LeafTable(tile.centers, tile.sizes, piece.leaves.log_odds)
+        # Ten digits hide the rounding of a product such as 3 * 0.7.
+        x, y = (f"{number * edge:.10g}" for number in (tile.column, tile.row))
+        yield _named(path, f"x{x}_y{y}"), piece._replace(leaves=leaves)
 
 
 def _named(output: Path, part: str) -> Path:
@@ -311,7 +355,9 @@ def _leaves(maps: Sequence[StoredMap], map_kind: str) -> tuple[LeafTable, Int64A
     return LeafTable(centers, sizes, log_odds).taken(keep), owners[keep]
 
 
-def _comments(result: Result, shown: Sequence[StoredMap], color: str, colors: LeafColors, map_kind: str) -> list[str]:
+def _comments(
+    result: Result, shown: Sequence[StoredMap], part: MapPart, color: str, colors: LeafColors, map_kind: str
+) -> list[str]:
     """Comments of the file: map, time, classes and colours."""
     last = shown[0]
     names = ", ".join(f"{c.class_id} {c.name}" for c in result.class_table.classes)
@@ -324,4 +370,6 @@ def _comments(result: Result, shown: Sequence[StoredMap], color: str, colors: Le
         f"classes: 0 free, {names}",
         f"color: {color} ({colors.scale})",
     ]
+    if len(part.bounds):
+        lines.insert(3, f"bounds: {', '.join(f'{number:g}' for number in part.bounds)} m")
     return ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in lines]

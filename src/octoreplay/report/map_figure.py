@@ -23,6 +23,7 @@ from octoreplay.report.cell_colors import (
     robot_color,
 )
 from octoreplay.report.figures import SCREEN, FigureStyle, plain
+from octoreplay.report.map_part import MapPart
 from octoreplay.result import Result
 
 if TYPE_CHECKING:
@@ -44,22 +45,23 @@ _SCALES = {
 
 def map_figure(
     results: Mapping[str, Result], look: FigureStyle = SCREEN, *, robot: str | None = None, at: float | None = None,
-    color: str | None = None,
+    color: str | None = None, max_depth: int | None = None,
 ) -> Figure:  # fmt: skip
     """Return the picture of the occupied leaves of each result's map, by label, seen obliquely from above.
 
     ``robot`` is the robot of the maps, None for the first one; ``at`` the time since the run's start in seconds, None
-    for the end; ``color`` as in ``export_map``. All pictures have one view and one scale. Raises ConfigError for an
-    unknown ``color``, and InputError where a result has no such map, or one without an occupied leaf.
+    for the end; ``color`` and ``max_depth`` as in ``export_map``. All pictures have one view and one scale. Raises
+    ConfigError for an unknown ``color`` or another ``max_depth``, and InputError where a result has no such map, or one
+    without an occupied leaf.
     """
     if color is not None and color not in COLORS:
         raise ConfigError(f"color: '{color}' is not one of {', '.join(COLORS)}")
     shown = color or default_color(next(iter(results.values())).class_table)
-    maps = {label: _occupied(result, robot, at, shown) for label, result in results.items()}
+    maps = {label: _occupied(result, robot, at, max_depth, shown) for label, result in results.items()}
     ranges = [colors.limits for _, colors, _ in maps.values() if colors.limits is not None]
     if len(ranges) > 1:
         common = min(low for low, _ in ranges), max(high for _, high in ranges)
-        maps = {label: _occupied(result, robot, at, shown, common) for label, result in results.items()}
+        maps = {label: _occupied(result, robot, at, max_depth, shown, common) for label, result in results.items()}
     columns = min(len(maps), _MAX_COLUMNS)
     pictures = _pictures(list(maps.values()), round(look.width / columns * _DPI))
     rows, (height, width) = math.ceil(len(maps) / columns), pictures[0].shape[:2]
@@ -83,16 +85,17 @@ def map_figure(
 
 
 def _occupied(
-    result: Result, robot: str | None, at: float | None, color: str, limits: tuple[float, float] | None = None
-) -> tuple[LeafTable, LeafColors, float]:
+    result: Result, robot: str | None, at: float | None, max_depth: int | None, color: str,
+    limits: tuple[float, float] | None = None,
+) -> tuple[LeafTable, LeafColors, float]:  # fmt: skip
     """Occupied leaves of a map, their colours, and the resolution [m]."""
-    at_ns = None if at is None else result.time_ns(at)
-    stored = result.map(robot or result.robots[0], at_ns=at_ns)
+    part = MapPart(None if at is None else result.time_ns(at), max_depth=max_depth)
+    stored = part.map(result, robot or result.robots[0])
     leaves = stored.leaves(map_kind=POSTERIOR)
     leaves = leaves.taken(best_labels(leaves.log_odds) > 0)
     if not len(leaves):
         raise InputError(f"{result.path}: the map of {stored.robot_id} holds no occupied leaf; use a later time")
-    return leaves, leaf_colors(result, [stored], leaves, color, at_ns, limits), stored.resolution
+    return leaves, leaf_colors(result, [stored], leaves, color, part, limits), stored.resolution
 
 
 def _pictures(maps: Sequence[tuple[LeafTable, LeafColors, float]], width: int) -> list[UInt8Array]:
@@ -112,7 +115,7 @@ def _picture(leaves: LeafTable, colors: UInt8Array, resolution: float, view: map
         centers = np.asarray((keys + 0.5) * resolution, np.float64)
         picture = map_view.draw(map_view.cube_faces(centers, resolution, colors[owners], np.ones(len(keys))), view)
     except ValueError as error:
-        raise InputError(f"the map is too large for a picture: {error}; run again with a coarser resolution") from error
+        raise InputError(f"the map is too large for a picture: {error}; give a smaller max_depth") from error
     picture[(picture == np.array(map_view.BACKGROUND)).all(axis=2)] = 255
     return picture
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.octree import codes_to_keys
 from octoreplay.records import Float64Array, Int64Array, UInt8Array, UInt64Array
-from octoreplay.result import StoredMap
+from octoreplay.stored_map import StoredMap
 
 BACKGROUND = (236, 239, 243)
 """Colour of the background; not white, so that pale and transparent cells differ."""

@@ -13,7 +13,7 @@ from octoreplay.records import LeafTable
 from octoreplay.report.tables import number, share, styled_table
 
 if TYPE_CHECKING:
-    from octoreplay.result import PointQuery
+    from octoreplay.stored_map import PointQuery
 
 _Points = Sequence[tuple[float, float, float]]
 

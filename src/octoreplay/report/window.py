@@ -13,14 +13,15 @@ from octoreplay.report.map_view import cube_faces
 from octoreplay.result import Result
 
 
-def show_window(result: Result) -> None:
+def show_window(result: Result, max_depth: int | None = None) -> None:
     """Show the occupied leaves of the first robot's last map until the window is closed.
 
-    Raises InputError for a map without occupied leaves, and OutputError without a screen or without Open3D.
+    ``max_depth`` is as in ``StoredMap.coarsened``. Raises InputError for a map without occupied leaves, and OutputError
+    without a screen or without Open3D.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise OutputError("this machine has no screen; use 'octoreplay view' without --window, or 'octoreplay report'")
-    stored = result.map(result.robots[0])
+    stored = result.map(result.robots[0]).coarsened(max_depth)
     leaves = stored.leaves()
     labels = best_labels(leaves.log_odds)
     occupied = labels > 0

@@ -27,11 +27,12 @@ from octoreplay.report import map_view, paper_plots
 from octoreplay.report.figures import save_figures
 from octoreplay.report.log_time import has_published, over_robots
 from octoreplay.report.map_figure import AZIMUTH, ELEVATION
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
 from octoreplay.run_metrics import TickMetrics
 from octoreplay.simulate.team import SimulationConfig
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import World
+from octoreplay.stored_map import StoredMap
 from octoreplay.study.teams import replayed_team, simulated_team
 
 TEAM, RESULT, FIGURES, NUMBERS = "team", "paper.mcap", "figures", "numbers.json"

@@ -157,6 +157,25 @@ def test_a_page_loads_nothing_from_elsewhere(trio_page: Page) -> None:
 
 
 @long
+def test_a_page_of_a_depth_has_the_coarse_maps(trio_result: Path, tmp_path: Path) -> None:
+    path = tmp_path / "coarse.html"
+    done = octoreplay("report", trio_result, "-o", path, "--max-depth", 17)
+    assert done.returncode == 0, done.stderr
+    page = Page(path)
+    with open_result(trio_result) as result:
+        assert page.header["resolution"] == 4 * result.config.map.resolution
+        for name in (*result.robots, "central"):
+            stored = result.map(name).coarsened(17)
+            leaves = stored.leaves()
+            cubes, _ = page.map(name, len(page.array(page.header["storedRows"])) - 1)
+            assert len(cubes) == int((best_labels(leaves.log_odds) > 0).sum()) > 0
+            answer = stored.query((np.array(list(cubes)).reshape(-1, 3) + 0.5) * stored.resolution)
+            assert [cube.values["label"] for cube in cubes.values()] == answer.labels.tolist()
+    edge = page.header["resolution"]
+    assert f"The finest cells of the team&#x27;s map on this page have an edge of {edge:g} m." in page.text
+
+
+@long
 def test_equal_results_give_equal_pages(trio_result: Path, trio_page: Page) -> None:
     with open_result(trio_result) as result:
         text = page_of(result)

@@ -190,6 +190,19 @@ def test_robots_and_the_least_time_between_maps_are_chosen(tmp_path: Path) -> No
 
 
 @long
+def test_maps_of_a_depth_have_its_cells(tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    write_rerun(RESULT, out, robots=("husky_2",), every=100.0, max_depth=18)
+    with open_result(RESULT) as result:
+        stored = result.map("husky_2").coarsened(18)
+    leaves = stored.leaves()
+    labels = best_labels(leaves.log_odds)
+    expected = np.column_stack([leaves.centers, leaves.sizes, labels])[labels > 0]
+    boxes = Recording(out).boxes("/team/husky_2/map", [stored.tick])[stored.tick]
+    assert sorted(map(tuple, boxes.round(3).tolist())) == sorted(map(tuple, expected.round(3).tolist()))
+
+
+@long
 def test_robots_that_find_each_other_change_their_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leaf_list.install(monkeypatch)
     metrics, own = [], ("team", "beta/map")

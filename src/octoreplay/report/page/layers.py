@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from octoreplay.mapping.octree import codes_to_keys
 from octoreplay.records import CENTRAL, Float64Array, Int64Array, UInt32Array
+from octoreplay.report.map_part import finest_edge
 from octoreplay.report.page.team_map import Evidence, RobotMap, TeamMap, together
 from octoreplay.report.page.tiles import (
     DISAGREEMENT_STEPS,
@@ -30,7 +31,8 @@ from octoreplay.report.page.tiles import (
     tile_places,
     tiles_of,
 )
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 TEAM_LAYER = "/team"
 """Name of the layer of the team's map; names of robots do not begin with a slash."""
@@ -71,10 +73,11 @@ class Layer:
 class Layers:
     """Layers of a result by name, and the pools of their tiles.
 
-    ``masks`` are the distinct masks of robots that the values of the team's map name by their index.
+    ``masks`` are the distinct masks of robots that the values of the team's map name by their index. ``max_depth`` is
+    as in ``StoredMap.coarsened``, and ``resolution`` the edge of the finest cells [m].
     """
 
-    def __init__(self, result: Result, ticks: Sequence[int]) -> None:
+    def __init__(self, result: Result, ticks: Sequence[int], max_depth: int | None = None) -> None:
         self.ticks = tuple(ticks)
         self.masks = _Masks()
         self.pools = {
@@ -84,10 +87,11 @@ class Layers:
         }
         self.layers: dict[str, Layer] = {}
         self.largest_disagreement = 0.0
-        self.bounds = Bounds(result.config.map.resolution)
-        self.evidence = Evidence(result, ticks)
+        self.resolution = finest_edge(result, max_depth)
+        self.bounds = Bounds(self.resolution)
+        self.evidence = Evidence(result, ticks, max_depth)
         team_map = TeamMap(self.evidence)
-        for index, maps in _chosen(result, ticks):
+        for index, maps in _chosen(result, ticks, max_depth):
             self._add_tick(index, maps, team_map)
 
     def contents_in_use(self, pool: str) -> UInt32Array:
@@ -211,14 +215,15 @@ class _Masks:
         return np.array(found, dtype=np.uint16)[places]
 
 
-def _chosen(result: Result, ticks: Sequence[int]) -> Iterator[tuple[int, dict[str, RobotMap]]]:
+def _chosen(result: Result, ticks: Sequence[int], max_depth: int | None) -> Iterator[tuple[int, dict[str, RobotMap]]]:
     """Yield the index of each of ``ticks`` and all maps at it by name."""
     indices = {tick: index for index, tick in enumerate(ticks)}
     names = (*result.robots, CENTRAL)
     for maps in result.history():
         tick = max(stored.tick for stored in maps.values())
         if tick in indices:
-            yield indices[tick], {name: _robot_map(names.index(name), stored) for name, stored in maps.items()}
+            shown = {name: stored.coarsened(max_depth) for name, stored in maps.items()}
+            yield indices[tick], {name: _robot_map(names.index(name), stored) for name, stored in shown.items()}
 
 
 def _robot_map(index: int, stored: StoredMap) -> RobotMap:

@@ -36,7 +36,9 @@ _LEVELS = ((0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4), (4, 5))
 """Finest levels of the team's map and of all other maps, from the largest page to the smallest."""
 
 
-def write_page(result_path: Path | str, output: Path | str, *, max_bytes: int = DEFAULT_MAX_BYTES) -> int:
+def write_page(
+    result_path: Path | str, output: Path | str, *, max_bytes: int = DEFAULT_MAX_BYTES, max_depth: int | None = None
+) -> int:
     """Write the page of a result to a file and return its size [byte].
 
     Parameters
@@ -46,24 +48,28 @@ def write_page(result_path: Path | str, output: Path | str, *, max_bytes: int = 
     max_bytes : int
         Size that the page should not exceed [byte]. Fine levels of the maps are left out where it would; the page says
         so. The coarsest levels, charts and tables are always there.
+    max_depth : int, optional
+        Depth of the finest cells of the maps, from 1 to 19 (``StoredMap.coarsened``); all cells by default.
 
     Raises
     ------
+    ConfigError
+        ``max_depth`` is no depth.
     InputError
         The result cannot be read, or holds no tick.
     OutputError
         The file cannot be written.
     """
     with open_result(result_path) as result:
-        text = page_of(result, max_bytes)
+        text = page_of(result, max_bytes, max_depth)
     content = text.encode()
     write_whole(Path(output), content)
     return len(content)
 
 
-def page_of(result: Result, max_bytes: int = DEFAULT_MAX_BYTES) -> str:
+def page_of(result: Result, max_bytes: int = DEFAULT_MAX_BYTES, max_depth: int | None = None) -> str:
     """Return the page of a result as HTML. Raises as ``write_page``."""
-    contents = PageContents(result)
+    contents = PageContents(result, max_depth)
     fixed = len(contents.html(b"").encode())
     for team_level, robot_level in _LEVELS:
         contents.layers.keep_levels(team_level, robot_level)
@@ -78,18 +84,18 @@ def page_of(result: Result, max_bytes: int = DEFAULT_MAX_BYTES) -> str:
 class PageContents:
     """Everything that a page shows of a result.
 
-    Raises InputError where the result holds no tick.
+    ``max_depth`` is as in ``StoredMap.coarsened``. Raises InputError where the result holds no tick.
     """
 
-    def __init__(self, result: Result) -> None:
+    def __init__(self, result: Result, max_depth: int | None = None) -> None:
         if not result.metrics:
             raise InputError(f"{result.path}: holds no tick; the run was interrupted before its first one")
         self.result = result
         self.times = series.times(result)
         stored = stored_ticks(result)
-        self.layers = Layers(result, chosen_ticks(result, stored))
+        self.layers = Layers(result, chosen_ticks(result, stored), max_depth)
         self.num_stored = len(stored)
-        self.pictures = pictures.pictures(result)
+        self.pictures = pictures.pictures(result, max_depth)
 
     def header(self, columns: Columns) -> str:
         """Return the header of a page that holds all tiles as JSON, and add its arrays to ``columns``."""
@@ -116,7 +122,7 @@ class PageContents:
         low, high = (bounds.low[2], bounds.high[2]) if np.isfinite(bounds.low[2]) else (-1.0, 1.0)
         description = {
             "served": pools is None,
-            "resolution": result.config.map.resolution,
+            "resolution": layers.resolution,
             "robots": [
                 {"id": escaped(name), "color": list(robot_color(index))} for index, name in enumerate(result.robots)
             ],
@@ -178,11 +184,10 @@ class PageContents:
     def _footer(self) -> str:
         """Sentences on what the page leaves out, and the version."""
         sentences = []
-        edge = self.result.config.map.resolution
         for is_team, name in ((True, "the team's map"), (False, "the robots' maps")):
-            level = self.layers.finest_level(is_team=is_team)
-            if level:
-                sentences.append(f"The finest cells of {name} on this page have an edge of {edge * 2**level:g} m.")
+            edge = self.layers.resolution * 2 ** self.layers.finest_level(is_team=is_team)
+            if edge > self.result.config.map.resolution:
+                sentences.append(f"The finest cells of {name} on this page have an edge of {edge:g} m.")
         if len(self.layers.ticks) < self.num_stored:
             sentences.append(f"The page has {len(self.layers.ticks)} of {self.num_stored} stored maps of each robot.")
         if sentences:

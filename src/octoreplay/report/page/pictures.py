@@ -15,7 +15,8 @@ from octoreplay.records import UInt8Array
 from octoreplay.report.cell_colors import FREE_COLOR
 from octoreplay.report.map_view import cube_faces, draw, opacities, overlay, view_of
 from octoreplay.report.page.team_map import together
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 _SIZE = (900, 560)
 _VIEWS = ((-60.0, "seen from the south-east"), (120.0, "seen from the north-west"))
@@ -23,12 +24,13 @@ _MOST_CUBES = 400_000
 """Largest number of cubes in a picture."""
 
 
-def pictures(result: Result) -> str:
+def pictures(result: Result, max_depth: int | None = None) -> str:
     """Return pictures of the robots' last maps as HTML figures, transparent where the robots differ.
 
-    Returns an empty text for a result without maps or occupied cells, and a sentence for a map that is too large.
+    ``max_depth`` is as in ``StoredMap.coarsened``. Returns an empty text for a result without maps or occupied cells,
+    and a sentence for a map that is too large.
     """
-    stored = {name: result.map(name) for name in result.robots if result.stored_ticks(name)}
+    stored = {name: result.map(name).coarsened(max_depth) for name in result.robots if result.stored_ticks(name)}
     maps = [stored[name] for name in together(stored)]
     if not maps:
         return "<p>The result holds no map.</p>"

@@ -21,15 +21,16 @@ _MOST_TILES = 256
 
 
 @contextmanager
-def served(result: Result, port: int = 0) -> Iterator[str]:
+def served(result: Result, port: int = 0, max_depth: int | None = None) -> Iterator[str]:
     """Serve the page of a result on the loopback interface; yields its URL.
 
-    ``port`` is that of the server, 0 for a free one. The server answers only requests that name this machine as their
-    host, so that pages of other sites cannot read the map through a name that resolves to it.
+    ``port`` is that of the server, 0 for a free one. ``max_depth`` is as in ``StoredMap.coarsened``. The server answers
+    only requests that name this machine as their host, so that pages of other sites cannot read the map through a name
+    that resolves to it.
 
     Raises InputError where the result holds no tick, and OutputError where the port cannot be used.
     """
-    answers = _Answers(PageContents(result))
+    answers = _Answers(PageContents(result, max_depth))
 
     class Handler(_Handler):
         answer = answers

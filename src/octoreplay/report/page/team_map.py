@@ -26,7 +26,8 @@ from octoreplay.report.page.tiles import (
     runs_hold,
     union,
 )
-from octoreplay.result import Result, StoredMap
+from octoreplay.result import Result
+from octoreplay.stored_map import StoredMap
 
 SEVERAL = 255
 """Value of the field ``first`` where several robots knew a cell in the same period."""
@@ -68,11 +69,13 @@ class RobotMap:
 class Evidence:
     """Robots' evidence at some ticks of a result: the last one up to a tick, or the first one that is stored.
 
-    ``has_history`` is True where the evidence of several ticks is stored.
+    ``has_history`` is True where the evidence of several ticks is stored. ``max_depth`` is as in
+    ``StoredMap.coarsened``.
     """
 
-    def __init__(self, result: Result, ticks: Sequence[int]) -> None:
+    def __init__(self, result: Result, ticks: Sequence[int], max_depth: int | None = None) -> None:
         self._result = result
+        self._max_depth = max_depth
         self._stored = {name: set(result.evidence_ticks(name)) for name in result.robots}
         self.ticks = [tick for tick in ticks if any(tick in stored for stored in self._stored.values())]
         self.has_history = len(self.ticks) > 1
@@ -87,7 +90,7 @@ class Evidence:
             self._tick, self._maps = wanted, []
             for index, name in enumerate(self._result.robots):
                 if wanted in self._stored[name]:
-                    stored = self._result.evidence(name, tick=wanted)
+                    stored = self._result.evidence(name, tick=wanted).coarsened(self._max_depth)
                     self._maps.append(RobotMap(index, stored, stored.octree.spans()))
         return self._tick, self._maps
 

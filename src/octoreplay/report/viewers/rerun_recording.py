@@ -27,8 +27,9 @@ from octoreplay.log_odds import best_labels
 from octoreplay.records import CENTRAL, MAP_KINDS, POSTERIOR, FilePath, Float64Array, LeafTable
 from octoreplay.report.figures import COLORS
 from octoreplay.report.viewers.scene import Scene, scene_of
-from octoreplay.result import Result, StoredMap, open_result
+from octoreplay.result import Result, open_result
 from octoreplay.run_metrics import TickMetrics
+from octoreplay.stored_map import StoredMap
 
 TIMELINE = "elapsed"
 """Main time axis: time since the run's start. The others are ``stamp`` (log time) and ``tick``."""
@@ -70,6 +71,7 @@ def write_rerun(
     robots: Sequence[str] = (),
     every: float = 0.0,
     map_kind: str = POSTERIOR,
+    max_depth: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> RecordingSummary:
     """Write a result as a recording of the Rerun viewer, with a blueprint.
@@ -84,13 +86,15 @@ def write_rerun(
         Least log time between two shown maps of a robot [s]. The last stored map is always shown.
     map_kind : str
         'posterior' or 'mean': form of the maps that the labels are of (``StoredMap``).
+    max_depth : int, optional
+        Depth of the finest cells of the maps, from 1 to 19 (``StoredMap.coarsened``); all cells by default.
     progress : callable, optional
         Called with the finished share, 0..1, after each stored tick.
 
     Raises
     ------
     ConfigError
-        rerun-sdk is not installed, or ``map_kind`` is unknown.
+        rerun-sdk is not installed, ``map_kind`` is unknown, or ``max_depth`` is no depth.
     InputError
         The result cannot be read, holds no tick or no map, or has no robot of this name.
     OutputError
@@ -114,7 +118,7 @@ def write_rerun(
                 writer.write_classes()
                 writer.write_metrics()
                 writer.write_motion()
-                num_maps = writer.write_maps(shown, every, map_kind, progress)
+                num_maps = writer.write_maps(shown, every, map_kind, max_depth, progress)
                 stream.flush()
             finally:
                 stream.disconnect()
@@ -244,8 +248,9 @@ class _Writer:
         return set(strips)
 
     def write_maps(
-        self, shown: Sequence[str], every: float, map_kind: str, progress: Callable[[float], None] | None
-    ) -> int:
+        self, shown: Sequence[str], every: float, map_kind: str, max_depth: int | None,
+        progress: Callable[[float], None] | None,
+    ) -> int:  # fmt: skip
         """Write the stored maps of some robots, and return their number."""
         last = {robot_id: self._result.stored_ticks(robot_id)[-1] for robot_id in shown}
         written: dict[str, StoredMap] = {}
@@ -266,7 +271,7 @@ class _Writer:
                 if frames.setdefault(robot_id, stored.frame_id) != stored.frame_id:
                     self._set_time(self._ticks[stored.tick])
                     self._clear(frames[robot_id], robot_id, "map")
-                self._write_map(stored, map_kind)
+                self._write_map(stored.coarsened(max_depth), map_kind)
                 written[robot_id], frames[robot_id] = stored, stored.frame_id
                 num_maps += 1
             if progress is not None:
