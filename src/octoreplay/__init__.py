@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from octoreplay.records import ClassTable, LeafTable, SemanticClass
     from octoreplay.replay.alignment import Alignment, RobotFrame, align_logs, aligned_config
     from octoreplay.replay.run import Progress, replay_team
-    from octoreplay.study.tiles.run import replay_tiles
     from octoreplay.report.export import export_map
     from octoreplay.result import Result, open_result
     from octoreplay.run_metrics import RunSummary, TickMetrics
     from octoreplay.simulate.team import SimulationConfig, simulate_team
     from octoreplay.stored_map import PointQuery, StoredMap
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
+    from octoreplay.study.tiles.run import replay_tiles
 
 _MODULES = {
     "Alignment": "replay.alignment",

@@ -95,9 +95,9 @@ def _check_input(word: str) -> None:
               help="least time between check points, 0 for none  [default: at most 3 % of the run's time]")  # fmt: skip
 @click.option("--memory-limit", cls=RareOption, callback=parse_size, metavar="SIZE",
               help="end the run above this memory, such as 8GB; --resume continues it")  # fmt: skip
-@click.option("--tiles", type=float, metavar="METRES",
+@click.option("--tiles", cls=RareOption, type=float, metavar="METRES",
               help="replay tiles of the space with this edge one after the other; the maps are the same")  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1), metavar="N",
+@click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
               help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
