@@ -13,7 +13,7 @@ from octoreplay.mapping.sensor import ScanCaster
 from octoreplay.records import CameraModel, CloudFrame, DepthFrame
 from octoreplay.replay.sources import TeamSources
 from octoreplay.study.tiles.geometry import tiles_of
-from octoreplay.study.tiles.survey import Survey, ray_box, touching
+from octoreplay.study.tiles.survey import Survey, load_frames, ray_box, touching
 from support.fixture_paths import TRIO_TEAM
 
 RESOLUTION = 0.25
@@ -60,16 +60,19 @@ def test_boxes_hold_all_cells_of_a_scan(seed, rays):
         assert (high <= box[3:] + margin).all()
 
 
-def test_frames_elsewhere_are_given_without_points():
+def test_frames_elsewhere_are_given_without_points(tmp_path):
     config = resolve(load_team_file(TRIO_TEAM))
     survey = Survey(config)
+    survey.save(tmp_path)
     bounds = tiles_of(survey.boxes, 32, config)[0].bounds(config.map)
-    elsewhere = [robot.elsewhere(bounds, len(of.views)) for robot, of in zip(survey.robots, config.robots, strict=True)]
+    elsewhere = [
+        robot.elsewhere(bounds, len(of.views)) for robot, of in zip(load_frames(tmp_path), config.robots, strict=True)
+    ]
     num_skipped = 0
     with TeamSources(config, elsewhere) as team:
         for source, robot in zip(team.sources, survey.robots, strict=True):
             found = list(source.frames())
-            assert [frame.stamp_ns for frame in found] == robot.stamps
+            assert [frame.stamp_ns for frame in found] == robot.stamps.tolist()
             is_near = touching(robot.boxes, bounds)
             for frame, T_team_sensor, near in zip(found, robot.poses, is_near, strict=True):
                 np.testing.assert_array_equal(frame.T_team_sensor, T_team_sensor)

@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,6 +39,11 @@ from octoreplay.study.tiles.worker import Request, Workers
 _log = logging.getLogger(__name__)
 
 _DESCRIPTION = "run.json"
+_OTHER_FILES = 64
+"""Open files of a process besides those of tiles."""
+
+Progress = Callable[[str, int, int], None]
+"""Function that is called with a stage, and the numbers of finished tiles or ticks and of all."""
 
 
 def replay_tiles(
@@ -47,7 +53,7 @@ def replay_tiles(
     *,
     num_jobs: int = 1,
     num_threads: int | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
     restart: bool = False,
     resume: bool = False,
 ) -> RunSummary:
@@ -99,8 +105,10 @@ def replay_tiles(
         tiles = tiles_of(survey.boxes, num_cells, config)
         if not tiles:
             raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
+        _allow_open_files(len(tiles))
+        survey.save(folder)
         workers = stack.enter_context(Workers(config, folder, num_jobs, num_threads))
-        stages = _replay_logs(config, survey, tiles, workers, folder, progress)
+        stages = _replay_logs(tiles, workers, folder, progress)
         stages = _settle(tiles, stages, workers, progress)
         counts = survey.counts(next(iter(stages.values())).num_frames_off)
         with interrupts.deferred() as deliver_interrupts:
@@ -113,7 +121,7 @@ def replay_tiles(
 
 def check_separable(config: ResolvedRun) -> None:
     """Raise ConfigError where tiles of a run would depend on each other."""
-    links = [config.link, *(config.link_config(*ends) for ends in _overridden_links(config))]
+    links = [config.link, *(config.link_config(sender, receiver) for sender, receiver, _ in config.link_overrides)]
     draws = any(link.mean_loss > 0.0 or link.jitter > 0.0 or link.corruption > 0.0 for link in links)
     reasons = {
         "align on-air": config.alignment.is_on_air,
@@ -129,9 +137,17 @@ def check_separable(config: ResolvedRun) -> None:
             raise ConfigError(f"tiles: cannot be used with {name}, which needs the packets of the whole map at once")
 
 
-def _overridden_links(config: ResolvedRun) -> list[tuple[str, str]]:
-    """Ends of the links with a configuration of their own."""
-    return [(sender, receiver) for sender, receiver, _ in config.link_overrides]
+def _allow_open_files(num_tiles: int) -> None:
+    """Let this process open the files of all tiles. Raises ConfigError where the system does not allow it."""
+    wanted = num_tiles + _OTHER_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and wanted > hard:
+        raise ConfigError(
+            f"tiles: {num_tiles:,} tiles need more open files than the {hard:,} that the system allows; give a larger"
+            " edge, or raise 'ulimit -n'"
+        )
+    if soft != resource.RLIM_INFINITY and wanted > soft:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 @contextmanager
@@ -182,21 +198,12 @@ def _check_same(writer: ResultWriter, path: Path, description: Mapping[str, Mapp
     writer.check_same(earlier)
 
 
-def _replay_logs(
-    config: ResolvedRun, survey: Survey, tiles: Sequence[Tile], workers: Workers, folder: Path,
-    progress: Callable[[str, int, int], None] | None,
-) -> dict[Tile, Stage]:  # fmt: skip
+def _replay_logs(tiles: Sequence[Tile], workers: Workers, folder: Path, progress: Progress | None) -> dict[Tile, Stage]:
     """Replay the logs of all tiles that an earlier run has not finished."""
     stages = {tile: stage for tile in tiles if (stage := TileFiles(folder, tile).read_stage()) is not None}
     if stages:
         _log.info("%d of %d tiles were finished before", len(stages), len(tiles))
-    requests = []
-    for tile in (tile for tile in tiles if tile not in stages):
-        bounds = tile.bounds(config.map)
-        robots = zip(survey.robots, config.robots, strict=True)
-        elsewhere = [frames.elsewhere(bounds, len(robot.views)) for frames, robot in robots]
-        requests.append(Request(tile, "replay_logs", (elsewhere,)))
-    for tile, stage in workers.answers(requests):
+    for tile, stage in workers.answers([Request(tile, "replay_logs") for tile in tiles if tile not in stages]):
         stages[tile] = stage
         if progress is not None:
             progress("replay", len(stages), len(tiles))
@@ -204,9 +211,8 @@ def _replay_logs(
 
 
 def _settle(
-    tiles: Sequence[Tile], stages: dict[Tile, Stage], workers: Workers,
-    progress: Callable[[str, int, int], None] | None,
-) -> dict[Tile, Stage]:  # fmt: skip
+    tiles: Sequence[Tile], stages: dict[Tile, Stage], workers: Workers, progress: Progress | None
+) -> dict[Tile, Stage]:
     """Let all tiles settle, in rounds, until all have the same number of ticks.
 
     A team has settled where all its tiles have, so every tile goes on until the last one has settled.
@@ -227,7 +233,7 @@ def _settle(
 
 def _write(
     config: ResolvedRun, writer: ResultWriter, tiles: Sequence[Tile], stages: Mapping[Tile, Stage], folder: Path,
-    counts: Mapping[str, FrameCounts], num_threads: int, progress: Callable[[str, int, int], None] | None,
+    counts: Mapping[str, FrameCounts], num_threads: int, progress: Progress | None,
     deliver_interrupts: Callable[[], None],
 ) -> RunSummary:  # fmt: skip
     """Write all ticks and maps of the run, and return its summary without the wall time."""

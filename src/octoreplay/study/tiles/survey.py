@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.sensor import SensorConfig
+from octoreplay.errors import InputError
+from octoreplay.io.output_file import writing
 from octoreplay.mapping.scan_points import range_of
-from octoreplay.records import BoolArray, CloudFrame, DepthFrame, Float64Array, Frame, FrameCounts
+from octoreplay.records import BoolArray, CloudFrame, DepthFrame, Float64Array, Frame, FrameCounts, Int64Array
 from octoreplay.replay.sources import TeamSources
+
+_FRAMES = "frames.npz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +28,9 @@ class RobotFrames:
 
     Attributes
     ----------
-    stamps : list of int
+    stamps : (F,) int64 array
         Stamps on the team's clock [ns].
-    sensors : list of int
+    sensors : (F,) int64 array
         Index of the sensor of each frame.
     poses : (F, 4, 4) float64 array
         Pose of the sensor in the team's frame.
@@ -32,16 +38,16 @@ class RobotFrames:
         Least and largest x, y, z of the frame's rays in the team's frame [m].
     """
 
-    stamps: list[int]
-    sensors: list[int]
+    stamps: Int64Array
+    sensors: Int64Array
     poses: Float64Array
     boxes: Float64Array
 
     def elsewhere(self, bounds: Sequence[float], num_sensors: int) -> list[dict[int, Float64Array]]:
         """Return, for each sensor, the poses at the stamps of the frames without a ray in ``bounds`` (6,) [m]."""
         found: list[dict[int, Float64Array]] = [{} for _ in range(num_sensors)]
-        for index in np.flatnonzero(~touching(self.boxes, bounds)).tolist():
-            found[self.sensors[index]][self.stamps[index]] = self.poses[index]
+        for index in np.flatnonzero(~touching(self.boxes, bounds)):
+            found[self.sensors[index]][int(self.stamps[index])] = self.poses[index]
         return found
 
 
@@ -67,6 +73,14 @@ class Survey:
         """Boxes (F, 6) of the rays of all frames."""
         return np.concatenate([robot.boxes for robot in self.robots])
 
+    def save(self, folder: Path) -> None:
+        """Write the frames to a folder for ``load_frames``. Raises OutputError."""
+        arrays = {
+            f"{name}_{index}": value for index, robot in enumerate(self.robots) for name, value in vars(robot).items()
+        }
+        with writing(folder / _FRAMES):
+            np.savez(folder / _FRAMES, **arrays)
+
     def counts(self, num_frames_off: Sequence[Mapping[int, int]] = ()) -> dict[str, FrameCounts]:
         """Return the counts of each robot's messages by robot_id.
 
@@ -77,13 +91,25 @@ class Survey:
         return self._team.counts
 
 
+def load_frames(folder: Path) -> tuple[RobotFrames, ...]:
+    """Return the frames of each robot from the folder that ``Survey.save`` wrote them to. Raises InputError."""
+    names = [item.name for item in fields(RobotFrames)]
+    try:
+        with np.load(folder / _FRAMES) as arrays:
+            num_robots = len(arrays.files) // len(names)
+            return tuple(RobotFrames(*(arrays[f"{name}_{index}"] for name in names)) for index in range(num_robots))
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(f"{folder / _FRAMES}: cannot be read: {error}; give --restart") from error
+
+
 def _frames_of(frames: Iterator[Frame], sensor: SensorConfig, margin: float) -> RobotFrames:
     """What tiles need to know of one robot's frames; boxes are larger by ``margin`` [m] on each side."""
     rows = [(frame.stamp_ns, frame.sensor_index, frame.T_team_sensor, ray_box(frame, sensor)) for frame in frames]
     poses = np.array([pose for *_, pose, _ in rows], np.float64).reshape(-1, 4, 4)
     boxes = np.array([box for *_, box in rows], np.float64).reshape(-1, 6)
     boxes += np.repeat([-margin, margin], 3)
-    return RobotFrames([row[0] for row in rows], [row[1] for row in rows], poses, boxes)
+    stamps, sensors = np.array([row[:2] for row in rows], np.int64).reshape(-1, 2).T
+    return RobotFrames(stamps, sensors, poses, boxes)
 
 
 def ray_box(frame: Frame, sensor: SensorConfig) -> Float64Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -13,17 +13,19 @@ from typing import Any, Self
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
+from octoreplay.errors import InputError
 from octoreplay.io.output_file import write_whole
 from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.records import CENTRAL, Float64Array
+from octoreplay.records import CENTRAL
 from octoreplay.replay.checkpoint import load_state, save_state
 from octoreplay.replay.map_recorder import map_periods
 from octoreplay.replay.session import Session
 from octoreplay.replay.sources import TeamSources
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
+from octoreplay.study.tiles.survey import load_frames
 from octoreplay.study.tiles.work import StoredMap, TileTick, WorkFile
 
 MAPS, EVIDENCE = "maps", "evidence"
@@ -92,14 +94,14 @@ class TileRun:
     def __init__(self, config: ResolvedRun, tile: Tile, folder: Path) -> None:
         self._config = tile.config(config)
         self._tile = tile
+        self._folder = folder
         self._files = TileFiles(folder, tile)
 
-    def replay_logs(self, elsewhere: Sequence[Sequence[Mapping[int, Float64Array]]], num_threads: int) -> Stage:
-        """Replay the logs up to their end. ``elsewhere`` are the frames that do not touch the tile (``TeamSources``).
-
-        Raises ConfigError, InputError and OutputError.
-        """
+    def replay_logs(self, num_threads: int) -> Stage:
+        """Replay the logs up to their end. Raises ConfigError, InputError and OutputError."""
         config = self._config
+        robots = zip(load_frames(self._folder), config.robots, strict=True)
+        elsewhere = [frames.elsewhere(config.map.bounds, len(robot.views)) for frames, robot in robots]
         with ExitStack() as stack:
             team = stack.enter_context(TeamSources(config, elsewhere))
             hides = config.sensor.hide_robots
@@ -109,12 +111,16 @@ class TileRun:
             with _TileRecorder(config, self._files) as recorder:
                 for tick in session.log_ticks():
                     recorder.record(tick)
-                return self._pause(session, recorder, num_settling=0)
+                return self._pause(session, recorder, 0, session.largest_log_odds)
 
     def settle(self, largest: float, least_ticks: int, num_threads: int) -> Stage:
-        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles."""
+        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles.
+
+        Raises InputError where the tile was not saved, and as ``replay_logs``.
+        """
         stage = self._files.read_stage()
-        assert stage is not None
+        if stage is None:
+            raise InputError(f"{self._files.stage}: is missing, as after a kill while it was saved; give --resume")
         with ThreadPoolExecutor(num_threads) as threads:
             session = Session(self._config, (), threads, tile_cells=self._tile.num_cells)
             content = load_state(self._files.state, session.shared)
@@ -124,9 +130,9 @@ class TileRun:
                 for tick in session.settling_ticks(largest, least_ticks):
                     num_settling += 1
                     recorder.record(tick)
-                return self._pause(session, recorder, num_settling=num_settling)
+                return self._pause(session, recorder, num_settling, stage.largest)
 
-    def _pause(self, session: Session, recorder: _TileRecorder, *, num_settling: int) -> Stage:
+    def _pause(self, session: Session, recorder: _TileRecorder, num_settling: int, largest: float) -> Stage:
         """Save the state, from which the next stage continues, and the maps, in case that it is the last one."""
         lengths = recorder.flush()
         # The stage describes the other files only once they are complete.
@@ -137,7 +143,7 @@ class TileRun:
             file.flush()
         save_state(self._files.state, {"session": session.state(), "stored": recorder.stored}, session.shared)
         stage = Stage(
-            session.num_ticks, num_settling, lengths, session.largest_log_odds, session.stop_reason,
+            session.num_ticks, num_settling, lengths, largest, session.stop_reason,
             session.is_symmetric, session.num_frames_off,
         )  # fmt: skip
         write_whole(self._files.stage, json.dumps(asdict(stage)))

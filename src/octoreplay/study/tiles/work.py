@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -88,9 +89,10 @@ class WorkFile:
             self._file.write(head + name + stored.delta)
 
     def flush(self) -> int:
-        """Hand what was written to the operating system; return the length of the file [byte]."""
+        """Flush to disk what was written; return the length of the file [byte]."""
         with writing(self._path):
             self._file.flush()
+            os.fsync(self._file.fileno())
             return self._file.tell()
 
 

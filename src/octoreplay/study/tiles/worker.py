@@ -35,7 +35,7 @@ class Request:
 
     tile: Tile
     method: str
-    arguments: tuple[Any, ...]
+    arguments: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)
