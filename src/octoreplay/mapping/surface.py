@@ -55,9 +55,12 @@ class CellVotes:
         self._votes = _Votes(np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.int64))
         self._waiting: list[_Votes] = []
 
-    def add(self, cells: Int64Array, class_ids: UInt8Array) -> None:
-        """Count points: their cells (P,), as any integer ids, and their classes (P,)."""
-        self._waiting.append(_counted(cells, class_ids))
+    def add(self, cells: Int64Array, class_ids: UInt8Array, counts: Int64Array | None = None) -> None:
+        """Count points: their cells (P,), as any integer ids, and their classes (P,).
+
+        ``counts`` (P,) are numbers of points of one cell and class; 1 without them.
+        """
+        self._waiting.append(_counted(cells, class_ids, counts))
         if sum(len(votes.cells) for votes in self._waiting) > max(BATCH, len(self._votes.cells)):
             self._merge()
 
