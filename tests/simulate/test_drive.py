@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -101,12 +102,25 @@ def test_a_leg_leads_around_a_wall_and_keeps_the_clearance():
     assert moved.sum() < 1.2 * 23.6
 
 
-def test_waypoints_at_obstacles_and_places_without_a_way_are_refused():
+def test_a_way_far_around_a_wall_is_found():
+    # The only way is 39 m away, beyond the first search.
+    world = walled_world((5.0, -30.0, 27.0))
+    [states] = drive_paths(world, {"husky_1": [(0, -12), (10, -12)]}, 2000, PERIOD, MOTION)
+    np.testing.assert_array_equal(states[-1, :2], (10, -12))
+    assert states[:, 1].max() > 27.0
+
+
+@pytest.mark.parametrize("place", [(5, 0), (9, 0)])
+def test_waypoints_at_obstacles_and_in_enclosures_are_refused_with_the_nearest_place(place):
     world = walled_world((5.0, -30.0, 30.0))
-    with pytest.raises(ConfigError, match=r"husky_2: waypoint 2 \(5, 0\) is at an obstacle; the nearest free place is"):
-        drive_paths(world, {"husky_1": [(0, 0)], "husky_2": [(0, 0), (5, 0)]}, 10, PERIOD, MOTION)
-    with pytest.raises(ConfigError, match="husky_1: obstacles block every way from waypoint 2 to waypoint 3 within 30"):
-        drive_paths(world, {"husky_1": [(0, 0), (1, 0), (9, 0)]}, 10, PERIOD, MOTION)
+    sentence = (
+        rf"husky_2: obstacles are at or around waypoint 2 \({place[0]}, 0\); the nearest place .* is \((.*), (.*)\)"
+    )
+    with pytest.raises(ConfigError, match=sentence) as error:
+        drive_paths(world, {"husky_1": [(0, 0)], "husky_2": [(0, 0), place]}, 10, PERIOD, MOTION)
+    x, y = map(float, re.search(sentence, str(error.value)).groups())
+    assert (x, y) == (4.25, pytest.approx(0.0, abs=0.25))
+    drive_paths(world, {"husky_2": [(0, 0), (x, y)]}, 10, PERIOD, MOTION)
 
 
 def test_paths_that_do_not_fit_the_settings_are_refused():

@@ -9,8 +9,8 @@ import numpy as np
 
 from octoreplay.records import Float64Array, Int64Array, UInt8Array
 
-BATCH = 1_000_000
-"""Approximate number of points in a batch."""
+BATCH = 64_000
+"""Approximate number of points in a batch, small enough for the caches of a processor."""
 
 
 def num_cuts(corners: Float64Array, spacing: float) -> Int64Array:

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from octoreplay.errors import ConfigError
-from octoreplay.records import Float64Array
+from octoreplay.records import BoolArray, Float64Array
 from octoreplay.simulate.exploration import Motion
 from octoreplay.simulate.grid import CELL, DrivingGrid, shortest_paths, wrapped
 from octoreplay.simulate.world import World
 
 _DETOUR = 30.0
-"""How far a way around obstacles may lead beyond the box of its two waypoints [m]."""
+"""How far ways around obstacles are searched at first beyond the box of their two waypoints [m]."""
 
 Path = Sequence[tuple[float, float]]
 
@@ -24,36 +24,41 @@ def drive_paths(world: World, paths: Mapping[str, Path], num_steps: int, period:
     """Return states (N, T, 3) of x, y [m] and heading [rad] of robots that drive on ``paths`` by robot id.
 
     A robot starts at its first waypoint, drives at ``motion.speed``, turns on the spot at ``motion.turn_rate`` and
-    stops at its last waypoint. A leg is the straight line between two waypoints, or the shortest path over the cells of
+    stops at its last waypoint. A leg is the straight line between two waypoints, or a shortest path over the cells of
     the driving grid where an obstacle is nearer to the line than ``motion.clearance``. Robots do not avoid each other.
-    Raises ConfigError for a waypoint near an obstacle, and for two waypoints without a way between them.
+    Raises ConfigError for a waypoint that is near an obstacle or enclosed by obstacles.
     """
     grid = DrivingGrid(world)
+    roomy = _largest_part(grid.distance >= motion.clearance)
     times = period * np.arange(num_steps, dtype=np.float64)
-    return np.stack([_driven(_way(grid, robot_id, path, motion), times, motion) for robot_id, path in paths.items()])
+    return np.stack([_driven(_way(grid, roomy, robot_id, path), times, motion) for robot_id, path in paths.items()])
 
 
-def _way(grid: DrivingGrid, robot_id: str, path: Path, motion: Motion) -> Float64Array:
-    """Corners (K, 2) of the way along a path [m], no two of them equal in a row."""
+def _largest_part(free: BoolArray) -> BoolArray:
+    """Mask (n, n) of the largest connected part of free cells (n, n): between its cells there is always a way."""
+    from scipy.ndimage import label
+
+    parts, count = label(free)
+    sizes = np.bincount(parts[free], minlength=count + 1)
+    largest: BoolArray = free & (parts == np.argmax(sizes))
+    return largest
+
+
+def _way(grid: DrivingGrid, roomy: BoolArray, robot_id: str, path: Path) -> Float64Array:
+    """Corners (K, 2) of the way along a path over the cells of a mask [m], no two of them equal in a row."""
     points = np.array(path, dtype=np.float64)
     for number, (x, y) in enumerate(points.tolist(), 1):
-        if grid.distance[grid.cell(x, y)] < motion.clearance:
-            free = grid.center(np.argwhere(grid.distance >= motion.clearance))
-            near = free[np.argmin(np.hypot(*(free - (x, y)).T))]
+        if not roomy[grid.cell(x, y)]:
+            places = grid.center(np.argwhere(roomy))
+            near = places[np.argmin(np.hypot(*(places - (x, y)).T))]
             raise ConfigError(
-                f"paths: {robot_id}: waypoint {number} ({x:g}, {y:g}) is at an obstacle; the nearest free place is"
-                f" ({near[0]:g}, {near[1]:g})"
+                f"paths: {robot_id}: obstacles are at or around waypoint {number} ({x:g}, {y:g}); the nearest place"
+                f" with a way to it is ({near[0]:g}, {near[1]:g})"
             )
     corners = [points[:1]]
-    for number, (start, end) in enumerate(itertools.pairwise(points), 1):
-        if not _is_clear(grid, start, end, motion.clearance):
-            detour = _detour(grid, start, end, motion.clearance)
-            if detour is None:
-                raise ConfigError(
-                    f"paths: {robot_id}: obstacles block every way from waypoint {number} to waypoint {number + 1}"
-                    f" within {_DETOUR:g} m; add a waypoint on a way around them"
-                )
-            corners.append(detour)
+    for start, end in itertools.pairwise(points):
+        if not _is_clear(grid, roomy, start, end):
+            corners.append(_detour(grid, roomy, start, end))
         corners.append(end[None])
     way: Float64Array = np.concatenate(corners)
     moved = np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))
@@ -61,25 +66,26 @@ def _way(grid: DrivingGrid, robot_id: str, path: Path, motion: Motion) -> Float6
     return corners_moved
 
 
-def _is_clear(grid: DrivingGrid, start: Float64Array, end: Float64Array, clearance: float) -> bool:
-    """True if no obstacle is nearer to a straight line than the clearance."""
+def _is_clear(grid: DrivingGrid, roomy: BoolArray, start: Float64Array, end: Float64Array) -> bool:
+    """True if a straight line leads over cells of the mask only."""
     count = 2 + math.ceil(float(np.hypot(*(end - start))) / (CELL / 4))
     line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-    return all(grid.distance[grid.cell(x, y)] >= clearance for x, y in line.tolist())
+    return all(roomy[grid.cell(x, y)] for x, y in line.tolist())
 
 
-def _detour(grid: DrivingGrid, start: Float64Array, end: Float64Array, clearance: float) -> Float64Array | None:
-    """Centres (K, 2) of the cells of the shortest path between two places [m]; None if there is none."""
-    # Only the surroundings of the leg are searched, so that the time does not depend on the size of the world.
-    reach = math.ceil(_DETOUR / CELL)
+def _detour(grid: DrivingGrid, roomy: BoolArray, start: Float64Array, end: Float64Array) -> Float64Array:
+    """Centres (K, 2) of the cells of a short way between two places over the cells of the mask [m]."""
     first, last = np.array(grid.cell(*start)), np.array(grid.cell(*end))
-    low = np.maximum(np.minimum(first, last) - reach, 0)
-    high = np.maximum(first, last) + reach + 1
-    passable = grid.distance[low[0] : high[0], low[1] : high[1]] >= clearance
-    cells, way, previous = shortest_paths(passable, first - low)
-    chain = np.flatnonzero((cells == last - low).all(axis=1)).tolist()
-    if not np.isfinite(way[chain[0]]):
-        return None
+    reach = math.ceil(_DETOUR / CELL)
+    # The surroundings are searched first, so that the time hardly depends on the size of the world.
+    while True:
+        low = np.maximum(np.minimum(first, last) - reach, 0)
+        high = np.maximum(first, last) + reach + 1
+        cells, way, previous = shortest_paths(roomy[low[0] : high[0], low[1] : high[1]], first - low)
+        chain = np.flatnonzero((cells == last - low).all(axis=1)).tolist()
+        if np.isfinite(way[chain[0]]):
+            break
+        reach *= 2
     while previous[chain[-1]] >= 0:
         chain.append(int(previous[chain[-1]]))
     return grid.center(cells[chain[::-1]] + low)

@@ -63,6 +63,11 @@ class Terrain:
     phases: Float64Array
     amplitudes: Float64Array
 
+    @property
+    def highest(self) -> float:
+        """Height that the ground does not exceed [m]."""
+        return float(np.abs(self.amplitudes).sum())
+
     def height(self, xy: npt.ArrayLike) -> Float64Array:
         """Return the height (...,) [m] at points (..., 2) [m]."""
         heights: Float64Array = np.sin(np.asarray(xy) @ self.wave_vectors.T + self.phases) @ self.amplitudes
@@ -126,7 +131,10 @@ class World:
         """
         n = grid_length(self.size, cell)
         mask = np.zeros((n, n), dtype=np.bool_)
-        for solid, _ in self.surface_points(cell / 2, ~self.is_ground(self.triangle_classes)):
+        highest = self.terrain.highest + 1.5
+        for points, _ in self.surface_points(cell / 2, ~self.is_ground(self.triangle_classes)):
+            # Roofs and crowns need no height of the ground below them.
+            solid = points[points[:, 2] < highest]
             above = solid[:, 2] - self.terrain.height(solid[:, :2])
             index = np.floor((solid[(above > 0.1) & (above < 1.5), :2] + self.size / 2) / cell).astype(np.int64)
             index = index[((index >= 0) & (index < n)).all(axis=1)]
