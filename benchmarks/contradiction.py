@@ -37,7 +37,8 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster, add_scan, clamped_increments
 from octoreplay.records import Float64Array, Frame
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, PAIR_SHARES, PairMetrics
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 SENSOR = SensorConfig()
 SHIFTS = (0.3, 0.5, 1.0, 3.0)

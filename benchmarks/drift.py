@@ -16,7 +16,8 @@ from octoreplay.config.frames_file import load_frames_file
 from octoreplay.io.containers.logs import open_log
 from octoreplay.io.datasets.pose_files import read_tum_track
 from octoreplay.io.messages.sensor_messages import Transforms
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.transforms import pose_matrix, transform_of
 
 DRIFTS = ((1.0, 0.5), (1.0, 0.0), (0.0, 0.5))

@@ -18,7 +18,8 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.replay.session import Session
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 GRAPHS: dict[str, tuple[int, float, dict[str, object]]] = {
     "complete, 6": (6, 30.0, {"topology": "complete"}),

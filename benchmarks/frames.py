@@ -47,10 +47,13 @@ from octoreplay.registration.pairs import PairAlignment
 from octoreplay.registration.team import align_team
 from octoreplay.replay.alignment import align_logs
 from octoreplay.replay.run import replay_team
-from octoreplay.simulate.camera import NO_LABEL, LabelPatches, MeshCamera, add_depth_noise, add_label_noise
+from octoreplay.simulate.body_poses import T_BODY_CAMERA, body_poses
+from octoreplay.simulate.camera import LabelPatches, MeshCamera, add_depth_noise, add_label_noise
 from octoreplay.simulate.exploration import explore
 from octoreplay.simulate.odometry import drift_corrections
-from octoreplay.simulate.team import T_BODY_CAMERA, SimulationConfig, body_poses, simulate_team
+from octoreplay.simulate.scene import NO_LABEL
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import World
 from octoreplay.transforms import inverse, numbers_of, transform_of

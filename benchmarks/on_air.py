@@ -23,7 +23,8 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.run import replay_team
 from octoreplay.result import open_result
 from octoreplay.run_metrics import FramePlace, TickMetrics
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.transforms import inverse, pose_difference, transform_of
 
 COLUMNS = (

@@ -22,7 +22,8 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.registration.rigid import moved
 from octoreplay.replay.alignment import align_logs, aligned_config
 from octoreplay.replay.refinement import Refinement, RefinementConfig, refine_team
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.transforms import numbers_of, transform_of
 
 DRIFT = (1.0, 0.5)

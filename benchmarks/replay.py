@@ -32,7 +32,8 @@ from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.run import Progress, replay_team
 from octoreplay.replay.session import Session
 from octoreplay.run_metrics import RunSummary
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 NUM_THREADS = 2
 NESTED = "contradiction of evidence (part of the metrics)"

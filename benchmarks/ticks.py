@@ -27,7 +27,8 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import Frame
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 SILENCE_NS = 45_000_000_000
 NUM_SETTLING_TICKS = 3

@@ -26,7 +26,8 @@ from octoreplay.records import DepthFrame, Float64Array, Frame, Int64Array
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick
 from octoreplay.run_metrics import TickMetrics
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 NUM_ROBOTS = 6
 FAULT_RESOLUTION = 0.4

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from octoreplay.config.frames_file import load_frames_file
+    from octoreplay.config.paths_file import load_paths_file
     from octoreplay.config.robot import RobotConfig
     from octoreplay.config.run import RunConfig
     from octoreplay.config.team_file import load_team_file
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from octoreplay.report.export import export_map
     from octoreplay.result import Result, open_result
     from octoreplay.run_metrics import RunSummary, TickMetrics
-    from octoreplay.simulate.team import SimulationConfig, simulate_team
+    from octoreplay.simulate.settings import SimulationConfig
+    from octoreplay.simulate.team import simulate_team
     from octoreplay.stored_map import PointQuery, StoredMap
     from octoreplay.study.sweep import Sweep, SweepProgress, run_sweep
     from octoreplay.study.tiles.run import replay_tiles
@@ -63,7 +65,7 @@ _MODULES = {
     "RunConfig": "config.run",
     "RunSummary": "run_metrics",
     "SemanticClass": "records",
-    "SimulationConfig": "simulate.team",
+    "SimulationConfig": "simulate.settings",
     "StoredMap": "stored_map",
     "Sweep": "study.sweep",
     "SweepProgress": "study.sweep",
@@ -79,6 +81,7 @@ _MODULES = {
     "import_clouds": "io.datasets.cloud_folder",
     "import_rgbd": "io.datasets.rgbd_folder",
     "load_frames_file": "config.frames_file",
+    "load_paths_file": "config.paths_file",
     "load_team_file": "config.team_file",
     "open_log": "io.containers.logs",
     "open_result": "result",
@@ -96,8 +99,8 @@ __all__ = [
     "Progress", "Result", "ResultComparison", "RobotConfig", "RobotFrame", "RunConfig", "RunSummary", "SemanticClass",
     "SimulationConfig", "StoredMap", "Sweep", "SweepProgress", "Table", "TickMetrics", "__version__", "align_logs",
     "aligned_config", "check_result", "compare_results", "discover", "evaluate_result", "export_map", "import_clouds",
-    "import_rgbd", "load_frames_file", "load_team_file", "open_log", "open_result", "replay_team", "replay_tiles",
-    "resolve", "run_sweep", "simulate_team",
+    "import_rgbd", "load_frames_file", "load_paths_file", "load_team_file", "open_log", "open_result", "replay_team",
+    "replay_tiles", "resolve", "run_sweep", "simulate_team",
 ]  # fmt: skip
 
 

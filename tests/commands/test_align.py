@@ -13,7 +13,8 @@ import pytest
 from octoreplay.config.frames_file import load_frames_file
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.result import open_result
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.transforms import inverse, pose_difference, transform_of
 from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import PAIR_TEAM

@@ -17,7 +17,8 @@ from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.io.datasets.pose_files import read_tum_track, write_tum
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.transforms import numbers_of, transform_of
 from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import PAIR, PAIR_TEAM

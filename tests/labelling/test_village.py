@@ -10,7 +10,8 @@ import numpy as np
 import onnx
 import pytest
 
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from support.command_line import octoreplay
 from support.long_suite import long
 from support.stored_messages import pixels, read_messages

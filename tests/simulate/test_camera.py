@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from octoreplay.errors import InputError
 from octoreplay.records import CameraModel
 from octoreplay.simulate.camera import (
-    NO_LABEL,
     MeshCamera,
     add_depth_noise,
     add_label_noise,
     depth_noise_sigma,
     depth_to_millimetres,
 )
+from octoreplay.simulate.scene import NO_LABEL
 from octoreplay.simulate.world import BUILDING, CAR, Terrain, World
 
 CAMERA = CameraModel(width=9, height=7, fx=6.0, fy=5.0, cx=4.0, cy=3.0)

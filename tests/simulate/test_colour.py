@@ -11,7 +11,8 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import ConfigError
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.simulate.world import village_classes
 from support.long_suite import long
 from support.stored_messages import pixels, read_messages

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from octoreplay.simulate.exploration import CELL, Motion, _shortest_paths, explore
+from octoreplay.simulate.exploration import Motion, explore
+from octoreplay.simulate.grid import CELL, shortest_paths
 from octoreplay.simulate.village import make_village
 from support.long_suite import long
 
@@ -149,7 +150,7 @@ def test_shortest_paths_equal_the_reference(seed, rows, columns, density):
     passable = rng.random((rows, columns)) < density
     start = (int(rng.integers(rows)), int(rng.integers(columns)))
     passable[start] = True
-    cells, distance, previous = _shortest_paths(passable, np.array(start))
+    cells, distance, previous = shortest_paths(passable, np.array(start))
     expected = reference_dijkstra(passable, start)
     for k, cell in enumerate(map(tuple, cells.tolist())):
         assert distance[k] == pytest.approx(expected.get(cell, np.inf))
@@ -157,3 +158,19 @@ def test_shortest_paths_equal_the_reference(seed, rows, columns, density):
             before = cells[previous[k]]
             assert np.abs(before - cells[k]).max() == 1
             assert distance[k] == pytest.approx(distance[previous[k]] + np.hypot(*(before - cells[k])))
+
+
+@pytest.mark.parametrize(("size", "seed"), [(40.0, 0), pytest.param(90.0, 3, marks=long)])
+def test_planning_in_the_seen_window_equals_planning_on_the_whole_map(monkeypatch, size, seed):
+    world = make_village(size, seed)
+    found = explore(world, 2, 200, PERIOD)
+    num_seen = []
+
+    def whole(team):
+        num_seen.append((team.last_seen >= 0).mean())
+        return slice(0, team.grid.n), slice(0, team.grid.n)
+
+    monkeypatch.setattr("octoreplay.simulate.exploration._Team._seen_window", whole)
+    np.testing.assert_array_equal(explore(world, 2, 200, PERIOD).states, found.states)
+    # Most of the map is outside of the window at first.
+    assert num_seen[0] < 0.2

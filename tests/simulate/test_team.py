@@ -19,8 +19,11 @@ from octoreplay.errors import ConfigError, OutputError
 from octoreplay.geodesy import enu_points
 from octoreplay.io.datasets.pose_files import read_tum_track
 from octoreplay.simulate import team
+from octoreplay.simulate.body_poses import midway, pose_errors
 from octoreplay.simulate.odometry import FIX_ORIGIN, drift_corrections
-from octoreplay.simulate.team import START_NS, SimulationConfig, midway, pose_errors, simulate_team
+from octoreplay.simulate.recorder import START_NS
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import village_classes
 from octoreplay.transforms import transform_of

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 import pytest
 from plyfile import PlyData
@@ -138,6 +140,36 @@ def test_the_ground_truth_contains_the_surface(village):
     # A cell at the foot of a wall contains grass and wall but has one class, so not all points agree with their cell.
     agree = np.array([value == own for value, own in zip(found, classes[visible], strict=True)])
     assert agree.mean() > 0.9
+
+
+@pytest.mark.parametrize("width", [0.8, 7.0, 1000.0])
+def test_the_ground_truth_does_not_depend_on_the_width_of_its_slabs(monkeypatch, width):
+    village = make_village(20.0, 3)
+    keys, class_ids = labelled_cells(village, 0.8)
+    votes: dict[tuple[int, ...], list[int]] = defaultdict(lambda: [0] * 9)
+    for points, classes in village.surface_points(0.8 / 3):
+        solid = (classes > DIRT_ROAD) & (points[:, 2] < village.terrain.height(points[:, :2]) - 0.05)
+        for key, class_id in zip(np.floor(points / 0.8).astype(int)[~solid].tolist(), classes[~solid], strict=True):
+            votes[tuple(key)][class_id] += 1
+    assert [tuple(key) for key in keys.tolist()] == sorted(votes)
+    assert class_ids.tolist() == [int(np.argmax(votes[key])) for key in sorted(votes)]
+    monkeypatch.setattr("octoreplay.simulate.world_files._SLAB", width)
+    again = labelled_cells(village, 0.8)
+    np.testing.assert_array_equal(again[0], keys)
+    np.testing.assert_array_equal(again[1], class_ids)
+
+
+def test_objects_are_as_far_apart_as_the_gaps_between_all_their_circles(monkeypatch):
+    found = make_village(40.0, 1)
+
+    def every_circle(circles, x, y, reach, *, skip_last=False):
+        others = [c for square in circles._squares.values() for c in square if not (skip_last and c is circles._last)]
+        return np.array(others)
+
+    monkeypatch.setattr("octoreplay.simulate.village._Circles.near", every_circle)
+    expected = make_village(40.0, 1)
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+    np.testing.assert_array_equal(found.triangle_classes, expected.triangle_classes)
 
 
 def test_obstacles_are_walls_and_not_the_ground_or_roofs():

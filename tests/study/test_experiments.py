@@ -9,7 +9,7 @@ import pytest
 
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study import experiments
 from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam, run_experiment
 from octoreplay.study.grid import check_variations, combinations, parse_variation

@@ -13,7 +13,7 @@ from PIL import Image
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.report import map_view
 from octoreplay.result import Result, open_result
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study import paper
 from support.command_line import octoreplay, started, wait_for
 

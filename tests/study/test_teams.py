@@ -12,7 +12,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError, OutputError
 from octoreplay.replay.run import Progress
 from octoreplay.result import open_result
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study import teams
 from octoreplay.study.teams import is_replayed, is_simulated, replayed_team, simulated_team
 

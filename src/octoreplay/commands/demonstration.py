@@ -52,7 +52,7 @@ def demo(folder: Path, robots: int, duration: float, seed: int) -> int:
     from octoreplay.report.page.page import write_page
     from octoreplay.report.tables import made_files
     from octoreplay.result import open_result
-    from octoreplay.simulate.team import SimulationConfig
+    from octoreplay.simulate.settings import SimulationConfig
     from octoreplay.study.teams import holds_team
 
     if not holds_team(folder / "logs"):

@@ -14,7 +14,7 @@ from octoreplay.commands.suggestions import SuggestingGroup
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
-    from octoreplay.simulate.team import SimulationConfig
+    from octoreplay.simulate.settings import SimulationConfig
 
 
 @click.group(cls=SuggestingGroup, short_help="Repeat the experiments of the documentation.")

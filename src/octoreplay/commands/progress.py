@@ -54,11 +54,13 @@ def replay_bar() -> Iterator[Callable[[Progress], None]]:
 def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
     """Simulate with a progress bar and report the files written; return the team file."""
     from octoreplay.report.tables import size
-    from octoreplay.simulate.team import SimulationConfig, simulate_team
+    from octoreplay.simulate.settings import SimulationConfig
+    from octoreplay.simulate.team import simulate_team
 
     with progress_bar("simulate") as update:
-        summary = simulate_team(folder, SimulationConfig(**options), lambda share: update(share, None, ""))
-    images = f"{summary.num_frames:,} images, {size(summary.num_bytes)}"
+        config = SimulationConfig(**options)
+        summary = simulate_team(folder, config, lambda share: update(share, None, ""))
+    images = f"{summary.num_frames:,} {'scans' if config.is_lidar else 'images'}, {size(summary.num_bytes)}"
     terminal().line(f"simulated {len(summary.logs)} robots: {images} in {folder}")
     return summary.team_file
 

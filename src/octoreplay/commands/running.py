@@ -224,18 +224,27 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
 
 @click.command(short_help="Write the logs of a simulated team.")
 @click.argument("folder", type=existing_path, metavar="DIR")
-@click.option("--robots", type=int, default=6, show_default=True, help="number of robots in the team")
+@click.option("--robots", type=int, default=None,
+              help="number of robots in the team  [default: 6, or one for each path]")  # fmt: skip
 @click.option("--duration", type=float, default=60.0, show_default=True, help="length of the logs [s]")
-@click.option("--rate", type=float, default=4.0, show_default=True, help="images per second and robot [Hz]")
+@click.option("--rate", type=float, default=4.0, show_default=True, help="images or scans per second and robot [Hz]")
+@click.option("--sensor", type=Choice(("camera", "lidar")), default="camera", show_default=True,
+              help="depth and label images of a camera, or labelled point clouds of a LiDAR")  # fmt: skip
 @click.option("--image", default="160x120", show_default=True, metavar="WxH", help="image size [pixels]")
+@click.option("--scan", default="64x1024", show_default=True, metavar="RINGSxCOLUMNS", help="size of a LiDAR's scans")
+@click.option("--scan-view", default="-22.5,22.5", show_default=True, metavar="LOW,HIGH",
+              help="elevation of a LiDAR's lowest and highest ring [degrees]")  # fmt: skip
+@click.option("--scan-range", type=float, default=100.0, show_default=True, help="range of a LiDAR [m]")
 @click.option("--seed", type=int, default=0, show_default=True, help="seed of the village and of all noise")
 @click.option("--resolution", type=float, default=0.3, show_default=True,
               help="cell size of the ground truth, and resolution in the team file [m]")  # fmt: skip
-@click.option("--label-noise", type=float, default=0.1, show_default=True, help="share of pixels with a wrong label")
+@click.option(
+    "--label-noise", type=float, default=0.1, show_default=True, help="share of pixels or points with a wrong label"
+)
 @click.option("--patchy-noise", type=float, default=0.0, show_default=True,
               help="share of the places, cubes of 2 m, that a robot always labels wrongly")  # fmt: skip
 @click.option("--depth-noise", type=float, default=1.0, show_default=True, metavar="FACTOR",
-              help="factor on the noise of a depth camera, whose standard deviation grows with depth")  # fmt: skip
+              help="factor on the noise of a depth camera, which grows with depth, or of a LiDAR's ranges")  # fmt: skip
 @click.option("--pose-noise", type=float, default=0.0, show_default=True,
               help="standard deviation of the recorded poses' error, correlated over ten seconds [m]")  # fmt: skip
 @click.option("--odometry-drift", default="0,0", show_default=True, metavar="PERCENT,DEGREES",
@@ -250,35 +259,43 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
               help="write colour images with light, shadow and noise in this form")  # fmt: skip
 @click.option("--colour-offset", default="0,0,0", show_default=True, metavar="X,Y,Z",
               help="position of the colour camera in the depth camera's frame; 0,0,0: aligned [m]")  # fmt: skip
-@click.option("--no-labels", is_flag=True, help="write no label images and no class names")
+@click.option("--no-labels", is_flag=True, help="write no labels and no class names")
 @click.option("--world-size", type=float, default=70.0, show_default=True, help="edge length of the square village [m]")
+@click.option("--speed", type=float, default=1.0, show_default=True, help="speed of the robots [m/s]")
+@click.option("--paths", type=existing_path, default=None, metavar="FILE",
+              help="YAML file with the waypoints of each robot; without it the robots explore")  # fmt: skip
 @prints
-def simulate(
-    folder: Path, robots: int, image: str, odometry_drift: str, colour_offset: str, no_labels: bool, **options: Any
-) -> int:
-    """Simulate a team that explores a village and write its logs into DIR.
+def simulate(folder: Path, robots: int | None, paths: Path | None, no_labels: bool, **options: Any) -> int:
+    """Simulate a team that drives through a village and write its logs into DIR.
 
     Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply; with own frames or drift
     also frames.yaml and truth/ROBOT.tum). Equal options give equal bytes.
     """
-    values = {
-        "num_robots": robots, "image": _image_size(image), "odometry_drift": _drift(odometry_drift),
-        "colour_offset": numbers("colour_offset", colour_offset, 3), "has_labels": not no_labels,
+    from octoreplay.config.paths_file import load_paths_file
+
+    given = () if paths is None else load_paths_file(paths)
+    options |= {
+        "num_robots": (len(given) or 6) if robots is None else robots, "paths": given, "has_labels": not no_labels,
+        "image": _size("image", options["image"], "WIDTHxHEIGHT such as 160x120"),
+        "scan": _size("scan", options["scan"], "RINGSxCOLUMNS such as 64x1024"),
+        "scan_view": numbers("scan_view", options["scan_view"], 2),
+        "odometry_drift": _drift(options["odometry_drift"]),
+        "colour_offset": numbers("colour_offset", options["colour_offset"], 3),
     }  # fmt: skip
     lock_folder(folder)
-    team_file = simulate_with_bar(folder, {**values, **options})
+    team_file = simulate_with_bar(folder, options)
     command, suffix = ("align", "aligned.yaml") if options["own_frames"] else ("run", "result.mcap")
     terminal().line(f"next: octoreplay {command} {team_file} -o {folder / suffix}")
     terminal().give(team_file=team_file)
     return 0
 
 
-def _image_size(text: str) -> tuple[int, int]:
-    """Width and height of a text WxH."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise ConfigError(f"image: expects WIDTHxHEIGHT such as 160x120, got '{text}'")
-    return int(width), int(height)
+def _size(name: str, text: str, form: str) -> tuple[int, int]:
+    """The two whole numbers of a text NxN."""
+    first, _, second = text.lower().partition("x")
+    if not (first.isdecimal() and second.isdecimal()):
+        raise ConfigError(f"{name}: expects {form}, got '{text}'")
+    return int(first), int(second)
 
 
 def _drift(text: str) -> tuple[float, float]:

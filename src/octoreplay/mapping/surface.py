@@ -9,8 +9,8 @@ import numpy as np
 
 from octoreplay.records import Float64Array, Int64Array, UInt8Array
 
-BATCH = 1_000_000
-"""Approximate number of points in a batch."""
+BATCH = 64_000
+"""Approximate number of points in a batch, small enough for the caches of a processor."""
 
 
 def num_cuts(corners: Float64Array, spacing: float) -> Int64Array:
@@ -55,9 +55,12 @@ class CellVotes:
         self._votes = _Votes(np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.int64))
         self._waiting: list[_Votes] = []
 
-    def add(self, cells: Int64Array, class_ids: UInt8Array) -> None:
-        """Count points: their cells (P,), as any integer ids, and their classes (P,)."""
-        self._waiting.append(_counted(cells, class_ids))
+    def add(self, cells: Int64Array, class_ids: UInt8Array, counts: Int64Array | None = None) -> None:
+        """Count points: their cells (P,), as any integer ids, and their classes (P,).
+
+        ``counts`` (P,) are numbers of points of one cell and class; 1 without them.
+        """
+        self._waiting.append(_counted(cells, class_ids, counts))
         if sum(len(votes.cells) for votes in self._waiting) > max(BATCH, len(self._votes.cells)):
             self._merge()
 

@@ -12,6 +12,7 @@ _POSE_CORRELATION_TIME = 10.0
 _BASE_HEIGHT = 0.13
 _CAMERA_POSITION = (0.35, 0.0, 0.75)
 _CAMERA_PITCH = 0.08
+_LIDAR_HEIGHT = 0.85
 
 
 def body_poses(terrain: Terrain, states: Float64Array) -> Float64Array:
@@ -70,3 +71,7 @@ def _camera_mount() -> Float64Array:
 
 T_BODY_CAMERA = _camera_mount()
 """Transform (4, 4) from the camera's optical frame to the body of a simulated robot."""
+
+T_BODY_LIDAR = np.eye(4)
+"""Transform (4, 4) from the LiDAR's frame to the body: above its centre, with parallel axes."""
+T_BODY_LIDAR[2, 3] = _LIDAR_HEIGHT

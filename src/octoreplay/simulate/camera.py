@@ -1,22 +1,13 @@
-"""Depth and label images of a mesh by ray casting, and the noise of a depth camera.
-
-Only this module imports Open3D, and only when a camera is made.
-"""
+"""Depth and label images of a mesh by ray casting, and the noise of a depth camera."""
 
 from __future__ import annotations
-
-from types import ModuleType
 
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.errors import InputError
 from octoreplay.records import BoolArray, CameraModel, Float32Array, Float64Array, UInt8Array
+from octoreplay.simulate.scene import NO_LABEL, MeshScene
 from octoreplay.simulate.world import World
-
-NO_LABEL = 255
-"""Raw label of a pixel without a measurement."""
-
 
 _FAR = 1000.0
 _PATCH_EDGE = 2.0
@@ -30,12 +21,7 @@ class MeshCamera:
     """
 
     def __init__(self, world: World, camera: CameraModel) -> None:
-        open3d = _import_open3d()
-        self._tensor = open3d.core.Tensor
-        self._scene = open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._tensor(world.vertices), self._tensor(world.triangles.astype(np.uint32)))
-        # The additional last entry is for rays that hit nothing; their primitive id is 2^32 - 1.
-        self._labels = np.append(world.triangle_classes, np.uint8(NO_LABEL))
+        self._scene = MeshScene(world)
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
 
@@ -63,22 +49,12 @@ class MeshCamera:
 
     def is_occluded(self, points: Float64Array, direction: Float64Array) -> BoolArray:
         """Return True (H, W) where a surface lies in a direction (3,) from points (H, W, 3)."""
-        rays = np.empty((*points.shape[:2], 6), dtype=np.float32)
-        rays[..., :3] = points
-        rays[..., 3:] = direction
-        hidden: BoolArray = self._scene.test_occlusions(self._tensor(rays)).numpy()
-        return hidden
+        return self._scene.is_occluded(points, direction)
 
     def _cast(self, T_world_camera: Float64Array) -> tuple[Float32Array, UInt8Array, Float32Array]:
         """Depth (H, W) along z, infinite where nothing is hit, labels (H, W) and unit normals (H, W, 3)."""
         # The z component of each ray is 1, so that the returned distance is the depth along z.
-        directions = self._rays @ T_world_camera[:3, :3].T
-        rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
-        rays[..., :3] = T_world_camera[:3, 3]
-        rays[..., 3:] = directions
-        hits = self._scene.cast_rays(self._tensor(rays))
-        ids = np.minimum(hits["primitive_ids"].numpy(), np.uint32(len(self._labels) - 1))
-        return hits["t_hit"].numpy(), self._labels[ids], hits["primitive_normals"].numpy()
+        return self._scene.cast(T_world_camera[:3, 3], self._rays @ T_world_camera[:3, :3].T)
 
     def points(self, depth: Float32Array, T_world_camera: Float64Array) -> Float64Array:
         """Return the world coordinates (H, W, 3) [m] of a depth image's pixels."""
@@ -138,16 +114,3 @@ def add_label_noise(labels: UInt8Array, share: float, num_classes: int, rng: np.
     shift = rng.integers(1, num_classes, int(wrong.sum()), dtype=np.int64)
     noisy[wrong] = (labels[wrong].astype(np.int64) - 1 + shift) % num_classes + 1
     return noisy
-
-
-def _import_open3d() -> ModuleType:
-    """Import Open3D. Raises InputError if it cannot be loaded."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"simulation needs Open3D, which cannot be loaded ({error}); on a headless Debian or Ubuntu machine install"
-            " its shared libraries with: apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6"
-        ) from error
-    module: ModuleType = open3d
-    return module

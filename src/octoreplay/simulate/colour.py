@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.records import ClassTable, Float32Array, Float64Array, UInt8Array
-from octoreplay.simulate.camera import NO_LABEL, MeshCamera
+from octoreplay.simulate.camera import MeshCamera
+from octoreplay.simulate.scene import NO_LABEL
 
 COLOUR_FORMATS = ("raw", "jpeg", "png")
 """Forms in which colour images are recorded: sensor_msgs/Image (rgb8), or CompressedImage."""

@@ -16,10 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.records import BoolArray, Float64Array, Int64Array
-from octoreplay.simulate.world import World, grid_length
-
-CELL = 0.5
-"""Edge length of the exploration map's cells [m]."""
+from octoreplay.simulate.grid import CELL, DrivingGrid, obstacle_distance, shortest_paths, wrapped
+from octoreplay.simulate.world import World
 
 
 @dataclass(frozen=True)
@@ -81,40 +79,32 @@ class _Team:
     """States of the robots and the map that they share."""
 
     def __init__(self, world: World, num_robots: int, num_steps: int, period: float, motion: Motion) -> None:
-        from scipy.ndimage import distance_transform_edt
-
-        self.size = world.size
-        self.n = grid_length(world.size, CELL)
+        self.grid = DrivingGrid(world)
         self.period = period
         self.motion = motion
-        self.obstacles = world.obstacle_mask(CELL)
-        # Distance between the centres of a cell and the nearest obstacle cell. The map's edge is an obstacle.
-        padded = np.pad(~self.obstacles, 1, constant_values=False)
-        self.true_distance: Float64Array = distance_transform_edt(padded)[1:-1, 1:-1] * CELL
-        self.first_seen = np.full((num_robots, self.n, self.n), -1, dtype=np.int32)
-        self.last_seen = np.full((self.n, self.n), -1, dtype=np.int32)
+        self.first_seen = np.full((num_robots, self.grid.n, self.grid.n), -1, dtype=np.int32)
+        self.last_seen = np.full((self.grid.n, self.grid.n), -1, dtype=np.int32)
         self.states = np.zeros((num_robots, num_steps, 3))
         self.states[:, 0] = self._start(num_robots)
         self.paths: list[Float64Array | None] = [None] * num_robots
         self.goals: list[Int64Array | None] = [None] * num_robots
-        self.passable = np.zeros((num_robots, self.n, self.n), dtype=np.bool_)
+        self.passable = np.zeros((num_robots, self.grid.n, self.grid.n), dtype=np.bool_)
         self.planned_at = [-(10**9)] * num_robots
         self._rays = self._sector()
 
     def _start(self, num_robots: int) -> Float64Array:
         """States (N, 3) on a ring around the origin, heading along x, each moved to the nearest free cell."""
         ring = max(1.2, num_robots * 2.6 / (2 * math.pi)) if num_robots > 1 else 0.0
-        free = np.argwhere(self.true_distance >= self.motion.clearance)
-        centers = self._center(free)
+        free = np.argwhere(self.grid.distance >= self.motion.clearance)
+        centers = self.grid.center(free)
         states = np.zeros((num_robots, 3))
+        crowded = np.zeros(len(centers), dtype=np.bool_)
         for robot in range(num_robots):
             angle = 2 * math.pi * robot / num_robots
             wanted = ring * np.array([math.cos(angle), math.sin(angle)])
-            crowded = np.zeros(len(centers), dtype=np.bool_)
-            for other in states[:robot, :2]:
-                crowded |= np.hypot(*(centers - other).T) < 1.2
             distance = np.hypot(*(centers - wanted).T) + 1e6 * crowded
             states[robot, :2] = centers[int(np.argmin(distance))]
+            crowded |= np.hypot(*(centers - states[robot, :2]).T) < 1.2
         return states
 
     def _sector(self) -> tuple[Float64Array, Float64Array]:
@@ -131,19 +121,19 @@ class _Team:
             bearing = heading + angles
             direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
             points = np.array([x, y]) + direction[:, None] * distances[None, :, None]
-            cells = np.floor((points + self.size / 2) / CELL).astype(np.int64)
-            outside = ((cells < 0) | (cells >= self.n)).any(axis=2)
-            cells = np.clip(cells, 0, self.n - 1)
-            blocked = self.obstacles[cells[..., 0], cells[..., 1]] | outside
+            cells = np.floor((points + self.grid.size / 2) / CELL).astype(np.int64)
+            outside = ((cells < 0) | (cells >= self.grid.n)).any(axis=2)
+            cells = np.clip(cells, 0, self.grid.n - 1)
+            blocked = self.grid.obstacles[cells[..., 0], cells[..., 1]] | outside
             # The first obstacle on a ray is seen, cells behind it are not.
             behind = np.cumsum(blocked, axis=1) - blocked > 0
             self._mark(robot, step, cells[~behind & ~outside])
             # A robot also detects obstacles next to it.
             reach = math.ceil(1.5 / CELL)
-            i, j = self._cell(x, y)
+            i, j = self.grid.cell(x, y)
             near = np.stack(np.meshgrid(np.arange(i - reach, i + reach + 1), np.arange(j - reach, j + reach + 1)), -1)
             near = near.reshape(-1, 2)
-            self._mark(robot, step, near[((near >= 0) & (near < self.n)).all(axis=1)])
+            self._mark(robot, step, near[((near >= 0) & (near < self.grid.n)).all(axis=1)])
 
     def _mark(self, robot: int, step: int, cells: Int64Array) -> None:
         """Mark cells (P, 2) as seen by a robot at a step."""
@@ -174,25 +164,27 @@ class _Team:
 
     def _plan(self, robot: int, step: int) -> None:
         """Choose the best goal and the shortest path to it over known free cells."""
-        from scipy.ndimage import distance_transform_edt
-
         self.planned_at[robot] = step
         self.paths[robot], self.goals[robot] = None, None
-        known = self.last_seen >= 0
-        open_cells = np.pad(~(known & self.obstacles), 1, constant_values=False)
-        passable = known & (distance_transform_edt(open_cells)[1:-1, 1:-1] * CELL >= self.motion.clearance)
+        window = self._seen_window()
+        known = self.last_seen[window] >= 0
+        clear = obstacle_distance(known & self.grid.obstacles[window]) >= self.motion.clearance
+        passable = np.zeros_like(self.grid.obstacles)
+        passable[window] = known & clear
         for other in range(len(self.states)):
             if other != robot:
                 self._block(passable, self.states[other, step, :2], 1.2)
         start = self._nearest(passable, self.states[robot, step, :2])
         if start is None:
             return
-        cells, way, previous = _shortest_paths(passable, start)
+        corner = np.array([window[0].start, window[1].start])
+        cells, way, previous = shortest_paths(passable[window], start - corner)
+        cells += corner
         cost = 0.6 * CELL * way + self._turning(robot, step, cells) + self._crowding(robot, step, cells)
         cost[way * CELL < 1.5] = np.inf
         best = None
-        for novelty in (self._frontier_area(), self._age(step)):
-            utility = novelty[cells[:, 0], cells[:, 1]] - cost
+        for novelty in (self._frontier_area(window), self._age(window, step)):
+            utility = novelty[*(cells - corner).T] - cost
             best = int(np.argmax(utility))
             if np.isfinite(utility[best]):
                 break
@@ -202,35 +194,48 @@ class _Team:
         chain = [best]
         while previous[chain[-1]] >= 0:
             chain.append(int(previous[chain[-1]]))
-        self.paths[robot] = self._center(cells[chain[::-1]])
+        self.paths[robot] = self.grid.center(cells[chain[::-1]])
         self.passable[robot] = passable
 
-    def _frontier_area(self) -> Float64Array:
-        """Unseen area (n, n) around each cell near a frontier [m^2]; -inf elsewhere."""
+    def _seen_window(self) -> tuple[slice, slice]:
+        """Rectangle of the map that holds all seen cells; planning looks at nothing else.
+
+        The margin is as wide as the filters reach, so that their values at seen cells are those of the whole map.
+        """
+        seen = self.last_seen >= 0
+        margin = self._width() + math.ceil(self.motion.clearance / CELL)
+        rows, columns = (
+            slice(max(0, int(places[0]) - margin), min(self.grid.n, int(places[-1]) + 1 + margin))
+            for places in (np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0)))
+        )
+        return rows, columns
+
+    def _frontier_area(self, window: tuple[slice, slice]) -> Float64Array:
+        """Unseen area in a window around each cell near a frontier [m^2]; -inf elsewhere."""
         from scipy.ndimage import uniform_filter
 
-        unseen = self.last_seen < 0
-        width = self._window()
+        unseen = self.last_seen[window] < 0
+        width = self._width()
         area: Float64Array = uniform_filter(unseen.astype(np.float64), width, mode="constant") * (width * CELL) ** 2
-        return np.where(self._frontier(unseen), area, -np.inf)
+        return np.where(self._frontier(unseen, ~self.grid.obstacles[window]), area, -np.inf)
 
-    def _age(self, step: int) -> Float64Array:
-        """Mean time (n, n) since the cells around each cell were last seen, clipped at 120 s [s]."""
+    def _age(self, window: tuple[slice, slice], step: int) -> Float64Array:
+        """Mean time in a window since the cells around each cell were last seen, clipped at 120 s [s]."""
         from scipy.ndimage import uniform_filter
 
-        age: Float64Array = np.minimum((step - self.last_seen) * self.period, 120.0)
-        mean: Float64Array = uniform_filter(age, self._window(), mode="constant")
+        age: Float64Array = np.minimum((step - self.last_seen[window]) * self.period, 120.0)
+        mean: Float64Array = uniform_filter(age, self._width(), mode="constant")
         return mean
 
-    def _window(self) -> int:
+    def _width(self) -> int:
         """Edge length in cells of the square that a robot sees well from its centre."""
         return 2 * math.ceil(0.5 * self.motion.view_range / CELL) + 1
 
-    def _frontier(self, unseen: BoolArray) -> BoolArray:
-        """Mask of free cells within the planner's clearance of a frontier of at least five cells."""
+    def _frontier(self, unseen: BoolArray, is_open: BoolArray) -> BoolArray:
+        """Mask of free cells, seen and open, within the planner's clearance of a frontier of at least five cells."""
         from scipy.ndimage import binary_dilation, label
 
-        free = ~unseen & ~self.obstacles
+        free = ~unseen & is_open
         edge = free & binary_dilation(unseen, iterations=1)
         groups, count = label(edge, structure=np.ones((3, 3)))
         sizes = np.bincount(groups.ravel(), minlength=count + 1)
@@ -242,19 +247,19 @@ class _Team:
     def _turning(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
         """Cost of turning towards each cell, which prevents alternating between goals on both sides."""
         x, y, heading = self.states[robot, step]
-        offset = self._center(cells) - (x, y)
-        error = np.abs(_wrap(np.arctan2(offset[:, 1], offset[:, 0]) - heading))
+        offset = self.grid.center(cells) - (x, y)
+        error = np.abs(wrapped(np.arctan2(offset[:, 1], offset[:, 0]) - heading))
         cost: Float64Array = 6.0 * error
         return cost
 
     def _crowding(self, robot: int, step: int, cells: Int64Array) -> Float64Array:
         """Cost of each cell that is near another robot or its goal."""
         cost = np.zeros(len(cells))
-        centers = self._center(cells)
+        centers = self.grid.center(cells)
         for other, goal in enumerate(self.goals):
             if other == robot:
                 continue
-            places = [self.states[other, step, :2]] + ([] if goal is None else [self._center(goal)])
+            places = [self.states[other, step, :2]] + ([] if goal is None else [self.grid.center(goal)])
             for place in places:
                 cost += 20.0 * np.clip(1.0 - np.hypot(*(centers - place).T) / 10.0, 0.0, None)
         return cost
@@ -266,7 +271,7 @@ class _Team:
         if path is None:
             return np.array([x, y, heading])
         target = self._look_ahead(robot, path, np.array([x, y]))
-        error = float(_wrap(math.atan2(target[1] - y, target[0] - x) - heading))
+        error = float(wrapped(math.atan2(target[1] - y, target[0] - x) - heading))
         turn = max(-self.motion.turn_rate * self.period, min(self.motion.turn_rate * self.period, error))
         heading += turn
         # Full speed if the target is straight ahead, turning on the spot if it is behind.
@@ -290,7 +295,7 @@ class _Team:
             side = 0.06 * np.array([-along[1], along[0]]) / max(1e-9, float(np.hypot(*along)))
             line = here + np.linspace(0.0, 1.0, 40)[:, None] * along
             strip = np.concatenate([line - side, line + side])
-            i, j = np.clip(np.floor((strip + self.size / 2) / CELL).astype(np.int64), 0, self.n - 1).T
+            i, j = np.clip(np.floor((strip + self.grid.size / 2) / CELL).astype(np.int64), 0, self.grid.n - 1).T
             if not self.passable[robot, i, j].all():
                 break
             target = ahead
@@ -298,7 +303,7 @@ class _Team:
 
     def _may_stand(self, robot: int, step: int, place: Float64Array) -> bool:
         """True if a position is clear of obstacles, and of other robots unless it increases the distance to them."""
-        if self.true_distance[self._cell(*place)] < self.motion.clearance:
+        if self.grid.distance[self.grid.cell(*place)] < self.motion.clearance:
             return False
         here = self.states[robot, step, :2]
         for other in range(len(self.states)):
@@ -313,9 +318,9 @@ class _Team:
     def _block(self, passable: BoolArray, place: Float64Array, radius: float) -> None:
         """Clear a disc in a mask."""
         reach = math.ceil(radius / CELL)
-        i, j = self._cell(*place)
-        rows, columns = np.ogrid[max(0, i - reach) : min(self.n, i + reach + 1),
-                                 max(0, j - reach) : min(self.n, j + reach + 1)]  # fmt: skip
+        i, j = self.grid.cell(*place)
+        rows, columns = np.ogrid[max(0, i - reach) : min(self.grid.n, i + reach + 1),
+                                 max(0, j - reach) : min(self.grid.n, j + reach + 1)]  # fmt: skip
         passable[rows, columns] &= np.hypot(rows - i, columns - j) * CELL > radius
 
     def _nearest(self, passable: BoolArray, place: Float64Array) -> Int64Array | None:
@@ -323,53 +328,6 @@ class _Team:
         cells = np.argwhere(passable)
         if len(cells) == 0:
             return None
-        distance = np.hypot(*(self._center(cells) - place).T)
+        distance = np.hypot(*(self.grid.center(cells) - place).T)
         best = int(np.argmin(distance))
         return cells[best] if distance[best] < 3.0 else None
-
-    def _cell(self, x: float, y: float) -> tuple[int, int]:
-        """Cell that contains a point; points on the map's edge belong to the last cell."""
-        i, j = (min(self.n - 1, max(0, math.floor((value + self.size / 2) / CELL))) for value in (x, y))
-        return i, j
-
-    def _center(self, cells: Int64Array) -> Float64Array:
-        """Centres (..., 2) of cells (..., 2) [m]."""
-        centers: Float64Array = (np.asarray(cells, dtype=np.float64) + 0.5) * CELL - self.size / 2
-        return centers
-
-
-def _shortest_paths(passable: BoolArray, start: Int64Array) -> tuple[Int64Array, Float64Array, Int64Array]:
-    """Shortest paths over passable cells with eight neighbours (Dijkstra); diagonal steps need both adjacent cells.
-
-    Returns the cells (P, 2), their distances from the start in cells, infinite if unreachable, and the index of each
-    cell's predecessor, negative at the start.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import dijkstra
-
-    cells = np.argwhere(passable)
-    index = np.full(passable.shape, -1, dtype=np.int64)
-    index[cells[:, 0], cells[:, 1]] = np.arange(len(cells))
-    rows, columns, lengths = [], [], []
-    padded = np.pad(index, 1, constant_values=-1)
-    n, m = passable.shape
-    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        neighbour = padded[1 + di : 1 + di + n, 1 + dj : 1 + dj + m]
-        beside = padded[1 : 1 + n, 1 + dj : 1 + dj + m], padded[1 + di : 1 + di + n, 1 : 1 + m]
-        linked = (index >= 0) & (neighbour >= 0) & (beside[0] >= 0) & (beside[1] >= 0)
-        rows.append(index[linked])
-        columns.append(neighbour[linked])
-        lengths.append(np.full(int(linked.sum()), math.hypot(di, dj)))
-    graph = csr_array(
-        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), shape=(len(cells), len(cells))
-    )
-    distance, previous = dijkstra(
-        graph, directed=False, indices=int(index[start[0], start[1]]), return_predecessors=True
-    )
-    return cells, distance, previous
-
-
-def _wrap(angle: npt.ArrayLike) -> Float64Array:
-    """Angles wrapped to [-pi, pi)."""
-    wrapped: Float64Array = (np.asarray(angle, dtype=np.float64) + math.pi) % (2 * math.pi) - math.pi
-    return wrapped

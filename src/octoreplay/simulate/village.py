@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ _GROUND_MARGIN = 8.0
 _SQUARE_RADIUS = 8.0
 _ROAD_BEND = 2.5
 _HOUSE_OFFSET = 6.0
+_SQUARE = 10.0
 
 
 def make_village(size: float, seed: int, *, identical_houses: bool = False) -> World:
@@ -49,7 +51,7 @@ def make_village(size: float, seed: int, *, identical_houses: bool = False) -> W
 
 
 class _Builder:
-    """Mesh of a village under construction. ``taken`` are the circles (x, y, radius) of the placed objects."""
+    """Mesh of a village under construction. ``taken`` are the circles of the placed objects."""
 
     def __init__(self, size: float, terrain: Terrain, roads: _Roads, rng: np.random.Generator) -> None:
         self.size = size
@@ -60,7 +62,8 @@ class _Builder:
         self.triangles: list[npt.NDArray[np.int64]] = []
         self.classes: list[UInt8Array] = []
         self.num_vertices = 0
-        self.taken: list[tuple[float, float, float]] = [(0.0, 0.0, _SQUARE_RADIUS)]
+        self.taken = _Circles()
+        self.taken.append((0.0, 0.0, _SQUARE_RADIUS))
 
     def world(self) -> World:
         """Return the finished village."""
@@ -215,13 +218,39 @@ class _Builder:
 
     def is_free(self, x: float, y: float, radius: float, *, gap: float, skip_last: bool = False) -> bool:
         """True if a circle is more than ``gap`` [m] away from all placed objects."""
-        others = np.array(self.taken[:-1] if skip_last else self.taken)
+        others = self.taken.near(x, y, radius + gap, skip_last=skip_last)
         distance = np.hypot(others[:, 0] - x, others[:, 1] - y)
         return bool((distance > others[:, 2] + radius + gap).all())
 
     def nearest_road(self, x: float, y: float) -> float:
         """Return the distance [m] to the nearest centre line of a road."""
         return float(self.roads.distance(np.array([[x, y]]))[0])
+
+
+class _Circles:
+    """Circles (x, y, radius) [m], found by their place in squares of ``_SQUARE`` [m]."""
+
+    def __init__(self) -> None:
+        self._squares: dict[tuple[int, int], list[tuple[float, float, float]]] = defaultdict(list)
+        self._largest = 0.0
+        self._last: tuple[float, float, float] | None = None
+
+    def append(self, circle: tuple[float, float, float]) -> None:
+        """Add a circle."""
+        x, y, radius = self._last = circle
+        self._squares[math.floor(x / _SQUARE), math.floor(y / _SQUARE)].append(circle)
+        self._largest = max(self._largest, radius)
+
+    def near(self, x: float, y: float, reach: float, *, skip_last: bool = False) -> Float64Array:
+        """Return the circles (K, 3) that may be at most ``reach`` [m] away, without the last one with ``skip_last``."""
+        reach += self._largest
+        rows, columns = (
+            range(math.floor((value - reach) / _SQUARE), math.floor((value + reach) / _SQUARE) + 1) for value in (x, y)
+        )
+        found = [circle for place in itertools.product(rows, columns) for circle in self._squares.get(place, ())]
+        if skip_last:
+            found = [circle for circle in found if circle is not self._last]
+        return np.array(found, dtype=np.float64).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -253,6 +282,8 @@ class _Roads:
     """
 
     def __init__(self, size: float, rng: np.random.Generator, bend: float) -> None:
+        from scipy.spatial import KDTree
+
         self.half = size / 2
         # The outermost roads are 8 m inside the edge. A small world has only one crossing.
         count = round((self.half - 8.0) / _ROAD_SPACING)
@@ -264,7 +295,7 @@ class _Roads:
                 wavelength, phase = rng.uniform(50.0, 80.0), rng.uniform(0.0, 2 * math.pi)
                 across = offset + bend * (np.sin(2 * math.pi * along / wavelength + phase) - math.sin(phase))
                 self.lines.append((is_x, np.stack([along, across] if is_x else [across, along], axis=1)))
-        self.points = np.concatenate([line for _, line in self.lines])
+        self._tree = KDTree(np.concatenate([line for _, line in self.lines]))
 
     @property
     def total_length(self) -> float:
@@ -277,9 +308,7 @@ class _Roads:
 
     def distance(self, xy: Float64Array) -> Float64Array:
         """Return distances (P,) [m] of points (P, 2) to the nearest centre line."""
-        from scipy.spatial import KDTree
-
-        distances: Float64Array = KDTree(self.points).query(xy)[0]
+        distances: Float64Array = self._tree.query(xy)[0]
         return distances
 
     def roadside(self, rng: np.random.Generator, setback: float) -> tuple[float, float, float]:

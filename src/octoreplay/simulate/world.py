@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +63,11 @@ class Terrain:
     phases: Float64Array
     amplitudes: Float64Array
 
+    @property
+    def highest(self) -> float:
+        """Height that the ground does not exceed [m]."""
+        return float(np.abs(self.amplitudes).sum())
+
     def height(self, xy: npt.ArrayLike) -> Float64Array:
         """Return the height (...,) [m] at points (..., 2) [m]."""
         heights: Float64Array = np.sin(np.asarray(xy) @ self.wave_vectors.T + self.phases) @ self.amplitudes
@@ -105,14 +110,18 @@ class World:
         classes = (self.triangle_classes.astype(np.int64) - 1) * kinds + kind + 1
         return dataclasses.replace(self, triangle_classes=classes.astype(np.uint8), kinds=kinds)
 
-    def surface_points(self, spacing: float) -> Iterator[tuple[Float64Array, UInt8Array]]:
+    def surface_points(
+        self, spacing: float, triangles: npt.NDArray[Any] | None = None
+    ) -> Iterator[tuple[Float64Array, UInt8Array]]:
         """Yield batches of surface points (P, 3) at most ``spacing`` [m] apart, with their class_ids (P,).
 
-        The points are those of ``points_on_triangles``.
+        The points are those of ``points_on_triangles``, on all triangles or on those of a mask or of indices.
         """
-        corners = self.vertices[self.triangles].astype(np.float64)
-        for points, triangles in points_on_triangles(corners, spacing):
-            yield points, self.triangle_classes[triangles]
+        chosen = slice(None) if triangles is None else triangles
+        corners = self.vertices[self.triangles[chosen]].astype(np.float64)
+        classes = self.triangle_classes[chosen]
+        for points, members in points_on_triangles(corners, spacing):
+            yield points, classes[members]
 
     def obstacle_mask(self, cell: float) -> npt.NDArray[np.bool_]:
         """Return a mask (n, n) of the cells in which a robot cannot drive.
@@ -122,8 +131,10 @@ class World:
         """
         n = grid_length(self.size, cell)
         mask = np.zeros((n, n), dtype=np.bool_)
-        for points, class_ids in self.surface_points(cell / 2):
-            solid = points[~self.is_ground(class_ids)]
+        highest = self.terrain.highest + 1.5
+        for points, _ in self.surface_points(cell / 2, ~self.is_ground(self.triangle_classes)):
+            # Roofs and crowns need no height of the ground below them.
+            solid = points[points[:, 2] < highest]
             above = solid[:, 2] - self.terrain.height(solid[:, :2])
             index = np.floor((solid[(above > 0.1) & (above < 1.5), :2] + self.size / 2) / cell).astype(np.int64)
             index = index[((index >= 0) & (index < n)).all(axis=1)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,14 @@ import numpy as np
 from octoreplay.io.output_file import write_whole
 from octoreplay.io.results import ply
 from octoreplay.mapping.surface import CellVotes
-from octoreplay.records import ClassTable, Int32Array, UInt8Array
+from octoreplay.records import ClassTable, Int32Array, Int64Array, UInt8Array
 from octoreplay.simulate.world import World
+
+_SLAB = 64.0
+"""Width of the slabs in which cells are labelled [m]."""
+
+_MAX_THREADS = 4
+"""Largest number of slabs in memory at once."""
 
 _KEY_BITS = 18
 _KEY_OFFSET = 1 << 17
@@ -22,15 +30,38 @@ def labelled_cells(world: World, resolution: float) -> tuple[Int32Array, UInt8Ar
 
     key = floor(coordinate / resolution). Surfaces are sampled every third of a cell's edge. The class with the most
     points in a cell wins; ties go to the lower class_id. Surfaces under the ground are left out. Keys are in ascending
-    order.
+    order. The cells are found slab by slab along x, so that memory holds the points' cells of a few slabs.
     """
+    along_x = world.vertices[:, 0][world.triangles].astype(np.float64)
+    # Points may leave their triangle by a rounding error.
+    first = np.floor(along_x.min(axis=1) / resolution).astype(np.int64) - 1
+    last = np.floor(along_x.max(axis=1) / resolution).astype(np.int64) + 1
+    step = max(1, round(_SLAB / resolution))
+
+    def found(start: int) -> tuple[Int32Array, UInt8Array]:
+        near = np.flatnonzero((last >= start) & (first < start + step))
+        return _slab_cells(world, resolution, (start, start + step), near)
+
+    with ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1)) as threads:
+        slabs = list(threads.map(found, range(int(first.min()), int(last.max()) + 1, step)))
+    return np.concatenate([keys for keys, _ in slabs]), np.concatenate([class_ids for _, class_ids in slabs])
+
+
+def _slab_cells(
+    world: World, resolution: float, slab: tuple[int, int], triangles: Int64Array
+) -> tuple[Int32Array, UInt8Array]:
+    """Labelled cells whose first key is in [start, stop), from the triangles that may reach them."""
     votes = CellVotes()
-    for points, class_ids in world.surface_points(resolution / 3):
-        is_visible = world.is_ground(class_ids)
-        above = np.flatnonzero(~is_visible)
-        is_visible[above] = points[above, 2] >= world.terrain.height(points[above, :2]) - 0.05
-        keys = np.floor(points[is_visible] / resolution).astype(np.int64) + _KEY_OFFSET
-        votes.add(((keys[:, 0] << _KEY_BITS) + keys[:, 1] << _KEY_BITS) + keys[:, 2], class_ids[is_visible])
+    start, stop = slab
+    for points, class_ids in world.surface_points(resolution / 3, triangles):
+        keys = np.floor(points / resolution).astype(np.int64)
+        is_counted = (keys[:, 0] >= start) & (keys[:, 0] < stop)
+        low = np.flatnonzero(is_counted & ~world.is_ground(class_ids) & (points[:, 2] < world.terrain.highest))
+        is_counted[low] = points[low, 2] >= world.terrain.height(points[low, :2]) - 0.05
+        keys = keys[is_counted] + _KEY_OFFSET
+        cells = ((keys[:, 0] << _KEY_BITS) + keys[:, 1] << _KEY_BITS) + keys[:, 2]
+        pairs, counts = np.unique(cells << 8 | class_ids[is_counted], return_counts=True)
+        votes.add(pairs >> 8, (pairs & 0xFF).astype(np.uint8), counts)
     cells, winners = votes.winners()
     mask = (1 << _KEY_BITS) - 1
     keys = np.stack([cells >> 2 * _KEY_BITS, (cells >> _KEY_BITS) & mask, cells & mask], axis=1) - _KEY_OFFSET

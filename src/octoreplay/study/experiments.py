@@ -14,7 +14,7 @@ from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.output_file import write_whole
 from octoreplay.replay.run import replay_team
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.folder import table_csv
 from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep
 from octoreplay.study.task import Row

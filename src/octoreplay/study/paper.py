@@ -29,7 +29,7 @@ from octoreplay.report.log_time import has_published, over_robots
 from octoreplay.report.map_figure import AZIMUTH, ELEVATION
 from octoreplay.result import Result, open_result
 from octoreplay.run_metrics import TickMetrics
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.simulate.village import make_village
 from octoreplay.simulate.world import World
 from octoreplay.stored_map import StoredMap

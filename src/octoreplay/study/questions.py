@@ -10,7 +10,7 @@ from octoreplay.evaluate.evaluation import truth_beside_logs
 from octoreplay.evaluate.repairs import repairs
 from octoreplay.evaluate.truth import load_truth
 from octoreplay.result import open_result
-from octoreplay.simulate.team import SimulationConfig
+from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.simulate.world import village_classes
 from octoreplay.study.experiments import Experiment, Plan, SimulatedTeam
 from octoreplay.study.sweep import Sweep

@@ -17,7 +17,8 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.io.text_files import json_text
 from octoreplay.replay.checkpoint import can_resume
 from octoreplay.replay.run import Progress, replay_team
-from octoreplay.simulate.team import SimulationConfig, simulate_team
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.simulate.team import simulate_team
 
 SETTINGS_FILE = "simulation.json"
 """File beside a team's logs with the version, the settings and the size of every file."""
