@@ -184,6 +184,5 @@ def test_a_run_of_the_logs_needs_no_option_and_agrees_with_the_truth(tmp_path):
     [*_, last] = evaluate_result(tmp_path / "result.mcap", truth=tmp_path / "team", over_time=False).ticks
     for scores in last.maps:
         assert scores.truth is not None
-        # With wrong labels or a wrong mount it is below 0.3.
         assert scores.truth.mean_iou_known > 0.6
         assert scores.truth.occupied_accuracy > 0.7
