@@ -37,9 +37,11 @@ Given = Callable[[str | Path], Any]
 CASES: dict[tuple[str, ...], Callable[[Given], Any]] = {
     ("load_team_file", "path"): lambda at: octoreplay.load_team_file(at(PAIR_TEAM)),
     ("load_frames_file", "path"): lambda at: octoreplay.load_frames_file(at("frames.yaml")),
+    ("load_paths_file", "path"): lambda at: octoreplay.load_paths_file(at("paths.yaml")),
     ("discover", "logs"): lambda at: octoreplay.discover([at(PAIR / "husky_1.mcap")]),
     ("open_log", "path"): lambda at: list(_closed(octoreplay.open_log(at(PAIR / "husky_1.mcap"))).topics),
     ("replay_team", "output"): lambda at: octoreplay.replay_team(_resolved_pair(), at("missing/out.mcap")),
+    ("replay_tiles", "output"): lambda at: octoreplay.replay_tiles(_resolved_pair(), at("missing/out.mcap"), 50.0),
     ("open_result", "path"): lambda at: _closed(octoreplay.open_result(at(RESULT))).robots,
     ("export_map", "result_path", "output"): lambda at: octoreplay.export_map(at(RESULT), at("map.ply"), "unknown"),
     ("evaluate_result", "path", "truth", "against"): lambda at: octoreplay.evaluate_result(
