@@ -12,7 +12,7 @@ from octoreplay.run_metrics import RunSummary, ranked_pairs
 
 @dataclass(frozen=True)
 class RunVerdict:
-    """What matters most about a run, after its last tick; docs/metrics.md defines the metrics.
+    """Main figures of a run after its last tick; docs/metrics.md defines the metrics.
 
     Attributes
     ----------

@@ -55,7 +55,7 @@ class DepthOdometry:
         self._last: _Image | None = None
         self._T_map_sensor = np.eye(4)
 
-    def register(self, frame: Frame, motion: Float64Array, seconds: float) -> ScanPose:  # noqa: ARG002
+    def register(self, frame: Frame, motion: Float64Array, seconds: float) -> ScanPose:  # noqa: ARG002 - an Odometer
         """Return the pose of a depth image (``Odometer.register``); the first one is at the identity."""
         if not isinstance(frame, ColoredDepth):
             raise TypeError("a depth image is expected")

@@ -82,7 +82,7 @@ class _Component:
         return comparison.spread(self.members, len(team.robots)), pairs
 
     def evidence_part(self) -> EvidencePart:
-        """What the last comparison of the evidence of a tile gives to that of the whole."""
+        """Part of the last comparison of the evidence of a tile that is joined with those of other tiles."""
         return self._evidence_comparer.part()
 
     def _maps_and_links(
@@ -170,7 +170,7 @@ class TickMeasurer:
         )
 
     def _parts(self, team: Team[Robot], traffic: Traffic, tile_cells: int) -> TileParts:
-        """What the counts of a tile need to be joined with those of others."""
+        """Parts of the counts of a tile that are joined with those of other tiles."""
         published = (
             part if publication and publication.sizes else None
             for part, publication in zip(self._published_parts, traffic.published, strict=True)

@@ -39,7 +39,7 @@ class RobotCounts:
 
 @dataclass(frozen=True, eq=False)
 class TileParts:
-    """What the counts of a tile need to be joined with those of others.
+    """Parts of the counts of a tile that are joined with those of other tiles by functions of ``mapping``.
 
     ``streams`` are the sizes of the robots' maps after the tick, and ``published`` those of the maps that they
     published (None: none).

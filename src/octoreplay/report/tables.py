@@ -282,7 +282,7 @@ def _frame_origins(origins: Mapping[str, str]) -> str:
 
 
 def _joined(summary: RunSummary) -> str:
-    """When the robots became one component, or the components at the end."""
+    """Time at which the robots became one component, or the components at the end."""
     if summary.last.num_components == 1:
         return f"one from {summary.joins[-1].seconds:g} s on" if summary.joins else "one"
     names = "; ".join(", ".join(component) for component in summary.last.components)

@@ -15,7 +15,7 @@ from octoreplay.simulate.grid import CELL, DrivingGrid, shortest_paths, wrapped
 from octoreplay.simulate.world import World
 
 _DETOUR = 30.0
-"""How far ways around obstacles are searched at first beyond the box of their two waypoints [m]."""
+"""Distance beyond the box of two waypoints within which a way around obstacles is searched at first [m]."""
 
 Path = Sequence[tuple[float, float]]
 

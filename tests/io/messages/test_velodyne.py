@@ -192,7 +192,7 @@ def test_cut_and_altered_messages_are_refused_or_decoded(ros1):
         except DamagedMessageError:
             outcomes.add("damaged")
         except InputError as error:
-            assert "not supported" in str(error)  # noqa: PT017
+            assert "not supported" in str(error)  # noqa: PT017 - one of several outcomes
         else:
             outcomes.add("decoded")
     assert outcomes == {"damaged", "decoded"}

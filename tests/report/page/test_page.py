@@ -64,11 +64,11 @@ def test_the_team_is_the_mean_of_the_maps_that_know_a_cell(trio_result: Path, tr
     row = trio_page.array(trio_page.header["storedRows"])[index]
     cubes, _ = trio_page.map("/team", index)
     shown = {cell: cube for cell, cube in cubes.items() if cube.values["label"]}
-    points = lambda r: (np.array(list(shown), dtype=np.float64) + 0.5) * r.config.map.resolution  # noqa: E731
     with open_result(trio_result) as result:
+        points = (np.array(list(shown), dtype=np.float64) + 0.5) * result.config.map.resolution
         at_ns = result.metrics[row].stamp_ns
-        answers = [result.map(name, at_ns=at_ns).query(points(result)) for name in result.robots]
-        means = [result.map(name, at_ns=at_ns).query(points(result), map_kind="mean") for name in result.robots]
+        answers = [result.map(name, at_ns=at_ns).query(points) for name in result.robots]
+        means = [result.map(name, at_ns=at_ns).query(points, map_kind="mean") for name in result.robots]
     known = np.stack([answer.known for answer in answers])[:, :, None]
     log_odds = np.sum([np.where(k, a.log_odds, 0) for k, a in zip(known, answers, strict=True)], axis=0)
     log_odds = log_odds / known.sum(axis=0)

@@ -68,7 +68,7 @@ class CheckedReader(SeekingReader):
         return self._summary
 
     # Named parameters only, and messages without a schema are given too.
-    def iter_messages(  # type: ignore[override]
+    def iter_messages(  # type: ignore[override]  # see above
         self,
         topics: Collection[str] | None = None,
         *,

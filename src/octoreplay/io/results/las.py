@@ -66,7 +66,7 @@ def _laspy() -> Any:
     """Return the module laspy. Raises ConfigError where it or lazrs is missing."""
     try:
         import laspy
-        import lazrs  # noqa: F401
+        import lazrs  # noqa: F401 - laspy uses it for LAZ
     except ImportError as error:
         raise ConfigError(
             f"LAS and LAZ files need the package {error.name}; install it with: pip install 'octoreplay[las]'"

@@ -25,7 +25,7 @@ Rows = list[tuple[str, list[str]]]
 """Rows of a table: where each is, and its words."""
 
 Matrices = list[tuple[str, list[float]]]
-"""Where each matrix is, and the 12 numbers of its upper three rows."""
+"""Place of each matrix, and the 12 numbers of its upper three rows."""
 
 
 @dataclass(frozen=True)

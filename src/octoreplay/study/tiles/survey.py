@@ -103,7 +103,7 @@ def load_frames(folder: Path) -> tuple[RobotFrames, ...]:
 
 
 def _frames_of(frames: Iterator[Frame], sensor: SensorConfig, margin: float) -> RobotFrames:
-    """What tiles need to know of one robot's frames; boxes are larger by ``margin`` [m] on each side."""
+    """Stamps, poses and boxes of one robot's frames; boxes are larger by ``margin`` [m] on each side."""
     rows = [(frame.stamp_ns, frame.sensor_index, frame.T_team_sensor, ray_box(frame, sensor)) for frame in frames]
     poses = np.array([pose for *_, pose, _ in rows], np.float64).reshape(-1, 4, 4)
     boxes = np.array([box for *_, box in rows], np.float64).reshape(-1, 6)

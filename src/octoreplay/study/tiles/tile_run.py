@@ -34,7 +34,7 @@ MAPS, EVIDENCE = "maps", "evidence"
 
 @dataclass(frozen=True)
 class Stage:
-    """How far a tile is.
+    """Progress of a tile.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class TileFiles:
         self.stage = folder / f"{tile.name}.json"
 
     def read_stage(self) -> Stage | None:
-        """Return how far the tile is; None where it has not finished its logs."""
+        """Return the progress of the tile; None where it has not finished its logs."""
         try:
             values = json.loads(self.stage.read_text(encoding="utf-8"))
             values["num_frames_off"] = [{int(k): n for k, n in off.items()} for off in values["num_frames_off"]]

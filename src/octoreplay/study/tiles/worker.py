@@ -40,7 +40,7 @@ class Request:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What a worker process needs to know of a run."""
+    """Settings of a run for its worker processes."""
 
     config: ResolvedRun
     folder: Path

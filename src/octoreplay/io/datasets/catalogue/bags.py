@@ -72,7 +72,7 @@ class Bags(DataSet):
                 RobotConfig(
                     robot_id,
                     tuple(log.resolve() for log in logs),
-                    **{self.role: topic},  # type: ignore[arg-type]
+                    **{self.role: topic},  # type: ignore[arg-type]  # a topic by the name of its field
                     camera_info_topic=self.camera_info and self.camera_info.format(robot=name),
                     label_field=self.label_field if is_labelled else None,
                     pose_file=files[name],
