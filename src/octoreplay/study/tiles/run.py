@@ -33,8 +33,8 @@ from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
 from octoreplay.study.tiles.survey import Survey
-from octoreplay.study.tiles.tile_run import Stage, TileFiles
-from octoreplay.study.tiles.worker import Request, Workers
+from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
+from octoreplay.study.tiles.worker import Request, Setup, Workers
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ def replay_tiles(
             raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
         _allow_open_files(len(tiles))
         survey.save(folder)
-        workers = stack.enter_context(Workers(config, folder, num_jobs, num_threads))
+        workers = stack.enter_context(Workers(Setup(config, folder, num_threads), num_jobs))
         stages = _replay_logs(tiles, workers, folder, progress)
         stages = _settle(tiles, stages, workers, progress)
         counts = survey.counts(next(iter(stages.values())).num_frames_off)
@@ -203,7 +203,8 @@ def _replay_logs(tiles: Sequence[Tile], workers: Workers, folder: Path, progress
     stages = {tile: stage for tile in tiles if (stage := TileFiles(folder, tile).read_stage()) is not None}
     if stages:
         _log.info("%d of %d tiles were finished before", len(stages), len(tiles))
-    for tile, stage in workers.answers([Request(tile, "replay_logs") for tile in tiles if tile not in stages]):
+    requests = [Request(tile.name, replay_logs, (tile,)) for tile in tiles if tile not in stages]
+    for tile, stage in workers.answers(requests):
         stages[tile] = stage
         if progress is not None:
             progress("replay", len(stages), len(tiles))
@@ -224,7 +225,8 @@ def _settle(
         if not left:
             return stages
         num_done = len(tiles) - len(left)
-        for tile, stage in workers.answers([Request(tile, "settle", (largest, least)) for tile in left]):
+        requests = [Request(tile.name, settle, (tile, largest, least)) for tile in left]
+        for tile, stage in workers.answers(requests):
             stages[tile] = stage
             num_done += 1
             if progress is not None:

@@ -27,6 +27,7 @@ from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.survey import load_frames
 from octoreplay.study.tiles.work import StoredMap, TileTick, WorkFile
+from octoreplay.study.tiles.worker import Setup
 
 MAPS, EVIDENCE = "maps", "evidence"
 """Kinds of stored maps."""
@@ -217,3 +218,13 @@ class _TileRecorder:
     def _is_due(self, tick: Tick, periods: Iterable[float]) -> bool:
         elapsed_ns = tick.stamp_ns - self.stored["start_ns"]
         return any(falls_due(elapsed_ns, self._period_ns, every) for every in periods)
+
+
+def replay_logs(setup: Setup, tile: Tile) -> tuple[Tile, Stage]:
+    """Replay the logs in one tile, as a request to a worker."""
+    return tile, TileRun(setup.config, tile, setup.folder).replay_logs(setup.num_threads)
+
+
+def settle(setup: Setup, tile: Tile, largest: float, least_ticks: int) -> tuple[Tile, Stage]:
+    """Let one tile settle, as a request to a worker."""
+    return tile, TileRun(setup.config, tile, setup.folder).settle(largest, least_ticks, setup.num_threads)

@@ -1,4 +1,4 @@
-"""Worker processes that replay tiles: each waits for requests and answers them one by one."""
+"""Worker processes of a run in tiles: each waits for requests and answers them one by one."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ from typing import Any
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.errors import InputError, OctoreplayError
-from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.tile_run import Stage, TileRun
 
 MAX_TRIES = 3
 """Number of processes that may die on one request."""
@@ -30,21 +28,24 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Request:
-    """Work on one tile: a method of ``TileRun`` and its arguments but the number of threads."""
-
-    tile: Tile
-    method: str
-    arguments: tuple[Any, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Setup:
-    """Settings of a run for its worker processes."""
+class Setup:
+    """Settings of a run for its workers: configuration, folder of the work files, threads of a worker."""
 
     config: ResolvedRun
     folder: Path
     num_threads: int
+
+
+@dataclass(frozen=True)
+class Request:
+    """Work for a worker: a function of a module, called with the ``Setup`` and the arguments; all can be pickled.
+
+    ``name`` is its subject in messages, such as that of a tile.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...] = ()
 
 
 class _DiedError(Exception):
@@ -54,11 +55,11 @@ class _DiedError(Exception):
 class _Worker:
     """A worker process, started with the first request and again after its death."""
 
-    def __init__(self, setup: _Setup) -> None:
+    def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._process: subprocess.Popen[bytes] | None = None
 
-    def answer(self, request: Request) -> Stage:
+    def answer(self, request: Request) -> Any:
         """Return the answer to a request. Raises the error of the request, and _DiedError."""
         try:
             if self._process is None:
@@ -76,7 +77,6 @@ class _Worker:
             raise _DiedError(f"ended with code {code}" if code >= 0 else f"was killed by signal {-code}") from error
         if isinstance(answer, BaseException):
             raise answer
-        assert isinstance(answer, Stage)
         return answer
 
     def _send(self, content: object) -> None:
@@ -100,10 +100,9 @@ class _Worker:
 
 
 class Workers:
-    """Worker processes for the tiles of one run; a context manager that ends them."""
+    """Worker processes of one run; a context manager that ends them."""
 
-    def __init__(self, config: ResolvedRun, folder: Path, num_jobs: int, num_threads: int) -> None:
-        setup = _Setup(config, folder, num_threads)
+    def __init__(self, setup: Setup, num_jobs: int) -> None:
         self._all = [_Worker(setup) for _ in range(num_jobs)]
         self._free: SimpleQueue[_Worker] = SimpleQueue()
         for worker in self._all:
@@ -120,16 +119,16 @@ class Workers:
             worker.stop()
         self._threads.shutdown(cancel_futures=True)
 
-    def answers(self, requests: Sequence[Request]) -> Iterator[tuple[Tile, Stage]]:
+    def answers(self, requests: Sequence[Request]) -> Iterator[Any]:
         """Yield the answers to requests in the order in which they come.
 
         A request whose process died is given to another one, MAX_TRIES times. Raises InputError where all of them died.
         """
-        futures = {self._threads.submit(self._answer, request): request for request in requests}
+        futures = [self._threads.submit(self._answer, request) for request in requests]
         for future in as_completed(futures):
-            yield futures[future].tile, future.result()
+            yield future.result()
 
-    def _answer(self, request: Request) -> Stage:
+    def _answer(self, request: Request) -> Any:
         """Answer of any free worker."""
         worker = self._free.get()
         try:
@@ -139,10 +138,10 @@ class Workers:
                 except _DiedError as error:
                     if self._is_closed.is_set() or number == MAX_TRIES - 1:
                         raise InputError(
-                            f"{request.tile.name}: its process {error}, {MAX_TRIES} times; if memory ran out, give a"
+                            f"{request.name}: its process {error}, {MAX_TRIES} times; if memory ran out, give a"
                             " smaller --tiles or fewer --jobs, and --resume"
                         ) from error
-                    _log.warning("warning: %s: its process %s; it is started again", request.tile.name, error)
+                    _log.warning("warning: %s: its process %s; it is started again", request.name, error)
         finally:
             self._free.put(worker)
         raise AssertionError
@@ -158,7 +157,7 @@ def serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     _end_with_parent()
     setup = pickle.load(sys.stdin.buffer)
-    assert isinstance(setup, _Setup)
+    assert isinstance(setup, Setup)
     while True:
         try:
             request = pickle.load(sys.stdin.buffer)
@@ -168,16 +167,14 @@ def serve() -> None:
         answers.flush()
 
 
-def _answer_to(setup: _Setup, request: Request) -> Stage | BaseException:
+def _answer_to(setup: Setup, request: Request) -> Any:
     """Answer to a request, or its error."""
     try:
-        run = TileRun(setup.config, request.tile, setup.folder)
-        method: Callable[..., Stage] = getattr(run, request.method)
-        return method(*request.arguments, num_threads=setup.num_threads)
+        return request.function(setup, *request.arguments)
     except OctoreplayError as error:
         return error
     except Exception:
-        return RuntimeError(f"{request.tile.name}:\n{traceback.format_exc()}")
+        return RuntimeError(f"{request.name}:\n{traceback.format_exc()}")
 
 
 def _end_with_parent() -> None:
