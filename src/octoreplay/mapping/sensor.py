@@ -88,6 +88,17 @@ class TouchedCells:
     strengths: UInt64Array
 
 
+@dataclass(frozen=True, eq=False)
+class CastFrame:
+    """Frame whose rays were cast before, with the cells that they touch; the other fields are those of a frame."""
+
+    robot_id: str
+    stamp_ns: int
+    T_team_sensor: Float64Array
+    sensor_index: int
+    cells: TouchedCells
+
+
 def sensor_reach(sensor: SensorConfig, map_config: MapConfig) -> float:
     """Return the largest coordinate of a sensor with which all its rays stay in the key space [m].
 

@@ -144,7 +144,7 @@ def save_state(path: Path, content: Mapping[str, Any], shared: Mapping[str, obje
         summed.write(_MAGIC)
         stream = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).stream_writer(cast("IO[bytes]", summed), closefd=False)
         with stream:
-            _Pickler(stream, shared).dump({**content, "versions": _versions()})
+            _SharingPickler(stream, shared).dump({**content, "versions": _versions()})
         file.write(_CHECKSUM.pack(summed.crc))
 
 
@@ -177,7 +177,7 @@ def load_state(path: Path, shared: Mapping[str, object]) -> dict[str, Any]:
 def pickled(content: Mapping[str, Any]) -> bytes:
     """Return the pickle of a mapping without shared objects."""
     buffer = io.BytesIO()
-    _Pickler(buffer, {}).dump(content)
+    _Pickler(buffer, protocol=5).dump(content)
     return buffer.getvalue()
 
 
@@ -208,14 +208,7 @@ def _versions() -> dict[str, str]:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that replaces ``shared`` objects by their names."""
-
-    def __init__(self, file: IO[bytes], shared: Mapping[str, object]) -> None:
-        super().__init__(file, protocol=5)
-        self._names = {id(value): name for name, value in shared.items()}
-
-    def persistent_id(self, value: object) -> str | None:
-        return self._names.get(id(value))
+    """Pickler whose pickles ``_Unpickler`` reads."""
 
     def reducer_override(self, value: Any) -> Any:
         """Reduce random generators to numbers, and members of enumerations to class and value."""
@@ -225,6 +218,17 @@ class _Pickler(pickle.Pickler):
             # Some versions of Python reduce them to a call of getattr.
             return type(value), (value.value,)
         return NotImplemented
+
+
+class _SharingPickler(_Pickler):
+    """Pickler that replaces ``shared`` objects by their names."""
+
+    def __init__(self, file: IO[bytes], shared: Mapping[str, object]) -> None:
+        super().__init__(file, protocol=5)
+        self._names = {id(value): name for name, value in shared.items()}
+
+    def persistent_id(self, value: object) -> str | None:
+        return self._names.get(id(value))
 
 
 def _random_generator(state: Any) -> np.random.Generator:

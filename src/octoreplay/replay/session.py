@@ -13,8 +13,8 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.errors import InputError
 from octoreplay.mapping.octree import SemanticOctree
-from octoreplay.mapping.sensor import ScanCaster
-from octoreplay.records import CENTRAL, Frame, RobotPose
+from octoreplay.mapping.sensor import CastFrame, ScanCaster
+from octoreplay.records import CENTRAL, RobotPose
 from octoreplay.replay.exchange.messages import Acknowledgement, Content, Receipt
 from octoreplay.replay.exchange.neighbours import Exchange
 from octoreplay.replay.exchange.packet_codec import PacketCodec
@@ -28,7 +28,7 @@ from octoreplay.replay.robots.team import make_team
 from octoreplay.replay.settling import NO_SETTLING, Settling
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.replay.tick_counts import tick_metrics
-from octoreplay.replay.timeline import Bodies, FrameSource, Position, Timeline
+from octoreplay.replay.timeline import Bodies, FrameSource, Position, Scan, Timeline
 
 _STATE = (
     "is_symmetric", "num_frames_off", "team", "joining", "_network", "_links", "_measurer", "_graph", "_num_ticks",
@@ -90,11 +90,11 @@ class Session:
     def __init__(
         self,
         config: ResolvedRun,
-        sources: Sequence[FrameSource],
+        sources: Sequence[FrameSource[Scan]],
         threads: Executor,
         *,
         bodies: Bodies | None = None,
-        reopen: Callable[[int, tuple[float, ...]], FrameSource] | None = None,
+        reopen: Callable[[int, tuple[float, ...]], FrameSource[Scan]] | None = None,
         tile_cells: int | None = None,
     ) -> None:
         self.config = config
@@ -273,7 +273,7 @@ class Session:
         self._advance_bodies(stamp_ns)
 
         def integrate(index: int) -> None:
-            def is_on(frame: Frame) -> bool:
+            def is_on(frame: Scan) -> bool:
                 is_kept = schedule.keeps(index, (frame.stamp_ns - start_ns) / 1e9, elapsed)
                 self.num_frames_off[index][frame.sensor_index] += not is_kept
                 return is_kept
@@ -293,9 +293,9 @@ class Session:
         if self._bodies is not None:
             self._bodies.advance(stamp_ns - self._period_ns, stamp_ns)
 
-    def _with_bodies(self, index: int, frame: Frame) -> Frame:
+    def _with_bodies(self, index: int, frame: Scan) -> Scan:
         """A robot's frame with the boxes of the other robots."""
-        if self._bodies is None:
+        if self._bodies is None or isinstance(frame, CastFrame):
             return frame
         return self._bodies.add_to(index, frame)
 

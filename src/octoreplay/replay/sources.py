@@ -12,19 +12,17 @@ from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.mapping.sensor import sensor_reach
-from octoreplay.records import Float64Array, FrameCounts
+from octoreplay.records import FrameCounts
 
 
 class TeamSources:
     """Sources of the frames of a team's robots, in the order of ``config.robots``; a context manager.
 
-    ``elsewhere`` are, for each robot and each of its sensors, the frames that ``RobotLog`` need not decode.
     Raises InputError as ``RobotLog`` does.
     """
 
-    def __init__(self, config: ResolvedRun, elsewhere: Sequence[Sequence[Mapping[int, Float64Array]]] = ()) -> None:
+    def __init__(self, config: ResolvedRun) -> None:
         self._config = config
-        self._elsewhere = elsewhere or [()] * len(config.robots)
         self._reach = sensor_reach(config.sensor, config.map)
         self._logs: list[SensorLogs] = []
         self._sources: list[ReadAhead] = []
@@ -75,9 +73,7 @@ class TeamSources:
 
     def _open(self, index: int, robot: ResolvedRobot) -> SensorLogs:
         """Open a robot's log."""
-        log = SensorLogs(
-            robot, self._config.time, self._config.classes, reach=self._reach, elsewhere=self._elsewhere[index]
-        )
+        log = SensorLogs(robot, self._config.time, self._config.classes, reach=self._reach)
         return self._opened[index].enter_context(log)
 
     def _read(self, index: int) -> ReadAhead:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from octoreplay.errors import InputError
+from octoreplay.mapping.sensor import CastFrame
 from octoreplay.records import Frame
 
+Scan: TypeAlias = Frame | CastFrame
+"""Frame of a sensor, or the cells that its rays touch."""
 
-class FrameSource(Protocol):
+
+ScanT = TypeVar("ScanT", bound=Scan)
+ScanT_co = TypeVar("ScanT_co", bound=Scan, covariant=True)
+
+
+class FrameSource(Protocol[ScanT_co]):
     """Frames of one robot in the order of their stamps (``io.robots.robot_log.RobotLog``)."""
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[ScanT_co]:
         """Iterate over the frames from the beginning."""
 
 
@@ -33,22 +41,22 @@ class Position(NamedTuple):
     last_ns: tuple[int | None, ...]
 
 
-class Timeline:
+class Timeline(Generic[ScanT]):
     """Frames of all robots up to a common time. It holds one frame of each robot ahead.
 
     Frames of different robots may be taken in parallel threads.
     """
 
-    def __init__(self, logs: Sequence[FrameSource]) -> None:
+    def __init__(self, logs: Sequence[FrameSource[ScanT]]) -> None:
         self._streams = [log.frames() for log in logs]
-        self._next: list[Frame | None] = [next(stream, None) for stream in self._streams]
+        self._next: list[ScanT | None] = [next(stream, None) for stream in self._streams]
         self._num_taken = [0] * len(self._streams)
         self._last_ns: list[int | None] = [None] * len(self._streams)
         stamps = [frame.stamp_ns for frame in self._next if frame is not None]
         self.first_stamp_ns = min(stamps, default=None)
         """Stamp of the team's first frame; None without frames."""
 
-    def rewind(self, robot_index: int, source: FrameSource) -> None:
+    def rewind(self, robot_index: int, source: FrameSource[ScanT]) -> None:
         """Continue a robot with another source, from its first frame on."""
         self._streams[robot_index] = source.frames()
         self._next[robot_index] = next(self._streams[robot_index], None)
@@ -90,13 +98,13 @@ class Timeline:
             for following, last_ns in pairs
         ]
 
-    def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[Frame]:
+    def frames_before(self, robot_index: int, stamp_ns: int) -> Iterator[ScanT]:
         """Remaining frames of a robot with stamps below ``stamp_ns``."""
         while (frame := self._next[robot_index]) is not None and frame.stamp_ns < stamp_ns:
             self._take(robot_index)
             yield frame
 
-    def _take(self, robot_index: int) -> Frame | None:
+    def _take(self, robot_index: int) -> ScanT | None:
         """Take the next frame of a robot; None at the end."""
         frame = self._next[robot_index]
         if frame is not None:

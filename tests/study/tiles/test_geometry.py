@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -11,15 +10,6 @@ import pytest
 from octoreplay.config.sensor import MapConfig
 from octoreplay.errors import ConfigError
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
-
-BOX = np.array([[-5.0, 1.0, 0.0, 7.0, 2.0, 1.0]])
-
-
-@dataclasses.dataclass
-class Config:
-    """The part of a run's configuration that tiles need."""
-
-    map: MapConfig
 
 
 @pytest.mark.parametrize(("edge", "cells"), [(6.4, 32), (8.0, 32), (10.0, 64), (50.0, 256), (1e9, 1 << 19)])
@@ -33,20 +23,16 @@ def test_small_and_wrong_edges_are_refused(edge):
         tile_cells(edge, 0.2)
 
 
-def test_tiles_cover_the_boxes():
-    config = Config(MapConfig(0.1))
-    assert tiles_of(BOX, 32, config) == tuple(Tile(x, 0, 32) for x in (-2, -1, 0, 1, 2))
-    apart = np.array([[0.1, 0.1, 0.0, 0.2, 0.2, 1.0], [7.0, 7.0, 0.0, 7.1, 7.1, 1.0]])
-    assert tiles_of(apart, 32, config) == (Tile(0, 0, 32), Tile(2, 2, 32))
+def test_tiles_cover_the_columns():
+    columns = np.array([[3, 0], [-1, 0], [-3, 1], [2, 0], [3, 0]])
+    assert tiles_of(columns, 32, 32) == tuple(Tile(x, y, 32) for x, y in ((-3, 1), (-1, 0), (2, 0), (3, 0)))
+    assert tiles_of(columns, 32, 128) == (Tile(-1, 0, 128), Tile(0, 0, 128))
+    assert tiles_of(np.zeros((0, 2), np.int64), 32, 32) == ()
 
 
-def test_tiles_lie_within_the_bounds():
-    config = Config(MapConfig(0.1, bounds=(-1.0, 0.0, 0.0, 4.0, 1.5, 2.0)))
-    tiles = tiles_of(BOX, 32, config)
-    assert tiles == tuple(Tile(x, 0, 32) for x in (-1, 0, 1))
-    assert tiles[0].bounds(config.map) == (-1.0, 0.0, 0.0, 0.0, 1.5, 2.0)
-    assert tiles_of(BOX, 32, Config(MapConfig(0.1, bounds=(20.0, 0.0, 0.0, 30.0, 1.0, 1.0)))) == ()
-    assert tiles_of(np.zeros((0, 6)), 32, config) == ()
+def test_bounds_of_a_tile_lie_within_those_of_the_run():
+    bounds = (-1.0, 0.0, 0.0, 4.0, 1.5, 2.0)
+    assert Tile(-1, 0, 32).bounds(MapConfig(0.1, bounds=bounds)) == (-1.0, 0.0, 0.0, 0.0, 1.5, 2.0)
 
 
 def test_tiles_without_bounds_have_all_heights():
@@ -56,5 +42,6 @@ def test_tiles_without_bounds_have_all_heights():
 
 
 def test_too_many_tiles_are_refused():
-    with pytest.raises(ConfigError, match="more than 100,000 tiles; give a larger one"):
-        tiles_of(np.array([[-1e4, -1e4, 0.0, 1e4, 1e4, 1.0]]), 32, Config(MapConfig(0.1)))
+    columns = np.column_stack([np.arange(100_001), np.zeros(100_001, np.int64)])
+    with pytest.raises(ConfigError, match="100,001 tiles, more than 100,000; give a larger edge"):
+        tiles_of(columns, 32, 32)

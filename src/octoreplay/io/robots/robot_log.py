@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from types import TracebackType
@@ -31,7 +31,7 @@ from octoreplay.io.robots.pose_source import PoseSource
 from octoreplay.io.robots.stamp_check import StampCheck
 from octoreplay.io.robots.thinning import Thinning
 from octoreplay.io.sensors.labels import LabelLookup
-from octoreplay.records import BodyBox, ClassTable, CloudFrame, Float64Array, Frame, FrameCounts
+from octoreplay.records import BodyBox, ClassTable, Float64Array, Frame, FrameCounts
 from octoreplay.transforms import transform_of
 
 # Largest delay between the stamp of a message or pose and its log time.
@@ -40,7 +40,6 @@ _LOG_DELAY_NS = 10_000_000_000
 _NUM_FIRST = 8
 # Number of messages between two removals of poses that are not needed any more.
 _FORGET_EVERY = 64
-_NO_POINTS = np.zeros((0, 3), np.float32)
 _STAMPED_KINDS = (Kind.IMAGE, Kind.COMPRESSED_IMAGE, Kind.CLOUD, Kind.SCAN)
 
 
@@ -53,8 +52,6 @@ class RobotLog:
       the sensor's stream is ``reorder_window`` further. A message with a damaged stamp (``StampCheck``) is undecodable.
     - Poses: they are in the team's frame. A sensor that is further than ``reach`` [m] from the team's origin along an
       axis has no pose.
-    - ``elsewhere`` has the sensor's poses at the stamps of frames without a ray in the mapped region. These frames are
-      not decoded; they are given without points.
     - Open ``logs`` of the robot are used as they are and stay open.
     - ``depth_maker`` and ``cloud_maker`` make the decoder of the sensor's messages.
 
@@ -70,7 +67,6 @@ class RobotLog:
         *,
         reach: float = math.inf,
         logs: Sequence[LogReader] | None = None,
-        elsewhere: Mapping[int, Float64Array] | None = None,
         depth_maker: Callable[[RobotConfig, LabelLookup | None, RawMessage | None], FrameMaker] = DepthFrameMaker,
         cloud_maker: Callable[[RobotConfig, LabelLookup | None], FrameMaker] = CloudFrameMaker,
     ) -> None:
@@ -78,7 +74,6 @@ class RobotLog:
         self.counts = FrameCounts()
         self._time = time
         self._reach = reach
-        self._elsewhere = elsewhere or {}
         self._num_out_of_reach = 0
         self._depth_maker, self._cloud_maker = depth_maker, cloud_maker
         self._use_log_time = time.clock == "log"
@@ -403,9 +398,6 @@ class RobotLog:
             return "no_label"
         if settled.T_map_sensor is None:
             return "no_pose"
-        stamp_ns = settled.stamp_ns + self._offset_ns
-        if (T_team_sensor := self._elsewhere.get(stamp_ns)) is not None:
-            return CloudFrame(self.robot_id, stamp_ns, _NO_POINTS, None, T_team_sensor)
         T_team_sensor = self.T_team_map @ settled.T_map_sensor
         boxes = self._own_boxes(poses, settled.stamp_ns, T_team_sensor)
         if boxes is None:
@@ -415,7 +407,7 @@ class RobotLog:
             self._num_out_of_reach += 1
             return "no_pose"
         try:
-            frame = self._maker.make(settled, stamp_ns, T_team_sensor, boxes)
+            frame = self._maker.make(settled, settled.stamp_ns + self._offset_ns, T_team_sensor, boxes)
         except DamagedMessageError:
             return "undecodable"
         return "no_label" if frame is None else frame

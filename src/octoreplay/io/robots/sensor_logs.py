@@ -7,6 +7,7 @@ import heapq
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from operator import attrgetter
 from types import TracebackType
 from typing import Self
@@ -20,12 +21,28 @@ from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import ClassTable, Float64Array, Frame, FrameCounts
 
 
+@dataclass(frozen=True)
+class SensorCounts:
+    """Numbers of one robot's messages: ``sensors`` of each sensor, and ``used`` of the used messages of all sensors."""
+
+    sensors: tuple[FrameCounts, ...]
+    used: FrameCounts
+
+    def total(self, num_off: Mapping[int, int]) -> FrameCounts:
+        """Return the numbers of all sensors, with frames left out because the robot was off, by index of the sensor."""
+        found = list(self.sensors)
+        for index, number in num_off.items():
+            messages = {topic: dict(numbers) for topic, numbers in found[index].messages.items()}
+            found[index] = dataclasses.replace(found[index], messages=messages)
+            found[index].leave_out(number)
+        return found[0] if len(found) == 1 else _sum_of(found, self.used)
+
+
 class SensorLogs:
     """Frames of one robot, read lazily, a ``RobotLog`` for each of its sensors; a context manager.
 
     The frames of several sensors are merged in the order of their stamps, equal stamps in the order of the sensors. The
-    poses are those of the first sensor. Arguments and errors are those of ``RobotLog``; ``elsewhere`` has an entry for
-    each sensor, or none.
+    poses are those of the first sensor. Arguments and errors are those of ``RobotLog``.
     """
 
     def __init__(
@@ -36,7 +53,6 @@ class SensorLogs:
         *,
         reach: float = math.inf,
         logs: Sequence[LogReader] | None = None,
-        elsewhere: Sequence[Mapping[int, Float64Array]] = (),
     ) -> None:
         self.robot = robot
         self._used = FrameCounts()
@@ -44,10 +60,7 @@ class SensorLogs:
         with ExitStack() as stack:
             if logs is None:
                 logs = [stack.enter_context(open_log(path)) for path in robot.logs]
-            self._sensors = tuple(
-                RobotLog(view, time, class_table, reach=reach, logs=logs, elsewhere=elsewhere[n] if elsewhere else None)
-                for n, view in enumerate(robot.views)
-            )
+            self._sensors = tuple(RobotLog(view, time, class_table, reach=reach, logs=logs) for view in robot.views)
             self._closing = stack.pop_all()
         self.first_stamp_ns = min(sensor.first_stamp_ns for sensor in self._sensors)
         """First stamp of any sensor, clock offset applied."""
@@ -89,13 +102,12 @@ class SensorLogs:
     @property
     def counts(self) -> FrameCounts:
         """Numbers of the messages of all sensors by outcome."""
-        found = [log.counts for log in self._sensors]
-        for index, num_off in self._num_off.items():
-            found[index] = dataclasses.replace(
-                found[index], messages={t: dict(n) for t, n in found[index].messages.items()}
-            )
-            found[index].leave_out(num_off)
-        return found[0] if len(found) == 1 else _sum_of(found, self._used)
+        return self.sensor_counts.total(self._num_off)
+
+    @property
+    def sensor_counts(self) -> SensorCounts:
+        """Numbers of the messages of each sensor by outcome."""
+        return SensorCounts(tuple(log.counts for log in self._sensors), self._used)
 
     def leave_out(self, num_off: Mapping[int, int]) -> None:
         """Count frames as left out because the robot was off, by the index of the sensor; call it after the replay."""

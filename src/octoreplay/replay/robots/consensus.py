@@ -12,12 +12,13 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Flows, Step, Update, gamma_at, team_step
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import ScanCaster
-from octoreplay.records import Float64Array, Frame
+from octoreplay.records import Float64Array
 from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.exchange.public_map import PublicMap
 from octoreplay.replay.robots.anchor import Anchor
 from octoreplay.replay.robots.robot import Arrival, Phase, Robot, Team, Turn
+from octoreplay.replay.timeline import Scan
 
 
 class ConsensusRobot(Robot):
@@ -36,7 +37,7 @@ class ConsensusRobot(Robot):
         self._receivers: frozenset[int] = frozenset()
         self._anchor = Anchor(config)
 
-    def integrate(self, frames: Iterable[Frame], caster: ScanCaster, tick: int) -> None:
+    def integrate(self, frames: Iterable[Scan], caster: ScanCaster, tick: int) -> None:
         """Add the scans of one tick to the evidence, and to the map for rules that do so before they publish."""
         super().integrate(frames, caster, tick)
         if not self._rule.adds_evidence_first or self._scan_tick < tick:

@@ -16,6 +16,7 @@ from octoreplay.mapping.consensus import Evidence, Step, Update, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
+    CastFrame,
     ScanCaster,
     add_scan,
     clamped_increments,
@@ -24,10 +25,11 @@ from octoreplay.mapping.sensor import (
 from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.mapping.stream_size import StreamMeter, StreamPart
 from octoreplay.mapping.streams import StreamSize
-from octoreplay.records import Float64Array, Frame, Int64Array
+from octoreplay.records import Float64Array, Int64Array
 from octoreplay.replay.exchange.messages import Acknowledgement, HeldMap, MapMessage, Receipt, Source
 from octoreplay.replay.exchange.neighbours import Exchange
 from octoreplay.replay.exchange.packet_codec import PacketCodec
+from octoreplay.replay.timeline import Scan
 
 
 class Arrival(NamedTuple):
@@ -195,11 +197,11 @@ class Robot(ABC):
 
     # --- scans --------------------------------------------------------------------------------------------------------
 
-    def integrate(self, frames: Iterable[Frame], caster: ScanCaster, tick: int) -> None:
+    def integrate(self, frames: Iterable[Scan], caster: ScanCaster, tick: int) -> None:
         """Add the scans of one tick to the evidence."""
         before = self._last_evidence if self._keeps_last and not self._is_average else None
         for frame in frames:
-            cells = caster.cast(frame)
+            cells = frame.cells if isinstance(frame, CastFrame) else caster.cast(frame)
             add_scan(self._own_sum, cells, self._increments, tick, before)
             if self._scan_counts is not None:
                 add_scan(self._scan_counts, cells, COUNT_SCANS, tick)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +12,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.sensor import MapConfig
 from octoreplay.errors import ConfigError
 from octoreplay.mapping.octree import KEY_OFFSET
-from octoreplay.records import Float64Array
-from octoreplay.study.tiles.survey import touching
+from octoreplay.records import Int64Array
 
 LEAST_CELLS = 32
 """Least edge of a tile [cells]: twice that of the nodes whose sizes are counted apart."""
@@ -63,28 +61,12 @@ def tile_cells(edge: float, resolution: float) -> int:
     return min(int(num_cells), 2 * KEY_OFFSET)
 
 
-def tiles_of(boxes: Float64Array, num_cells: int, config: ResolvedRun) -> tuple[Tile, ...]:
-    """Return the tiles that rays in the boxes (F, 6) [m] may touch, within the run's bounds, by x and then y.
+def tiles_of(columns: Int64Array, column_cells: int, num_cells: int) -> tuple[Tile, ...]:
+    """Return the tiles with an edge of ``num_cells`` that hold the columns (n, 2), by x and then y.
 
-    Raises ConfigError for more than MAX_TILES.
+    ``column_cells`` is the edge of the columns; edges are in cells. Raises ConfigError for more than MAX_TILES.
     """
-    edge = num_cells * config.map.resolution
-    low = np.maximum(boxes[:, :2].min(axis=0, initial=np.inf), config.map.box[:2])
-    high = np.minimum(boxes[:, 3:5].max(axis=0, initial=-np.inf), config.map.box[3:5])
-    if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
-        return ()
-    first, last = np.floor(low / edge).astype(int), np.floor(high / edge).astype(int)
-    if np.prod(last - first + 1) > MAX_TILES:
-        raise ConfigError(f"tiles: an edge of {edge:g} m gives more than {MAX_TILES:,} tiles; give a larger one")
-    return tuple(_touched(first.tolist(), last.tolist(), num_cells, boxes, config))
-
-
-def _touched(
-    first: list[int], last: list[int], num_cells: int, boxes: Float64Array, config: ResolvedRun
-) -> Iterator[Tile]:
-    """Tiles of a rectangle that rays may touch."""
-    for x in range(first[0], last[0] + 1):
-        for y in range(first[1], last[1] + 1):
-            tile = Tile(x, y, num_cells)
-            if touching(boxes, tile.bounds(config.map)).any():
-                yield tile
+    places = np.unique(columns // (num_cells // column_cells), axis=0)
+    if len(places) > MAX_TILES:
+        raise ConfigError(f"tiles: the maps have {len(places):,} tiles, more than {MAX_TILES:,}; give a larger edge")
+    return tuple(Tile(x, y, num_cells) for x, y in places.tolist())

@@ -15,6 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from octoreplay import interrupts
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
@@ -29,10 +31,11 @@ from octoreplay.replay.run import check_num_ticks, frame_causes
 from octoreplay.replay.team_recorder import TeamRecorder
 from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
+from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
-from octoreplay.study.tiles.survey import Survey
+from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index
 from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
 from octoreplay.study.tiles.worker import Request, Setup, Workers
 
@@ -43,7 +46,7 @@ _OTHER_FILES = 64
 """Open files of a process besides those of tiles."""
 
 Progress = Callable[[str, int, int], None]
-"""Function that is called with a stage, and the numbers of finished tiles or ticks and of all."""
+"""Function that is called with a stage, and the numbers of finished robots, tiles or ticks and of all."""
 
 
 def replay_tiles(
@@ -72,7 +75,8 @@ def replay_tiles(
     num_threads : int, optional
         Threads of each process; by default the processors are shared among the processes.
     progress : function, optional
-        Called with the stage ('replay', 'settle' or 'write'), and the numbers of finished tiles or ticks and of all.
+        Called with the stage ('cast', 'replay', 'settle' or 'write'), and the numbers of finished robots, tiles or
+        ticks and of all.
     restart, resume : bool
         Remove, or use, the tiles that an interrupted run has finished. Without either they are an error.
 
@@ -99,18 +103,13 @@ def replay_tiles(
         stack.enter_context(second_compiler())
         writer = stack.enter_context(ResultWriter(output, config, restart=restart or resume))
         folder = stack.enter_context(_work_folder(writer, num_cells, restart=restart, resume=resume))
-        survey = Survey(config)
-        if not len(survey.boxes):
-            raise InputError(f"no robot has a frame that can be used: {frame_causes(survey.counts(), config.time)}")
-        tiles = tiles_of(survey.boxes, num_cells, config)
-        if not tiles:
-            raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
-        _allow_open_files(len(tiles))
-        survey.save(folder)
         workers = stack.enter_context(Workers(Setup(config, folder, num_threads), num_jobs))
+        scans = _cast_scans(config, workers, folder, num_cells, num_threads, progress)
+        tiles = _tiles(config, scans, num_cells)
+        _allow_open_files(len(tiles))
         stages = _replay_logs(tiles, workers, folder, progress)
         stages = _settle(tiles, stages, workers, progress)
-        counts = survey.counts(next(iter(stages.values())).num_frames_off)
+        counts = _counts(config, scans, next(iter(stages.values())).num_frames_off)
         with interrupts.deferred() as deliver_interrupts:
             summary = _write(config, writer, tiles, stages, folder, counts, num_threads, progress, deliver_interrupts)
             summary = dataclasses.replace(summary, wall_seconds=time.monotonic() - started)
@@ -175,8 +174,8 @@ def _work_folder(writer: ResultWriter, num_cells: int, *, restart: bool, resume:
     try:
         yield folder
     except BaseException as error:
-        if any(folder.glob("tile_*.json")):
-            error.add_note(f"the finished tiles are in {folder}; --resume continues the run")
+        if any(folder.glob("robot_*.index")):
+            error.add_note(f"the finished parts are in {folder}; --resume continues the run")
         elif not continues:
             shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -196,6 +195,44 @@ def _check_same(writer: ResultWriter, path: Path, description: Mapping[str, Mapp
             " --restart to start from the beginning"
         )
     writer.check_same(earlier)
+
+
+def _cast_scans(
+    config: ResolvedRun, workers: Workers, folder: Path, column_cells: int, num_threads: int, progress: Progress | None
+) -> list[ScanIndex]:
+    """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
+    start_ns, groups = team_start_ns(config), cast_groups(config, folder, num_threads)
+    names = [", ".join(config.robots[index].robot_id for index in group) for group in groups]
+    requests = [
+        Request(name, cast_scans, (group, start_ns, column_cells)) for name, group in zip(names, groups, strict=True)
+    ]
+    num_done = len(config.robots) - sum(map(len, groups))
+    for num_robots in workers.answers(requests):
+        num_done += num_robots
+        if progress is not None:
+            progress("cast", num_done, len(config.robots))
+    return [load_index(ScanFiles(folder, index).index) for index in range(len(config.robots))]
+
+
+def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> tuple[Tile, ...]:
+    """Tiles that the scans touch. Raises InputError without any."""
+    if not sum(index.stamps.size for index in scans):
+        causes = frame_causes(_counts(config, scans, [{}] * len(scans)), config.time)
+        raise InputError(f"no robot has a frame that can be used: {causes}")
+    tiles = tiles_of(np.concatenate([index.columns for index in scans]), scans[0].column_cells, num_cells)
+    if not tiles:
+        raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
+    return tiles
+
+
+def _counts(
+    config: ResolvedRun, scans: Sequence[ScanIndex], num_frames_off: Sequence[Mapping[int, int]]
+) -> dict[str, FrameCounts]:
+    """Counts of each robot's messages by robot_id; ``num_frames_off`` were left out because the robot was off."""
+    return {
+        robot.robot_id: index.counts.total(num_off)
+        for robot, index, num_off in zip(config.robots, scans, num_frames_off, strict=True)
+    }
 
 
 def _replay_logs(tiles: Sequence[Tile], workers: Workers, folder: Path, progress: Progress | None) -> dict[Tile, Stage]:

@@ -15,17 +15,15 @@ import numpy as np
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.errors import InputError
 from octoreplay.io.output_file import write_whole
-from octoreplay.io.robots.team_bodies import TeamBodies
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL
 from octoreplay.replay.checkpoint import load_state, save_state
 from octoreplay.replay.map_recorder import map_periods
 from octoreplay.replay.session import Session
-from octoreplay.replay.sources import TeamSources
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.survey import load_frames
+from octoreplay.study.tiles.scans import ScanFile, ScanFiles
 from octoreplay.study.tiles.work import StoredMap, TileTick, WorkFile
 from octoreplay.study.tiles.worker import Setup
 
@@ -99,16 +97,15 @@ class TileRun:
         self._files = TileFiles(folder, tile)
 
     def replay_logs(self, num_threads: int) -> Stage:
-        """Replay the logs up to their end. Raises ConfigError, InputError and OutputError."""
+        """Replay all scans. Raises ConfigError, InputError and OutputError."""
         config = self._config
-        robots = zip(load_frames(self._folder), config.robots, strict=True)
-        elsewhere = [frames.elsewhere(config.map.bounds, len(robot.views)) for frames, robot in robots]
         with ExitStack() as stack:
-            team = stack.enter_context(TeamSources(config, elsewhere))
-            hides = config.sensor.hide_robots
-            bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
+            sources = [
+                stack.enter_context(ScanFile(ScanFiles(self._folder, index), robot.robot_id, self._tile))
+                for index, robot in enumerate(config.robots)
+            ]
             threads = stack.enter_context(ThreadPoolExecutor(num_threads))
-            session = Session(config, team.sources, threads, bodies=bodies, tile_cells=self._tile.num_cells)
+            session = Session(config, sources, threads, tile_cells=self._tile.num_cells)
             with _TileRecorder(config, self._files) as recorder:
                 for tick in session.log_ticks():
                     recorder.record(tick)
