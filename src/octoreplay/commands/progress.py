@@ -24,7 +24,7 @@ def replay_with_bar(config: RunConfig, output: Path, **options: Any) -> RunSumma
         return replay_team(config, output, progress=show, **options)
 
 
-def replay_tiles_with_bar(config: RunConfig, output: Path, edge: float, **options: Any) -> RunSummary:
+def replay_tiles_with_bar(config: RunConfig, output: Path, edge: float | None, **options: Any) -> RunSummary:
     """Replay in tiles with a progress bar for each stage; ``options`` are those of ``replay_tiles``."""
     from octoreplay.study.tiles.run import replay_tiles
 

@@ -48,6 +48,14 @@ _BEFORE = "before"
 _ALIGN_VALUES = (_BEFORE, ON_AIR, "off")
 
 
+_AUTO = "auto"
+
+
+def _parse_edge(ctx: click.Context, param: click.Parameter, value: Any) -> float | str | None:
+    """Return the edge of tiles [m], or 'auto'. Raises BadParameter."""
+    return value if value in (None, _AUTO) else float(click.FLOAT.convert(value, param, ctx))
+
+
 class _RunCommand(SectionedCommand):
     """Command whose option ``--align`` may stand without a value."""
 
@@ -94,9 +102,10 @@ def _check_input(word: str) -> None:
 @click.option("--checkpoint-every", cls=RareOption, type=click.FloatRange(min=0.0), metavar="SECONDS",
               help="least time between check points, 0 for none  [default: at most 3 % of the run's time]")  # fmt: skip
 @click.option("--memory-limit", cls=RareOption, callback=parse_size, metavar="SIZE",
-              help="end the run above this memory, such as 8GB; --resume continues it")  # fmt: skip
-@click.option("--tiles", cls=RareOption, type=float, metavar="METRES",
-              help="replay tiles of the space with this edge one after the other; the maps are the same")  # fmt: skip
+              help="largest memory, such as 8GB: a run that takes more is replayed in tiles")  # fmt: skip
+@click.option("--tiles", cls=RareOption, callback=_parse_edge, metavar="[METRES|auto]",
+              help="replay tiles of the space with this edge one after the other; the maps are the same; auto: the"
+              " largest tiles that fit into the memory")  # fmt: skip
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
@@ -120,7 +129,7 @@ def _check_input(word: str) -> None:
 @prints
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
-    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None,
+    checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, jobs: int | None,
     report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
@@ -140,8 +149,8 @@ def run(
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
     if tiles is None and jobs is not None:
         raise click.UsageError("--jobs needs --tiles")
-    if tiles is not None and (checkpoint_every is not None or memory_limit is not None):
-        raise click.UsageError("--checkpoint-every and --memory-limit are for runs without --tiles")
+    if tiles is not None and checkpoint_every is not None:
+        raise click.UsageError("--checkpoint-every is for runs without --tiles")
     if output is not None:
         _check_result(output, config_from, resume=resume, restart=restart)
     if report is not None:
@@ -179,8 +188,13 @@ def run(
         here.give(team_file=save_team)
     if output is None:
         return 0
+    if tiles is None and memory_limit is not None and _takes_more(config, output, memory_limit, resume=resume):
+        tiles = _AUTO
     if tiles is not None:
-        summary = replay_tiles_with_bar(config, output, tiles, num_jobs=jobs or 1, restart=restart, resume=resume)
+        summary = replay_tiles_with_bar(
+            config, output, None if tiles == _AUTO else float(tiles), num_jobs=jobs or 1, memory_limit=memory_limit,
+            restart=restart, resume=resume,
+        )  # fmt: skip
     else:
         summary = replay_with_bar(
             config, output, restart=restart, resume=resume, checkpoint_every=checkpoint_every, memory_limit=memory_limit
@@ -211,6 +225,24 @@ def _check_result(output: Path, config_from: Path | None, *, resume: bool, resta
         return
     if not continues and config_from is not None and config_from.resolve() == partial_path(output).resolve():
         raise OutputError(f"{config_from}: this run would remove this result of --config-from; name another output")
+
+
+def _takes_more(config: ResolvedRun, output: Path, memory_limit: int, *, resume: bool) -> bool:
+    """Return True for a run that can be replayed in tiles and that takes more memory than a limit without them."""
+    from octoreplay.replay.checkpoint import can_resume
+    from octoreplay.study.tiles.forecast import whole_memory
+    from octoreplay.study.tiles.run import can_resume_tiles, check_separable
+
+    if resume and (can_resume_tiles(output) or can_resume(output)):
+        return can_resume_tiles(output)
+    try:
+        check_separable(config)
+    except ConfigError:
+        return False
+    memory = whole_memory(config)
+    if memory > memory_limit:
+        terminal().line(f"the run takes about {memory / 1e9:.2g} GB and is replayed in tiles")
+    return memory > memory_limit
 
 
 def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:

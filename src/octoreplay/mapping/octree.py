@@ -317,6 +317,11 @@ def codes_to_keys(codes: Int64Array) -> Int64Array:
     return keys
 
 
+def brick_keys(codes: Int64Array) -> Int64Array:
+    """Return the keys (n, 3) of the lowest cells of bricks with the Morton ``codes`` (n,)."""
+    return codes_to_keys(codes << storage.CELL_BITS)
+
+
 def _grown(array: npt.NDArray[Any], used: int, wanted: int) -> npt.NDArray[Any]:
     """Copy the first ``used`` rows into an array of at least ``wanted`` rows; unused rows take no physical memory."""
     larger = cache_aligned((max(wanted, 2 * array.shape[0], 64), *array.shape[1:]), array.dtype)

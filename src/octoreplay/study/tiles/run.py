@@ -21,7 +21,7 @@ from octoreplay import interrupts
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
-from octoreplay.errors import ConfigError, InputError, OutputError
+from octoreplay.errors import ConfigError, InputError, MemoryLimitError, OutputError
 from octoreplay.io.output_file import write_whole, writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
@@ -32,6 +32,7 @@ from octoreplay.replay.team_recorder import TeamRecorder
 from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
+from octoreplay.study.tiles.forecast import COLUMN_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
@@ -42,6 +43,10 @@ from octoreplay.study.tiles.worker import Request, Setup, Workers
 _log = logging.getLogger(__name__)
 
 _DESCRIPTION = "run.json"
+_EDGE = "edge"
+"""File with the edge of the tiles in a work folder [cell]."""
+_RETRY_SHARE = 0.7
+"""Share of the forecast that was too low, into which the tiles of the next try must fit."""
 _OTHER_FILES = 64
 """Open files of a process besides those of tiles."""
 
@@ -52,10 +57,11 @@ Progress = Callable[[str, int, int], None]
 def replay_tiles(
     config: RunConfig,
     output: FilePath,
-    edge: float,
+    edge: float | None = None,
     *,
     num_jobs: int = 1,
     num_threads: int | None = None,
+    memory_limit: int | None = None,
     progress: Progress | None = None,
     restart: bool = False,
     resume: bool = False,
@@ -68,12 +74,15 @@ def replay_tiles(
         Configuration of the run.
     output : path
         Result to write.
-    edge : float
-        Edge of the tiles along x and y [m], rounded to a power of two of cells. Tiles have all heights.
+    edge : float, optional
+        Edge of the tiles along x and y [m], rounded to a power of two of cells. Tiles have all heights. By default the
+        tiles are the largest ones that fit into the memory by a forecast; where it was too low they are halved.
     num_jobs : int
         Number of tiles that are replayed at the same time, each in a process of its own.
     num_threads : int, optional
         Threads of each process; by default the processors are shared among the processes.
+    memory_limit : int, optional
+        Largest memory of all processes together [byte], by default 80 % of what is free.
     progress : function, optional
         Called with the stage ('cast', 'replay', 'settle' or 'write'), and the numbers of finished robots, tiles or
         ticks and of all.
@@ -89,26 +98,27 @@ def replay_tiles(
     Raises
     ------
     ConfigError
-        The tiles are too small, or the configuration has what tiles cannot give: see ``check_separable``.
+        The tiles are too small or too large, or the configuration has what tiles cannot give: see
+        ``check_separable``.
+    MemoryLimitError
+        A tile takes more memory than the limit leaves for it.
     InputError, OutputError
         As ``replay_team``; the tiles that are finished stay in the folder ``OUT.tiles`` beside the output.
     """
     started, output = time.monotonic(), Path(output)
     config = resolve(config)
-    num_cells = tile_cells(edge, config.map.resolution)
+    given_cells = None if edge is None else tile_cells(edge, config.map.resolution)
     check_separable(config)
     check_num_ticks(config, config.total_ns)
     num_threads = num_threads or max(1, (os.cpu_count() or 1) // num_jobs)
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
         writer = stack.enter_context(ResultWriter(output, config, restart=restart or resume))
-        folder = stack.enter_context(_work_folder(writer, num_cells, restart=restart, resume=resume))
-        workers = stack.enter_context(Workers(Setup(config, folder, num_threads), num_jobs))
-        scans = _cast_scans(config, workers, folder, num_cells, num_threads, progress)
-        tiles = _tiles(config, scans, num_cells)
-        _allow_open_files(len(tiles))
-        stages = _replay_logs(tiles, workers, folder, progress)
-        stages = _settle(tiles, stages, workers, progress)
+        folder = stack.enter_context(_work_folder(writer, given_cells, restart=restart, resume=resume))
+        setup = Setup(config, folder, num_threads)
+        scans = _cast_scans(setup, num_jobs, given_cells or COLUMN_CELLS, progress)
+        stages = _replay_all(setup, scans, given_cells, memory_limit, num_jobs, progress)
+        tiles = tuple(stages)
         counts = _counts(config, scans, next(iter(stages.values())).num_frames_off)
         with interrupts.deferred() as deliver_interrupts:
             summary = _write(config, writer, tiles, stages, folder, counts, num_threads, progress, deliver_interrupts)
@@ -149,14 +159,24 @@ def _allow_open_files(num_tiles: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+def can_resume_tiles(output: Path) -> bool:
+    """Return True where an interrupted run in tiles left its work folder."""
+    return (_folder_of(output) / _DESCRIPTION).exists()
+
+
+def _folder_of(output: Path) -> Path:
+    """Work folder of a result."""
+    return output.with_name(f"{output.stem}.tiles")
+
+
 @contextmanager
-def _work_folder(writer: ResultWriter, num_cells: int, *, restart: bool, resume: bool) -> Iterator[Path]:
+def _work_folder(writer: ResultWriter, num_cells: int | None, *, restart: bool, resume: bool) -> Iterator[Path]:
     """Folder of the work files; after an error it is kept if a tile is finished, and a note of the error names it.
 
     Raises OutputError, InputError and ConfigError where an earlier run left a folder that cannot be used.
     """
-    folder = writer.path.with_name(f"{writer.path.stem}.tiles")
-    description = {**writer.description, "tiles": {"cells": str(num_cells)}}
+    folder = _folder_of(writer.path)
+    description = {**writer.description, "tiles": {"cells": str(num_cells or "auto")}}
     with writing(folder):
         if folder.exists() and not (restart or resume):
             raise OutputError(
@@ -197,21 +217,64 @@ def _check_same(writer: ResultWriter, path: Path, description: Mapping[str, Mapp
     writer.check_same(earlier)
 
 
-def _cast_scans(
-    config: ResolvedRun, workers: Workers, folder: Path, column_cells: int, num_threads: int, progress: Progress | None
-) -> list[ScanIndex]:
+def _cast_scans(setup: Setup, num_jobs: int, column_cells: int, progress: Progress | None) -> list[ScanIndex]:
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
-    start_ns, groups = team_start_ns(config), cast_groups(config, folder, num_threads)
+    config, folder = setup.config, setup.folder
+    start_ns, groups = team_start_ns(config), cast_groups(config, folder, setup.num_threads)
     names = [", ".join(config.robots[index].robot_id for index in group) for group in groups]
     requests = [
         Request(name, cast_scans, (group, start_ns, column_cells)) for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
-    for num_robots in workers.answers(requests):
-        num_done += num_robots
-        if progress is not None:
-            progress("cast", num_done, len(config.robots))
-    return [load_index(ScanFiles(folder, index).index) for index in range(len(config.robots))]
+    with Workers(setup, num_jobs) as workers:
+        for num_robots in workers.answers(requests):
+            num_done += num_robots
+            if progress is not None:
+                progress("cast", num_done, len(config.robots))
+    paths = [ScanFiles(folder, index).index for index in range(len(config.robots))]
+    scans = [load_index(path) for path in paths]
+    if not sum(index.frames.size for index in scans):
+        # They are of no use to a run that continues this one.
+        with writing(folder):
+            for path in paths:
+                path.unlink()
+    return scans
+
+
+def _replay_all(
+    setup: Setup, scans: Sequence[ScanIndex], given_cells: int | None, memory_limit: int | None, num_jobs: int,
+    progress: Progress | None,
+) -> dict[Tile, Stage]:  # fmt: skip
+    """Replay all tiles up to their last tick, with a given edge or with the largest one that fits into the memory."""
+    room = math.inf
+    if given_cells is None or memory_limit is not None:
+        setup = dataclasses.replace(setup, memory_limit=worker_memory(memory_limit or available_memory(), num_jobs))
+        assert setup.memory_limit is not None
+        room = setup.memory_limit
+    while True:
+        num_cells = given_cells or chosen_cells(setup.config, scans, room)
+        tiles = _tiles(setup.config, scans, num_cells)
+        _allow_open_files(len(tiles))
+        _keep_tiles_of(setup.folder, num_cells)
+        try:
+            with Workers(setup, num_jobs) as workers:
+                stages = _replay_logs(tiles, workers, setup.folder, progress)
+                return _settle(tiles, stages, workers, progress)
+        except MemoryLimitError as error:
+            if given_cells is not None:
+                raise
+            _log.info("%s; the run goes on with smaller tiles", str(error).partition(";")[0])
+            room = _RETRY_SHARE * tile_memory(setup.config, scans, num_cells)
+
+
+def _keep_tiles_of(folder: Path, num_cells: int) -> None:
+    """Remove the work files of tiles with another edge."""
+    path, text = folder / _EDGE, str(num_cells)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        with writing(folder):
+            for tile in folder.glob("tile_*"):
+                tile.unlink()
+        write_whole(path, text)
 
 
 def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> tuple[Tile, ...]:

@@ -19,8 +19,7 @@ import zstandard
 from octoreplay.errors import InputError
 from octoreplay.io.output_file import write_whole, writing
 from octoreplay.io.robots.sensor_logs import SensorCounts
-from octoreplay.mapping.kernels.storage import CELL_BITS, KEY_BITS
-from octoreplay.mapping.octree import codes_to_keys
+from octoreplay.mapping.octree import KEY_BITS, brick_keys
 from octoreplay.mapping.sensor import CastFrame, TouchedCells
 from octoreplay.records import BoolArray, Float64Array, Frame, Int64Array
 from octoreplay.replay.checkpoint import pickled, unpickled
@@ -125,8 +124,8 @@ class ScanWriter:
         number = len(self._frames)
         self._frames.append((frame.stamp_ns, frame.sensor_index))
         self._poses.append(np.array(frame.T_team_sensor))
-        self._sample.add(cells.codes[_is_sampled(cells.codes)])
-        columns = codes_to_keys(cells.codes << CELL_BITS)[:, :2] >> self._column_bits
+        self._sample.add(cells.codes[is_sampled(cells.codes)])
+        columns = brick_keys(cells.codes)[:, :2] >> self._column_bits
         ids = (columns[:, 0] << KEY_BITS) + columns[:, 1]
         order = np.argsort(ids, kind="stable")
         firsts = np.flatnonzero(np.diff(ids[order], prepend=np.iinfo(np.int64).min))
@@ -245,6 +244,6 @@ class _Distinct:
         self._added, self._num_added = [], 0
 
 
-def _is_sampled(codes: Int64Array) -> BoolArray:
+def is_sampled(codes: Int64Array) -> BoolArray:
     """Return True (n,) for one of SAMPLE codes, alike for all robots and scans."""
     return np.asarray((codes.view(np.uint64) * _HASH >> _HASH_BITS) % np.uint64(SAMPLE) == 0)

@@ -13,13 +13,14 @@ from typing import Any, Self
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.errors import InputError
+from octoreplay.errors import InputError, MemoryLimitError
 from octoreplay.io.output_file import write_whole
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL
 from octoreplay.replay.checkpoint import load_state, save_state
 from octoreplay.replay.map_recorder import map_periods
+from octoreplay.replay.memory import resident_bytes
 from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
@@ -87,39 +88,37 @@ class TileFiles:
 class TileRun:
     """Replay of one tile in its own process.
 
-    ``config`` is the configuration of the whole run, ``folder`` that of the work files.
+    Both methods raise ConfigError, InputError and OutputError, and MemoryLimitError above the limit of a worker.
     """
 
-    def __init__(self, config: ResolvedRun, tile: Tile, folder: Path) -> None:
-        self._config = tile.config(config)
+    def __init__(self, setup: Setup, tile: Tile) -> None:
+        self._setup = setup
+        self._config = tile.config(setup.config)
         self._tile = tile
-        self._folder = folder
-        self._files = TileFiles(folder, tile)
+        self._files = TileFiles(setup.folder, tile)
 
-    def replay_logs(self, num_threads: int) -> Stage:
-        """Replay all scans. Raises ConfigError, InputError and OutputError."""
+    def replay_logs(self) -> Stage:
+        """Replay all scans."""
         config = self._config
         with ExitStack() as stack:
             sources = [
-                stack.enter_context(ScanFile(ScanFiles(self._folder, index), robot.robot_id, self._tile))
+                stack.enter_context(ScanFile(ScanFiles(self._setup.folder, index), robot.robot_id, self._tile))
                 for index, robot in enumerate(config.robots)
             ]
-            threads = stack.enter_context(ThreadPoolExecutor(num_threads))
+            threads = stack.enter_context(ThreadPoolExecutor(self._setup.num_threads))
             session = Session(config, sources, threads, tile_cells=self._tile.num_cells)
             with _TileRecorder(config, self._files) as recorder:
                 for tick in session.log_ticks():
                     recorder.record(tick)
+                    self._check_memory()
                 return self._pause(session, recorder, 0, session.largest_log_odds)
 
-    def settle(self, largest: float, least_ticks: int, num_threads: int) -> Stage:
-        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles.
-
-        Raises InputError where the tile was not saved, and as ``replay_logs``.
-        """
+    def settle(self, largest: float, least_ticks: int) -> Stage:
+        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles."""
         stage = self._files.read_stage()
         if stage is None:
             raise InputError(f"{self._files.stage}: is missing, as after a kill while it was saved; give --resume")
-        with ThreadPoolExecutor(num_threads) as threads:
+        with ThreadPoolExecutor(self._setup.num_threads) as threads:
             session = Session(self._config, (), threads, tile_cells=self._tile.num_cells)
             content = load_state(self._files.state, session.shared)
             session.restore(content["session"])
@@ -128,7 +127,17 @@ class TileRun:
                 for tick in session.settling_ticks(largest, least_ticks):
                     num_settling += 1
                     recorder.record(tick)
+                    self._check_memory()
                 return self._pause(session, recorder, num_settling, stage.largest)
+
+    def _check_memory(self) -> None:
+        """Raise MemoryLimitError above the limit of a worker."""
+        limit, used = self._setup.memory_limit, resident_bytes()
+        if limit is not None and used > limit:
+            raise MemoryLimitError(
+                f"{self._tile.name}: takes {used / 1e9:.3g} GB, more than the {limit / 1e9:.3g} GB of a process;"
+                " continue with --resume and a larger --memory-limit, or give a smaller --tiles"
+            )
 
     def _pause(self, session: Session, recorder: _TileRecorder, num_settling: int, largest: float) -> Stage:
         """Save the state, from which the next stage continues, and the maps, in case that it is the last one."""
@@ -219,9 +228,9 @@ class _TileRecorder:
 
 def replay_logs(setup: Setup, tile: Tile) -> tuple[Tile, Stage]:
     """Replay the logs in one tile, as a request to a worker."""
-    return tile, TileRun(setup.config, tile, setup.folder).replay_logs(setup.num_threads)
+    return tile, TileRun(setup, tile).replay_logs()
 
 
 def settle(setup: Setup, tile: Tile, largest: float, least_ticks: int) -> tuple[Tile, Stage]:
     """Let one tile settle, as a request to a worker."""
-    return tile, TileRun(setup.config, tile, setup.folder).settle(largest, least_ticks, setup.num_threads)
+    return tile, TileRun(setup, tile).settle(largest, least_ticks)

@@ -29,11 +29,24 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Setup:
-    """Settings of a run for its workers: configuration, folder of the work files, threads of a worker."""
+    """Settings of a run for its workers.
+
+    Attributes
+    ----------
+    config : ResolvedRun
+        Configuration of the whole run.
+    folder : path
+        Folder of the work files.
+    num_threads : int
+        Threads of a worker.
+    memory_limit : int or None
+        Largest memory of a worker [byte].
+    """
 
     config: ResolvedRun
     folder: Path
     num_threads: int
+    memory_limit: int | None = None
 
 
 @dataclass(frozen=True)
