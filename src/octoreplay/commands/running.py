@@ -106,6 +106,7 @@ def _check_input(word: str) -> None:
 @click.option("--tiles", cls=RareOption, callback=_parse_edge, metavar="[METRES|auto]",
               help="replay tiles of the space with this edge one after the other; the maps are the same; auto: the"
               " largest tiles that fit into the memory")  # fmt: skip
+@click.option("--tiles-z", cls=RareOption, is_flag=True, help="cut the heights too: tiles are cubes")
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
@@ -129,8 +130,8 @@ def _check_input(word: str) -> None:
 @prints
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
-    checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, jobs: int | None,
-    report: Path | None, save_team: Path | None,
+    checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, tiles_z: bool,
+    jobs: int | None, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
@@ -147,8 +148,8 @@ def run(
         )
     if resume and restart:
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
-    if tiles is None and jobs is not None:
-        raise click.UsageError("--jobs needs --tiles")
+    if tiles is None and (jobs is not None or tiles_z):
+        raise click.UsageError("--jobs and --tiles-z need --tiles")
     if tiles is not None and checkpoint_every is not None:
         raise click.UsageError("--checkpoint-every is for runs without --tiles")
     if output is not None:
@@ -192,8 +193,8 @@ def run(
         tiles = _AUTO
     if tiles is not None:
         summary = replay_tiles_with_bar(
-            config, output, None if tiles == _AUTO else float(tiles), num_jobs=jobs or 1, memory_limit=memory_limit,
-            restart=restart, resume=resume,
+            config, output, None if tiles == _AUTO else float(tiles), cut_heights=tiles_z, num_jobs=jobs or 1,
+            memory_limit=memory_limit, restart=restart, resume=resume,
         )  # fmt: skip
     else:
         summary = replay_with_bar(
@@ -228,9 +229,9 @@ def _check_result(output: Path, config_from: Path | None, *, resume: bool, resta
 
 
 def _takes_more(config: ResolvedRun, output: Path, memory_limit: int, *, resume: bool) -> bool:
-    """Return True for a run that can be replayed in tiles and that takes more memory than a limit without them."""
+    """Return True for a run that takes more memory than a limit without tiles, and can be replayed in them."""
     from octoreplay.replay.checkpoint import can_resume
-    from octoreplay.study.tiles.forecast import whole_memory
+    from octoreplay.study.tiles.forecast import takes_tiles
     from octoreplay.study.tiles.run import can_resume_tiles, check_separable
 
     if resume and (can_resume_tiles(output) or can_resume(output)):
@@ -239,10 +240,7 @@ def _takes_more(config: ResolvedRun, output: Path, memory_limit: int, *, resume:
         check_separable(config)
     except ConfigError:
         return False
-    memory = whole_memory(config)
-    if memory > memory_limit:
-        terminal().line(f"the run takes about {memory / 1e9:.2g} GB and is replayed in tiles")
-    return memory > memory_limit
+    return takes_tiles(config, memory_limit)
 
 
 def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:

@@ -216,7 +216,7 @@ class EvidenceComparer:
     def _border_states(self, robot: int, rows: Int64Array, tile_cells: int) -> BorderStates:
         """States of one robot's bricks at the sides of the tile, of the bricks in some rows."""
         codes = self._bricks.codes[rows]
-        places = codes_to_keys(codes * BRICK_CELLS)[:, :2] % tile_cells
+        places = codes_to_keys(codes * BRICK_CELLS) % tile_cells
         at_side = np.flatnonzero(((places == 0) | (places == tile_cells - BRICK_EDGE)).any(axis=1))
         return BorderStates(robot, codes[at_side], self._latest[self._slots[rows[at_side], robot]])
 

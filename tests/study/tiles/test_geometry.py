@@ -23,11 +23,12 @@ def test_small_and_wrong_edges_are_refused(edge):
         tile_cells(edge, 0.2)
 
 
-def test_tiles_cover_the_columns():
+def test_tiles_cover_the_blocks():
     columns = np.array([[3, 0], [-1, 0], [-3, 1], [2, 0], [3, 0]])
-    assert tiles_of(columns, 32, 32) == tuple(Tile(x, y, 32) for x, y in ((-3, 1), (-1, 0), (2, 0), (3, 0)))
-    assert tiles_of(columns, 32, 128) == (Tile(-1, 0, 128), Tile(0, 0, 128))
-    assert tiles_of(np.zeros((0, 2), np.int64), 32, 32) == ()
+    assert tiles_of(columns, 1, 32) == tuple(Tile(x, y, 32) for x, y in ((-3, 1), (-1, 0), (2, 0), (3, 0)))
+    assert tiles_of(columns, 4, 128) == (Tile(-1, 0, 128), Tile(0, 0, 128))
+    assert tiles_of(np.array([[1, 0, -1], [0, 0, -2]]), 2, 64) == (Tile(0, 0, 64, -1),)
+    assert tiles_of(np.zeros((0, 2), np.int64), 1, 32) == ()
 
 
 def test_bounds_of_a_tile_lie_within_those_of_the_run():
@@ -41,7 +42,13 @@ def test_tiles_without_bounds_have_all_heights():
     assert (bounds[2], bounds[5]) == (-(2**18) * 0.1, 2**18 * 0.1)
 
 
+def test_a_cube_has_bounds_along_each_axis():
+    tile = Tile(1, -1, 32, -2)
+    assert tile.name == "tile_1_-1_-2"
+    assert tile.bounds(MapConfig(0.1)) == (3.2, -3.2, -6.4, 6.4, 0.0, -3.2)
+
+
 def test_too_many_tiles_are_refused():
     columns = np.column_stack([np.arange(100_001), np.zeros(100_001, np.int64)])
     with pytest.raises(ConfigError, match="100,001 tiles, more than 100,000; give a larger edge"):
-        tiles_of(columns, 32, 32)
+        tiles_of(columns, 1, 32)

@@ -12,7 +12,7 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.sensor_logs import SensorCounts
-from octoreplay.mapping.octree import codes_to_keys
+from octoreplay.mapping.octree import brick_keys
 from octoreplay.mapping.sensor import ScanCaster
 from octoreplay.records import CloudFrame, FrameCounts
 from octoreplay.replay.sources import TeamSources
@@ -34,14 +34,16 @@ def cells_of(cells):
 
 
 @given(
-    seed=st.integers(0, 99), num_frames=st.integers(0, 4), column_cells=st.sampled_from([32, 64]),
-    factor=st.sampled_from([1, 4]), is_weighted=st.booleans(),
+    seed=st.integers(0, 99), num_frames=st.integers(0, 4), block_cells=st.sampled_from([32, 64]),
+    factor=st.sampled_from([1, 4]), num_axes=st.sampled_from([2, 3]), is_weighted=st.booleans(),
 )  # fmt: skip
-def test_each_cell_comes_back_in_one_tile(tmp_path_factory, seed, num_frames, column_cells, factor, is_weighted):
+def test_each_cell_comes_back_in_one_tile(
+    tmp_path_factory, seed, num_frames, block_cells, factor, num_axes, is_weighted
+):
     random = np.random.default_rng(seed)
     files = ScanFiles(tmp_path_factory.mktemp("scans"), 0)
     written = []
-    with ScanWriter(files, column_cells) as writer:
+    with ScanWriter(files, block_cells, num_axes) as writer:
         for number in range(num_frames):
             pose = np.eye(4)
             pose[:3, 3] = random.uniform(-9, 9, 3)
@@ -55,14 +57,14 @@ def test_each_cell_comes_back_in_one_tile(tmp_path_factory, seed, num_frames, co
         writer.finish(COUNTS)
     index = load_index(files.index)
     found = [{} for _ in written]
-    tiles = tiles_of(index.columns, column_cells, column_cells * factor)
+    tiles = tiles_of(index.blocks, factor, block_cells * factor)
     for tile in tiles:
         with ScanFile(files, "r", tile) as scans:
             for (frame, _), cast, into in zip(written, scans.frames(), found, strict=True):
                 assert (cast.robot_id, cast.stamp_ns, cast.sensor_index) == ("r", frame.stamp_ns, frame.sensor_index)
                 np.testing.assert_array_equal(cast.T_team_sensor, frame.T_team_sensor)
-                keys = codes_to_keys(cast.cells.codes << 6)[:, :2]
-                assert (keys // tile.num_cells == (tile.x, tile.y)).all()
+                keys = brick_keys(cast.cells.codes)[:, :num_axes]
+                assert (keys // tile.num_cells == [tile.x, tile.y, tile.z][:num_axes]).all()
                 assert not into.keys() & cells_of(cast.cells).keys()
                 into.update(cells_of(cast.cells))
     if tiles:
@@ -77,7 +79,7 @@ def test_the_sample_is_alike_for_all_robots(tmp_path):
     cells = CASTER.cast(frame)
     samples = []
     for index in range(2):
-        with ScanWriter(ScanFiles(tmp_path, index), 32) as writer:
+        with ScanWriter(ScanFiles(tmp_path, index), 32, 2) as writer:
             for _ in range(index + 1):
                 writer.write(frame, cells)
             writer.finish(COUNTS)
@@ -91,9 +93,9 @@ def test_a_pass_over_the_logs_gives_their_frames_and_counts(tmp_path):
     config = resolve(load_team_file(TRIO_TEAM))
     setup = Setup(config, tmp_path, 2)
     assert cast_groups(config, tmp_path, 2) == [(0, 1), (2,)]
-    assert cast_scans(setup, (0, 2), team_start_ns(config), 64) == 2
+    assert cast_scans(setup, (0, 2), team_start_ns(config), 64, 2) == 2
     assert cast_groups(config, tmp_path, 2) == [(1,)]
-    cast_scans(setup, (1,), team_start_ns(config), 64)
+    cast_scans(setup, (1,), team_start_ns(config), 64, 2)
     assert cast_groups(config, tmp_path, 2) == []
     with TeamSources(config) as team:
         for index, (source, robot) in enumerate(zip(team.sources, config.robots, strict=True)):
@@ -106,11 +108,11 @@ def test_a_pass_over_the_logs_gives_their_frames_and_counts(tmp_path):
 def test_damaged_files_are_refused(tmp_path):
     files = ScanFiles(tmp_path, 0)
     frame = CloudFrame("r", 0, np.ones((3, 3), np.float32), None, np.eye(4))
-    with ScanWriter(files, 32) as writer:
+    with ScanWriter(files, 32, 2) as writer:
         writer.write(frame, CASTER.cast(frame))
         writer.finish(COUNTS)
     index = load_index(files.index)
-    tile = tiles_of(index.columns, 32, 32)[0]
+    tile = tiles_of(index.blocks, 1, 32)[0]
     files.cells.write_bytes(files.cells.read_bytes()[:-20])
     with (
         ScanFile(files, "r", tile) as scans,

@@ -100,10 +100,11 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, bytes]]]:
     [pytest.param(values, id=name, marks=() if name in IN_DEFAULT_SUITE else long)
      for name, values in CONFIGURATIONS.items()],
 )  # fmt: skip
-def test_tiles_give_the_result_of_the_whole_run(tmp_path: Path, parameters) -> None:
+@pytest.mark.parametrize("cut_heights", [False, pytest.param(True, marks=long)])
+def test_tiles_give_the_result_of_the_whole_run(tmp_path: Path, parameters, cut_heights) -> None:
     config = team(**parameters)
     whole = replay_team(config, tmp_path / "whole.mcap")
-    tiled = replay_tiles(config, tmp_path / "tiled.mcap", EDGE)
+    tiled = replay_tiles(config, tmp_path / "tiled.mcap", EDGE, cut_heights=cut_heights)
     assert sorted(path.name for path in tmp_path.iterdir() if not path.name.startswith(".")) == [
         "tiled.mcap", "whole.mcap"
     ]  # fmt: skip

@@ -33,11 +33,11 @@ def cast_groups(config: ResolvedRun, folder: Path, num_threads: int) -> list[tup
     return [tuple(left[first : first + size]) for first in range(0, len(left), max(size, 1))]
 
 
-def cast_scans(setup: Setup, robots: Sequence[int], start_ns: int, column_cells: int) -> int:
+def cast_scans(setup: Setup, robots: Sequence[int], start_ns: int, block_cells: int, num_axes: int) -> int:
     """Cast the rays of all scans of some robots and write the touched cells, as a request to a worker.
 
-    ``start_ns`` is the first stamp of the team, and ``column_cells`` the edge of the columns that divide the cells.
-    Returns the number of robots. Raises ConfigError, InputError and OutputError.
+    ``start_ns`` is the first stamp of the team; ``block_cells`` and ``num_axes`` are those of ``ScanWriter``. Returns
+    the number of robots. Raises ConfigError, InputError and OutputError.
     """
     config = setup.config
     with ExitStack() as stack:
@@ -45,7 +45,9 @@ def cast_scans(setup: Setup, robots: Sequence[int], start_ns: int, column_cells:
         sources = [stack.enter_context(ReadAhead(log, start_ns)) for log in logs]
         hides = config.sensor.hide_robots
         bodies = stack.enter_context(TeamBodies(config.robots, config.time)) if hides else None
-        writers = [stack.enter_context(ScanWriter(ScanFiles(setup.folder, index), column_cells)) for index in robots]
+        writers = [
+            stack.enter_context(ScanWriter(ScanFiles(setup.folder, index), block_cells, num_axes)) for index in robots
+        ]
         casters = [ScanCaster(config.effective_sensor, config.map, config.classes.num_classes) for _ in robots]
         threads = stack.enter_context(ThreadPoolExecutor(setup.num_threads))
         timeline = Timeline(sources)

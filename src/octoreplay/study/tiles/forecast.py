@@ -36,8 +36,8 @@ MARGIN = 1.2
 """Factor on the forecast for a tile, which also holds what joins it to the others."""
 FREE_SHARE = 0.8
 """Share of the free memory that a run without a limit may take."""
-COLUMN_CELLS = 2 * LEAST_CELLS
-"""Edge of the columns that divide the scans of a run whose tiles are chosen after them."""
+BLOCK_CELLS = 2 * LEAST_CELLS
+"""Edge of the blocks that divide the scans of a run whose tiles are chosen after them."""
 
 _SAMPLE_SECONDS = 2.0
 _LEAST_FRAMES = 20
@@ -57,6 +57,16 @@ class Bricks(NamedTuple):
         return round(
             PROCESS_BYTES + ROBOT_BYTES * num_robots + EVIDENCE_BYTES * (self.own + self.union) + of_robots
         )  # fmt: skip
+
+
+def takes_tiles(config: ResolvedRun, limit: int) -> bool:
+    """Return True where a run takes more memory than ``limit`` [byte], but less in tiles. Raises InputError."""
+    if MARGIN * Bricks(0.0, 0.0).memory(config) > worker_memory(limit, 1):
+        return False
+    memory = whole_memory(config)
+    if memory > limit:
+        _log.info("the run takes about %.2g GB and is replayed in tiles", memory / 1e9)
+    return memory > limit
 
 
 def whole_memory(config: ResolvedRun) -> int:
@@ -94,16 +104,15 @@ def _estimated(codes: Int64Array) -> float:
 
 def tile_memory(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> int:
     """Return the memory of the process that replays the largest tile with an edge of ``num_cells`` [byte]."""
-    own = np.concatenate([index.sample for index in scans])
-    num_own = _counts(own, num_cells)
-    num_union = _counts(np.unique(own), num_cells)
+    own, num_axes = np.concatenate([index.sample for index in scans]), scans[0].blocks.shape[1]
+    num_own, num_union = (_counts(brick_keys(codes)[:, :num_axes] // num_cells) for codes in (own, np.unique(own)))
     found = (Bricks(SAMPLE * own, SAMPLE * num_union[tile]).memory(config) for tile, own in num_own.items())
     return round(MARGIN * max(found, default=PROCESS_BYTES))
 
 
-def _counts(codes: Int64Array, num_cells: int) -> dict[tuple[int, ...], int]:
-    """Number of bricks in each tile."""
-    tiles, counts = np.unique(brick_keys(codes)[:, :2] // num_cells, axis=0, return_counts=True)
+def _counts(places: Int64Array) -> dict[tuple[int, ...], int]:
+    """Number of bricks in each tile, given the place of the tile of each brick (n, 2 or 3)."""
+    tiles, counts = np.unique(places, axis=0, return_counts=True)
     return {tuple(tile): number for tile, number in zip(tiles.tolist(), counts.tolist(), strict=True)}
 
 
@@ -126,14 +135,14 @@ def chosen_cells(config: ResolvedRun, scans: Sequence[ScanIndex], room: float) -
     Raises ConfigError where no tiles fit.
     """
     codes, resolution = np.concatenate([index.sample for index in scans]), config.map.resolution
-    reach = np.abs(brick_keys(codes)[:, :2]).max(initial=0)
+    reach = np.abs(brick_keys(codes)).max(initial=0)
     # Larger tiles would be the same four around the origin.
-    num_cells = max(COLUMN_CELLS, 1 << int(reach).bit_length())
+    num_cells = max(BLOCK_CELLS, 1 << int(reach).bit_length())
     while (memory := tile_memory(config, scans, num_cells)) > room:
         num_cells //= 2
-        if num_cells < COLUMN_CELLS:
+        if num_cells < BLOCK_CELLS:
             raise ConfigError(
-                f"memory_limit: a tile of {COLUMN_CELLS * resolution:g} m, the smallest one, takes about"
+                f"memory_limit: a tile of {BLOCK_CELLS * resolution:g} m, the smallest one, takes about"
                 f" {memory / 1e9:.2g} GB, more than {room / 1e9:.2g} GB; give a larger limit, fewer --jobs, or a larger"
                 " resolution"
             )

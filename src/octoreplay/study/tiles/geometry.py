@@ -1,4 +1,4 @@
-"""Cut of a run's space into tiles: columns along z whose sides are nodes of the octree."""
+"""Cut of a run's space into tiles: columns along z, or cubes, that consist of nodes of the octree."""
 
 from __future__ import annotations
 
@@ -21,22 +21,24 @@ MAX_TILES = 100_000
 
 
 class Tile(NamedTuple):
-    """One tile: its place in the grid of tiles, and its edge [cells]. It covers all heights of the map."""
+    """One tile: its place in the grid of tiles, and its edge [cell]. Without ``z`` it has all heights of the map."""
 
     x: int
     y: int
     num_cells: int
+    z: int | None = None
 
     @property
     def name(self) -> str:
         """Name in files and messages."""
-        return f"tile_{self.x}_{self.y}"
+        return f"tile_{self.x}_{self.y}" + ("" if self.z is None else f"_{self.z}")
 
     def bounds(self, map_config: MapConfig) -> tuple[float, ...]:
         """Bounds of the tile's map (6,) [m]: the tile, and the bounds of the run."""
         edge, reach = self.num_cells * map_config.resolution, KEY_OFFSET * map_config.resolution
-        tile = (self.x * edge, self.y * edge, -reach, (self.x + 1) * edge, (self.y + 1) * edge, reach)
-        low, high = np.array(tile[:3]), np.array(tile[3:])
+        bottom, top = (-reach, reach) if self.z is None else (self.z * edge, (self.z + 1) * edge)
+        low = np.array([self.x * edge, self.y * edge, bottom])
+        high = np.array([(self.x + 1) * edge, (self.y + 1) * edge, top])
         run = np.array(map_config.box)
         return (*np.maximum(low, run[:3]).tolist(), *np.minimum(high, run[3:]).tolist())
 
@@ -61,12 +63,13 @@ def tile_cells(edge: float, resolution: float) -> int:
     return min(int(num_cells), 2 * KEY_OFFSET)
 
 
-def tiles_of(columns: Int64Array, column_cells: int, num_cells: int) -> tuple[Tile, ...]:
-    """Return the tiles with an edge of ``num_cells`` that hold the columns (n, 2), by x and then y.
+def tiles_of(blocks: Int64Array, factor: int, num_cells: int) -> tuple[Tile, ...]:
+    """Return the tiles with an edge of ``num_cells`` that hold some blocks, in ascending order.
 
-    ``column_cells`` is the edge of the columns; edges are in cells. Raises ConfigError for more than MAX_TILES.
+    ``blocks`` are the places (n, 2) of columns along x and y, or (n, 3) of cubes; ``factor`` of them make the edge of a
+    tile. Raises ConfigError for more than MAX_TILES.
     """
-    places = np.unique(columns // (num_cells // column_cells), axis=0)
+    places = np.unique(blocks // factor, axis=0)
     if len(places) > MAX_TILES:
         raise ConfigError(f"tiles: the maps have {len(places):,} tiles, more than {MAX_TILES:,}; give a larger edge")
-    return tuple(Tile(x, y, num_cells) for x, y in places.tolist())
+    return tuple(Tile(x, y, num_cells, *z) for x, y, *z in places.tolist())

@@ -32,7 +32,7 @@ from octoreplay.replay.team_recorder import TeamRecorder
 from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
-from octoreplay.study.tiles.forecast import COLUMN_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
+from octoreplay.study.tiles.forecast import BLOCK_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
@@ -59,6 +59,7 @@ def replay_tiles(
     output: FilePath,
     edge: float | None = None,
     *,
+    cut_heights: bool = False,
     num_jobs: int = 1,
     num_threads: int | None = None,
     memory_limit: int | None = None,
@@ -75,8 +76,10 @@ def replay_tiles(
     output : path
         Result to write.
     edge : float, optional
-        Edge of the tiles along x and y [m], rounded to a power of two of cells. Tiles have all heights. By default the
+        Edge of the tiles along x and y [m], rounded to a power of two of cells. By default the
         tiles are the largest ones that fit into the memory by a forecast; where it was too low they are halved.
+    cut_heights : bool
+        Cut the heights too: tiles are cubes.
     num_jobs : int
         Number of tiles that are replayed at the same time, each in a process of its own.
     num_threads : int, optional
@@ -107,6 +110,7 @@ def replay_tiles(
     """
     started, output = time.monotonic(), Path(output)
     config = resolve(config)
+    num_axes = 3 if cut_heights else 2
     given_cells = None if edge is None else tile_cells(edge, config.map.resolution)
     check_separable(config)
     check_num_ticks(config, config.total_ns)
@@ -114,9 +118,9 @@ def replay_tiles(
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
         writer = stack.enter_context(ResultWriter(output, config, restart=restart or resume))
-        folder = stack.enter_context(_work_folder(writer, given_cells, restart=restart, resume=resume))
+        folder = stack.enter_context(_work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
         setup = Setup(config, folder, num_threads)
-        scans = _cast_scans(setup, num_jobs, given_cells or COLUMN_CELLS, progress)
+        scans = _cast_scans(setup, num_jobs, given_cells or BLOCK_CELLS, num_axes, progress)
         stages = _replay_all(setup, scans, given_cells, memory_limit, num_jobs, progress)
         tiles = tuple(stages)
         counts = _counts(config, scans, next(iter(stages.values())).num_frames_off)
@@ -170,13 +174,15 @@ def _folder_of(output: Path) -> Path:
 
 
 @contextmanager
-def _work_folder(writer: ResultWriter, num_cells: int | None, *, restart: bool, resume: bool) -> Iterator[Path]:
+def _work_folder(
+    writer: ResultWriter, num_cells: int | None, num_axes: int, *, restart: bool, resume: bool
+) -> Iterator[Path]:
     """Folder of the work files; after an error it is kept if a tile is finished, and a note of the error names it.
 
     Raises OutputError, InputError and ConfigError where an earlier run left a folder that cannot be used.
     """
     folder = _folder_of(writer.path)
-    description = {**writer.description, "tiles": {"cells": str(num_cells or "auto")}}
+    description = {**writer.description, "tiles": {"cells": str(num_cells or "auto"), "axes": str(num_axes)}}
     with writing(folder):
         if folder.exists() and not (restart or resume):
             raise OutputError(
@@ -211,19 +217,22 @@ def _check_same(writer: ResultWriter, path: Path, description: Mapping[str, Mapp
         raise InputError(f"{path}: cannot be read; run with --restart to start from the beginning") from error
     if tiles != description["tiles"]:
         raise ConfigError(
-            f"{writer.path}: cannot be continued: the tiles had another edge; use the same --tiles, or run with"
-            " --restart to start from the beginning"
+            f"{writer.path}: cannot be continued: the tiles had another form; use the same --tiles and --tiles-z, or"
+            " run with --restart to start from the beginning"
         )
     writer.check_same(earlier)
 
 
-def _cast_scans(setup: Setup, num_jobs: int, column_cells: int, progress: Progress | None) -> list[ScanIndex]:
+def _cast_scans(
+    setup: Setup, num_jobs: int, block_cells: int, num_axes: int, progress: Progress | None
+) -> list[ScanIndex]:
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
     config, folder = setup.config, setup.folder
     start_ns, groups = team_start_ns(config), cast_groups(config, folder, setup.num_threads)
     names = [", ".join(config.robots[index].robot_id for index in group) for group in groups]
     requests = [
-        Request(name, cast_scans, (group, start_ns, column_cells)) for name, group in zip(names, groups, strict=True)
+        Request(name, cast_scans, (group, start_ns, block_cells, num_axes))
+        for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
     with Workers(setup, num_jobs) as workers:
@@ -282,7 +291,8 @@ def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> t
     if not sum(index.stamps.size for index in scans):
         causes = frame_causes(_counts(config, scans, [{}] * len(scans)), config.time)
         raise InputError(f"no robot has a frame that can be used: {causes}")
-    tiles = tiles_of(np.concatenate([index.columns for index in scans]), scans[0].column_cells, num_cells)
+    blocks = np.concatenate([index.blocks for index in scans])
+    tiles = tiles_of(blocks, num_cells // scans[0].block_cells, num_cells)
     if not tiles:
         raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
     return tiles

@@ -1,10 +1,11 @@
-"""Work files with the cells that every scan of a robot touches, divided among columns of the space.
+"""Work files with the cells that every scan of a robot touches, divided among blocks of the space.
 
 Rays are cast once for a run, and each tile reads its part of every scan.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -50,16 +51,16 @@ class ScanIndex:
 
     Attributes
     ----------
-    column_cells : int
-        Edge of the columns that divide the cells [cell].
+    block_cells : int
+        Edge of the blocks that divide the cells [cell].
     stamps, sensors : (F,) int64 array
         Stamps on the team's clock [ns], and index of the sensor.
     poses : (F, 4, 4) float64 array
         Pose of the sensor in the team's frame.
     frames : (P,) int64 array
         Frame of each part, ascending.
-    columns : (P, 2) int64 array
-        Column of each part along x and y.
+    blocks : (P, 2) or (P, 3) int64 array
+        Place of each part in the grid of columns along x and y, or of cubes.
     places : (P, 3) int64 array
         First byte of each part in the file of cells, its length [byte], and its number of bricks.
     sample : (k,) int64 array
@@ -68,12 +69,12 @@ class ScanIndex:
         Messages of each sensor by outcome.
     """
 
-    column_cells: int
+    block_cells: int
     stamps: Int64Array
     sensors: Int64Array
     poses: Float64Array
     frames: Int64Array
-    columns: Int64Array
+    blocks: Int64Array
     places: Int64Array
     sample: Int64Array
     counts: SensorCounts
@@ -94,12 +95,15 @@ def load_index(path: Path) -> ScanIndex:
 
 
 class ScanWriter:
-    """Writer of the scans of one robot, in the order of their stamps; a context manager. Methods raise OutputError."""
+    """Writer of the scans of one robot, in the order of their stamps; a context manager. Methods raise OutputError.
 
-    def __init__(self, files: ScanFiles, column_cells: int) -> None:
+    Blocks have an edge of ``block_cells``; they are columns with ``num_axes`` 2, and cubes with 3.
+    """
+
+    def __init__(self, files: ScanFiles, block_cells: int, num_axes: int) -> None:
         self._files = files
-        self._column_cells = column_cells
-        self._column_bits = column_cells.bit_length() - 1
+        self._block_cells = block_cells
+        self._num_axes = num_axes
         self._compressor = zstandard.ZstdCompressor(_LEVEL)
         self._frames: list[tuple[int, int]] = []
         self._poses: list[Float64Array] = []
@@ -125,22 +129,22 @@ class ScanWriter:
         self._frames.append((frame.stamp_ns, frame.sensor_index))
         self._poses.append(np.array(frame.T_team_sensor))
         self._sample.add(cells.codes[is_sampled(cells.codes)])
-        columns = brick_keys(cells.codes)[:, :2] >> self._column_bits
-        ids = (columns[:, 0] << KEY_BITS) + columns[:, 1]
+        blocks = brick_keys(cells.codes)[:, : self._num_axes] // self._block_cells
+        ids = functools.reduce(lambda high, low: (high << KEY_BITS) + low, blocks.T)
         order = np.argsort(ids, kind="stable")
         firsts = np.flatnonzero(np.diff(ids[order], prepend=np.iinfo(np.int64).min))
         for bricks in np.split(order, firsts)[1:]:
-            self._write_part(number, columns[bricks[0]].tolist(), bricks, cells)
+            self._write_part(number, blocks[bricks[0]].tolist(), bricks, cells)
 
-    def _write_part(self, number: int, column: list[int], bricks: Int64Array, cells: TouchedCells) -> None:
-        """Write the bricks (n,) of a scan in one column."""
+    def _write_part(self, number: int, block: list[int], bricks: Int64Array, cells: TouchedCells) -> None:
+        """Write the bricks (n,) of a scan in one block."""
         planes = [np.diff(cells.codes[bricks], prepend=0), cells.marks[bricks]]
         if cells.strengths.size:
             planes.append(cells.strengths[bricks])
         data = self._compressor.compress(b"".join(plane.tobytes() for plane in planes))
         with writing(self._files.cells):
             self._file.write(data)
-        self._parts.append((number, *column, self._length, len(data), bricks.size))
+        self._parts.append((number, *block, self._length, len(data), bricks.size))
         self._length += len(data)
 
     def finish(self, counts: SensorCounts) -> None:
@@ -148,11 +152,11 @@ class ScanWriter:
         with writing(self._files.cells):
             self._file.flush()
             os.fsync(self._file.fileno())
-        parts = np.array(self._parts, np.int64).reshape(-1, 6)
+        parts = np.array(self._parts, np.int64).reshape(-1, 4 + self._num_axes)
         stamps, sensors = np.array(self._frames, np.int64).reshape(-1, 2).T
         poses = np.array(self._poses, np.float64).reshape(-1, 4, 4)
         ScanIndex(
-            self._column_cells, stamps, sensors, poses, parts[:, 0], parts[:, 1:3], parts[:, 3:], self._sample.codes,
+            self._block_cells, stamps, sensors, poses, parts[:, 0], parts[:, 1:-3], parts[:, -3:], self._sample.codes,
             counts,
         ).save(self._files.index)  # fmt: skip
 
@@ -213,8 +217,9 @@ class ScanFile:
 
 
 def is_within(index: ScanIndex, tile: Tile) -> BoolArray:
-    """Return True (P,) for the parts of scans that are in a tile, a multiple of the columns."""
-    return np.asarray((index.columns // (tile.num_cells // index.column_cells) == (tile.x, tile.y)).all(axis=1))
+    """Return True (P,) for the parts of scans that are in a tile, which consists of whole blocks."""
+    place = [axis for axis in (tile.x, tile.y, tile.z) if axis is not None]
+    return np.asarray((index.blocks // (tile.num_cells // index.block_cells) == place).all(axis=1))
 
 
 class _Distinct:
