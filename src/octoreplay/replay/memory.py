@@ -68,8 +68,8 @@ class MemoryWatch:
         if self._limit is not None and used > self._limit:
             raise MemoryLimitError(
                 f"memory_limit: the run takes {used / 1e9:.3g} GB {log_ns / 1e9:.1f} s after the start, more than"
-                f" {self._limit / 1e9:.3g} GB; continue with --resume and a larger limit, or use a larger resolution or"
-                " a smaller max_range"
+                f" {self._limit / 1e9:.3g} GB; continue with --resume and a larger limit, start again with --tiles, or"
+                " use a larger resolution or a smaller max_range"
             )
         self._samples.append((log_ns, used))
         if not self._has_warned and len(self._samples) > WINDOW:
@@ -91,7 +91,7 @@ class MemoryWatch:
         at_end = "" if left is None else f" and {(used + growth * left) / 1e9:.3g} GB at the end of the logs"
         _log.warning(
             "warning: the maps grow by %.3g MB per second of log time: at this rate the run takes all of %.3g GB in"
-            " %.0f s of log time%s; use a larger resolution or a smaller max_range, or set --memory-limit to end it"
-            " with a result that --resume continues",
+            " %.0f s of log time%s; use a larger resolution or a smaller max_range, or"
+            " replay it with --tiles auto",
             growth / 1e6, room / 1e9, until_full, at_end, extra=EARLY,
         )  # fmt: skip
