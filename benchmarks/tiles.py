@@ -6,16 +6,11 @@ Memory is that of the parent process and of the largest worker process. Results 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
+from peaks import octoreplay
 from rounds import Report, Row, arguments
-
-MEBIBYTE = 1024
-"""One MiB [KiB]."""
 
 
 def main() -> None:
@@ -24,7 +19,7 @@ def main() -> None:
     report = Report("tiles", vars(options))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        _octoreplay(
+        octoreplay(
             "simulate", folder / "logs", "--robots", options.robots, "--duration", options.seconds,
             "--image", "320x240", "--world-size", options.world,
         )  # fmt: skip
@@ -47,14 +42,14 @@ def _measure(report: Report, folder: Path, team: Path, resolution: float, edges:
     """The whole run, then tiles of each edge."""
     whole = folder / "whole.mcap"
     run = ("run", team, "--resolution", resolution, "--force", "-q", "-o")
-    seconds, own, _ = _octoreplay(*run, whole)
+    seconds, own, *_ = octoreplay(*run, whole)
     title = f"{resolution:g} m, round {number + 1}"
     report.add(Row(f"{title}: whole run", seconds, "s"))
     report.add(Row(f"{title}: whole run, memory", own, "MiB"))
     for edge in edges:
         tiled = folder / "tiled.mcap"
-        of_tiles, parent, worker = _octoreplay(*run, tiled, "--tiles", edge)
-        _octoreplay("compare", whole, tiled, "--tolerance", 0)
+        of_tiles, parent, worker, _ = octoreplay(*run, tiled, "--tiles", edge)
+        octoreplay("compare", whole, tiled, "--tolerance", 0)
         report.add(
             Row(f"{title}: tiles of {edge:g} m", of_tiles, "s", note=f"{of_tiles / seconds:.2f} of the whole run")
         )
@@ -69,42 +64,6 @@ def _measure(report: Report, folder: Path, team: Path, resolution: float, edges:
                 note=f"{worker / own:.2f} of the whole run",
             )
         )
-
-
-def _octoreplay(*words: object) -> tuple[float, float, float]:
-    """Seconds of a command, and the peak memory of its process and of its largest child process [MiB]."""
-    started, own, child = time.perf_counter(), 0, 0
-    process = subprocess.Popen([sys.executable, "-m", "octoreplay", *map(str, words)], stdout=subprocess.DEVNULL)
-    while process.poll() is None:
-        own = max(own, _peak(process.pid))
-        child = max([child, *map(_peak, _children(process.pid))])
-        time.sleep(0.1)
-    if process.returncode:
-        raise SystemExit(f"octoreplay {' '.join(map(str, words))} ended with code {process.returncode}")
-    return time.perf_counter() - started, own / MEBIBYTE, child / MEBIBYTE
-
-
-def _peak(pid: int) -> int:
-    """Peak resident memory of a process [KiB]; 0 where it has ended."""
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
-
-
-def _children(pid: int) -> list[int]:
-    """Child processes of a process."""
-    found = []
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdecimal():
-            try:
-                fields = (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-            except OSError:
-                continue
-            if int(fields[1]) == pid:
-                found.append(int(folder.name))
-    return found
 
 
 if __name__ == "__main__":
