@@ -99,6 +99,8 @@ def _check_input(word: str) -> None:
               help="replay tiles of the space with this edge one after the other; the maps are the same")  # fmt: skip
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
+@click.option("--result-per-tile", cls=RareOption, is_flag=True,
+              help="write the maps of each of the --tiles to a file in OUT.maps, and to OUT.mcap all other results")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
               help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
@@ -120,7 +122,7 @@ def _check_input(word: str) -> None:
 @prints
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
-    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None,
+    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None, result_per_tile: bool,
     report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
@@ -140,6 +142,8 @@ def run(
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
     if tiles is None and jobs is not None:
         raise click.UsageError("--jobs needs --tiles")
+    if tiles is None and result_per_tile:
+        raise click.UsageError("--result-per-tile needs --tiles")
     if tiles is not None and (checkpoint_every is not None or memory_limit is not None):
         raise click.UsageError("--checkpoint-every and --memory-limit are for runs without --tiles")
     if output is not None:
@@ -180,7 +184,9 @@ def run(
     if output is None:
         return 0
     if tiles is not None:
-        summary = replay_tiles_with_bar(config, output, tiles, num_jobs=jobs or 1, restart=restart, resume=resume)
+        summary = replay_tiles_with_bar(
+            config, output, tiles, num_jobs=jobs or 1, result_per_tile=result_per_tile, restart=restart, resume=resume
+        )
     else:
         summary = replay_with_bar(
             config, output, restart=restart, resume=resume, checkpoint_every=checkpoint_every, memory_limit=memory_limit

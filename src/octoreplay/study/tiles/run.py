@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import math
 import os
 import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -24,17 +22,15 @@ from octoreplay.io.output_file import write_whole, writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.mapping.warm_up import second_compiler
-from octoreplay.records import CONVERGED, FilePath, FrameCounts
+from octoreplay.records import FilePath
 from octoreplay.replay.run import check_num_ticks, frame_causes
-from octoreplay.replay.team_recorder import TeamRecorder
-from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
-from octoreplay.study.tiles.joined_maps import JoinedMaps
-from octoreplay.study.tiles.joined_ticks import joined_ticks
+from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.survey import Survey
 from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
 from octoreplay.study.tiles.worker import Request, Setup, Workers
+from octoreplay.study.tiles.written import Outcome, write_result, write_tiles
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +50,7 @@ def replay_tiles(
     num_jobs: int = 1,
     num_threads: int | None = None,
     progress: Progress | None = None,
+    result_per_tile: bool = False,
     restart: bool = False,
     resume: bool = False,
 ) -> RunSummary:
@@ -72,7 +69,11 @@ def replay_tiles(
     num_threads : int, optional
         Threads of each process; by default the processors are shared among the processes.
     progress : function, optional
-        Called with the stage ('replay', 'settle' or 'write'), and the numbers of finished tiles or ticks and of all.
+        Called with the stage ('replay', 'settle', 'write tiles' or 'write'), and the numbers of finished tiles or ticks
+        and of all.
+    result_per_tile : bool
+        True to write the maps of each tile into a result of its own in the folder ``OUT.maps`` beside the output, which
+        is then the index of them: ``open_result`` reads both as one result.
     restart, resume : bool
         Remove, or use, the tiles that an interrupted run has finished. Without either they are an error.
 
@@ -110,9 +111,21 @@ def replay_tiles(
         workers = stack.enter_context(Workers(Setup(config, folder, num_threads), num_jobs))
         stages = _replay_logs(tiles, workers, folder, progress)
         stages = _settle(tiles, stages, workers, progress)
-        counts = survey.counts(next(iter(stages.values())).num_frames_off)
+        outcome = Outcome.of(stages, survey.counts(next(iter(stages.values())).num_frames_off))
+        show = progress or (lambda *_: None)
+        maps: JoinedMaps | OtherMaps = JoinedMaps(config, tiles, folder)
+        if result_per_tile:
+            files, maps = write_tiles(
+                output, tiles, workers, outcome, writer.inputs, lambda done: show("write tiles", done, len(tiles))
+            )
+            writer.write_tiles(files)
         with interrupts.deferred() as deliver_interrupts:
-            summary = _write(config, writer, tiles, stages, folder, counts, num_threads, progress, deliver_interrupts)
+
+            def show_ticks(done: int) -> None:
+                show("write", done, outcome.num_ticks)
+                deliver_interrupts()
+
+            summary = write_result(config, writer, maps, tiles, folder, outcome, num_threads, show_ticks)
             summary = dataclasses.replace(summary, wall_seconds=time.monotonic() - started)
             deliver_interrupts()
             writer.complete(summary)
@@ -231,36 +244,3 @@ def _settle(
             num_done += 1
             if progress is not None:
                 progress("settle", num_done, len(tiles))
-
-
-def _write(
-    config: ResolvedRun, writer: ResultWriter, tiles: Sequence[Tile], stages: Mapping[Tile, Stage], folder: Path,
-    counts: Mapping[str, FrameCounts], num_threads: int, progress: Progress | None,
-    deliver_interrupts: Callable[[], None],
-) -> RunSummary:  # fmt: skip
-    """Write all ticks and maps of the run, and return its summary without the wall time."""
-    first = next(iter(stages.values()))
-    maps = JoinedMaps(config, tiles, folder)
-    with ThreadPoolExecutor(num_threads) as threads, TeamRecorder(config, writer, threads) as recorder:
-        maps.encode(threads)
-        deliver_interrupts()
-        written_maps = maps.write(recorder.queue)
-        for tick in joined_ticks(config, tiles, folder):
-            recorder.record(tick.metrics, tick.graph, tick.poses)
-            next(written_maps)
-            recorder.queue.start()
-            if progress is not None:
-                progress("write", tick.metrics.tick + 1, first.num_ticks)
-            deliver_interrupts()
-        assert recorder.last is not None
-        warnings = (
-            *config.warnings,
-            *rule_warnings(config, first.is_symmetric),
-            *map_warnings(recorder.last.num_known_cells),
-            *team_frame_warnings(recorder.last, {name: n for name, n in maps.num_evidence_cells.items() if n}),
-            *coverage_warnings(counts),
-        )
-        # A tile that has not settled stands for the team.
-        reasons = {stage.stop_reason for stage in stages.values()}
-        reason = next(iter(reasons - {CONVERGED}), CONVERGED)
-        return recorder.finish(reason, counts, warnings, math.nan)
