@@ -50,14 +50,17 @@ _log = logging.getLogger(__name__)
 
 
 class Result:
-    """Stored result, opened by ``open_result``; a context manager."""
+    """Stored result, opened by ``open_result``; a context manager.
+
+    ``tiles`` are the files that hold the maps of a result in tiles; None where the file itself does.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = ResultReader(path)
         tiles = self._reader.tiles
-        self._tiles = None if tiles is None else ResultTiles(path, tiles, Result)
-        self._most_bytes = max_memory(path.stat().st_size if self._tiles is None else self._tiles.num_bytes)
+        self.tiles = None if tiles is None else ResultTiles(path, tiles, Result)
+        self._most_bytes = max_memory(path.stat().st_size if self.tiles is None else self.tiles.num_bytes)
         self._octrees: WeakSet[SemanticOctree] = WeakSet()
 
     def __enter__(self) -> Self:
@@ -74,8 +77,8 @@ class Result:
     def close(self) -> None:
         """Close the file, and those of its tiles."""
         self._reader.close()
-        if self._tiles is not None:
-            self._tiles.close()
+        if self.tiles is not None:
+            self.tiles.close()
 
     def plot(
         self, what: str, *, label: str | None = None, beside: Mapping[str, Result] | None = None, style: str = "screen",
@@ -249,8 +252,8 @@ class Result:
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
-        if self._tiles is not None:
-            return self._of_tiles(self._tiles, robot_id, until_ns, bounds, box, evidence=evidence)
+        if self.tiles is not None:
+            return self._of_tiles(self.tiles, robot_id, until_ns, bounds, box, evidence=evidence)
         states = self._reader.states(robot_id, until_ns, evidence=evidence)
         octree = self._updated(None, states[0], box)
         for state in states[1:]:
@@ -289,7 +292,7 @@ class Result:
         max_depth : int, optional
             Depth of the finest cells that the reader makes of each part (``StoredMap.coarsened``); none is cut.
         """
-        return boxes_of([result._tiles for result in (self, *beside)], self.config.map.resolution, bounds, max_depth)
+        return boxes_of([result.tiles for result in (self, *beside)], self.config.map.resolution, bounds, max_depth)
 
     def history(self, *, bounds: Sequence[float] = ()) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
@@ -298,8 +301,8 @@ class Result:
         ``map`` does.
         """
         box = key_box(bounds, self.config.map.resolution) if len(bounds) else None
-        if self._tiles is not None:
-            yield from self._history_of_tiles(self._tiles, bounds, box)
+        if self.tiles is not None:
+            yield from self._history_of_tiles(self.tiles, bounds, box)
             return
         octrees: dict[str, SemanticOctree] = {}
         maps: dict[str, StoredMap] = {}
@@ -385,7 +388,7 @@ class Result:
     def _states_reader(self, robot_id: str, *, evidence: bool = False) -> ResultReader:
         """Reader of a file with stored states of a robot; all tiles store them at the same ticks."""
         self._reader.state_topic(robot_id, evidence)
-        return self._reader if self._tiles is None else self._tiles.opened(self._tiles.files[0])._reader
+        return self._reader if self.tiles is None else self.tiles.reader
 
     def _stamp_of(self, robot_id: str, tick: int, *, evidence: bool) -> int:
         """Stamp of a robot's map or evidence stored at a tick."""

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from octoreplay.config.sensor import region_of
+from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.tile_files import TileFile, TileList
 from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import KEY_BITS, KEY_OFFSET
+from octoreplay.records import Int64Array
 
 if TYPE_CHECKING:
     from octoreplay.result import Result
@@ -32,9 +34,19 @@ class ResultTiles:
         self._path = path
         self._open_file = open_file
         self._opened: dict[TileFile, Result] = {}
+        self._reader: ResultReader | None = None
+
+    @property
+    def reader(self) -> ResultReader:
+        """Reader of one of the files, which tells the ticks of all. Raises InputError as ``open_new``."""
+        if self._reader is None:
+            self._reader = ResultReader(self.files[0].checked_path(self._path))
+        return self._reader
 
     def close(self) -> None:
         """Close all files."""
+        if self._reader is not None:
+            self._reader.close()
         while self._opened:
             self._opened.popitem()[1].close()
 
@@ -66,7 +78,7 @@ class ResultTiles:
         low, high = self._limits(file)
         return bool((low < box.high[:2]).all() and (high > box.low[:2]).all())
 
-    def _limits(self, file: TileFile) -> tuple[np.ndarray, np.ndarray]:
+    def _limits(self, file: TileFile) -> tuple[Int64Array, Int64Array]:
         """First keys (2,) of a tile along x and y, and those after its last ones."""
         low = np.array([file.x, file.y], np.int64) * self.num_cells
         return low, low + self.num_cells
@@ -91,8 +103,9 @@ def boxes_of(
     for x, y in sorted(columns):
         column = np.array([x * edge, y * edge, -reach, (x + 1) * edge, (y + 1) * edge, reach])
         box = np.concatenate([np.maximum(column[:3], region[:3]), np.minimum(column[3:], region[3:])])
-        if not KeyBox.of(box, resolution).is_empty:
+        limits = tuple(box.tolist())
+        if not KeyBox.of(limits, resolution).is_empty:
             num_boxes += 1
-            yield tuple(box.tolist())
+            yield limits
     if not num_boxes:
         yield tuple(bounds)

@@ -100,7 +100,7 @@ def _check_input(word: str) -> None:
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
 @click.option("--result-per-tile", cls=RareOption, is_flag=True,
-              help="write the maps of each of the --tiles to a file in OUT.maps, and to OUT.mcap all other results")  # fmt: skip
+              help="write the maps of each of the --tiles to a file in OUT.maps, and all else to OUT.mcap")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
               help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
@@ -122,8 +122,8 @@ def _check_input(word: str) -> None:
 @prints
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
-    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None, result_per_tile: bool,
-    report: Path | None, save_team: Path | None,
+    checkpoint_every: float | None, memory_limit: int | None, tiles: float | None, jobs: int | None,
+    result_per_tile: bool, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip

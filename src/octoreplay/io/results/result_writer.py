@@ -95,9 +95,10 @@ class ResultWriter:
     calls give equal bytes: no wall-clock time and nothing machine-dependent is written.
 
     An existing partial file is an error, unless it holds no message or ``restart`` removes it. With ``continues`` it
-    stays as it is until ``take_over`` has copied it. The lock of the output
-    is held until the end. ``inputs`` are the fingerprints of the logs where they are known; None computes them. Raises OutputError where the result cannot be written, is being written by another process,
-    or would overwrite an input, and InputError where an input cannot be read for its fingerprint.
+    stays as it is until ``take_over`` has copied it. The lock of the output is held until the end. ``inputs`` are the
+    fingerprints of the logs where they are known. Raises OutputError where the result cannot be written, is being
+    written by another process, or would overwrite an input, and InputError where an input cannot be read for its
+    fingerprint.
     """
 
     def __init__(

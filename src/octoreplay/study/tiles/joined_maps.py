@@ -123,7 +123,7 @@ class OtherMaps:
     def encode(self, threads: Executor) -> None:
         """Do nothing."""
 
-    def write(self, sink: MapSink) -> Iterator[None]:
+    def write(self, _: MapSink) -> Iterator[None]:
         """Give nothing to a sink, tick after tick."""
         yield from itertools.repeat(None)
 
