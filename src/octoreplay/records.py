@@ -6,6 +6,7 @@ Times are integer nanoseconds and end in ``_ns``; lengths are metres. ``T_a_b`` 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar, cast
 
@@ -195,6 +196,14 @@ class LeafTable:
 
     def __len__(self) -> int:
         return len(self.sizes)
+
+    @classmethod
+    def joined(cls, tables: Sequence[LeafTable]) -> LeafTable:
+        """Return the leaves of one table after the other, of at least one."""
+        if len(tables) == 1:
+            return tables[0]
+        columns = ([getattr(table, name) for table in tables] for name in ("centers", "sizes", "log_odds"))
+        return cls(*map(np.concatenate, columns))
 
     def as_table(self) -> Table:
         """Return the columns x, y, z, size [m] and log_odds_1 to log_odds_C, one row per leaf."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +25,7 @@ from octoreplay.config.run import RunConfig
 from octoreplay.data_table import Table
 from octoreplay.errors import ConfigError, InputError, PacketError
 from octoreplay.io.results.result_reader import ResultReader
+from octoreplay.io.results.tile_files import TileFile
 from octoreplay.mapping.codec import apply_delta, decode_packet, max_memory
 from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import SemanticOctree
@@ -37,8 +39,9 @@ from octoreplay.records import (
     MapState,
     public_names,
 )
+from octoreplay.result_tiles import ResultTiles, boxes_of
 from octoreplay.run_metrics import FramePlace, RunSummary, TickMetrics
-from octoreplay.stored_map import StoredMap, key_box
+from octoreplay.stored_map import StoredMap, joined_map, key_box
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,12 +50,17 @@ _log = logging.getLogger(__name__)
 
 
 class Result:
-    """Stored result, opened by ``open_result``; a context manager."""
+    """Stored result, opened by ``open_result``; a context manager.
+
+    ``tiles`` are the files that hold the maps of a result in tiles; None where the file itself does.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader = ResultReader(path)
-        self._most_bytes = max_memory(path.stat().st_size)
+        tiles = self._reader.tiles
+        self.tiles = None if tiles is None else ResultTiles(path, tiles, Result)
+        self._most_bytes = max_memory(path.stat().st_size if self.tiles is None else self.tiles.num_bytes)
         self._octrees: WeakSet[SemanticOctree] = WeakSet()
 
     def __enter__(self) -> Self:
@@ -67,8 +75,10 @@ class Result:
         return public_names(self)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and those of its tiles."""
         self._reader.close()
+        if self.tiles is not None:
+            self.tiles.close()
 
     def plot(
         self, what: str, *, label: str | None = None, beside: Mapping[str, Result] | None = None, style: str = "screen",
@@ -184,11 +194,11 @@ class Result:
 
     def stored_ticks(self, robot_id: str) -> list[int]:
         """Return the ticks at which a robot's map is stored. Raises InputError for an unknown robot."""
-        return [tick for tick, _ in self._reader.state_times(robot_id)]
+        return [tick for tick, _ in self._states_reader(robot_id).state_times(robot_id)]
 
     def evidence_ticks(self, robot_id: str) -> list[int]:
         """Return the ticks at which a robot's evidence is stored. Raises InputError for an unknown robot."""
-        return [tick for tick, _ in self._reader.state_times(robot_id, evidence=True)]
+        return [tick for tick, _ in self._states_reader(robot_id, evidence=True).state_times(robot_id, evidence=True)]
 
     def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
         """Return the poses of a robot's sensor at the ticks: stamps [ns], and (P, 7) x, y, z [m], qx, qy, qz, qw.
@@ -206,7 +216,7 @@ class Result:
         ``robot_id`` 'central' is the centralised map, the sum of all robots' evidence up to then. ``bounds`` are those
         of a run, (zmin, zmax) or (xmin, ymin, zmin, xmax, ymax, zmax) in the map's frame [m]: the map has the cells
         with centres in this box only, bit for bit as in the whole map. Its packets are decompressed as a whole, and
-        only the bricks near the box are made.
+        only the bricks near the box are made. Of a result in tiles only the files of tiles in the box are read.
 
         Raises InputError for an unknown robot, a tick without a stored map, or a time before the first stored map.
         Raises PacketError where a stored map is damaged or has another format version.
@@ -242,6 +252,8 @@ class Result:
         if at_ns is not None and tick is not None:
             raise ValueError("give at_ns or tick, not both")
         until_ns = at_ns if tick is None else self._stamp_of(robot_id, tick, evidence=evidence)
+        if self.tiles is not None:
+            return self._of_tiles(self.tiles, robot_id, until_ns, bounds, box, evidence=evidence)
         states = self._reader.states(robot_id, until_ns, evidence=evidence)
         octree = self._updated(None, states[0], box)
         for state in states[1:]:
@@ -249,22 +261,73 @@ class Result:
         stored = self._stored_map(octree, states[-1], is_evidence=evidence)
         return stored.cut(bounds) if len(bounds) else stored
 
-    def history(self) -> Iterator[dict[str, StoredMap]]:
+    def _of_tiles(
+        self, tiles: ResultTiles, robot_id: str, until_ns: int | None, bounds: Sequence[float], box: KeyBox | None,
+        *, evidence: bool,
+    ) -> StoredMap:  # fmt: skip
+        """Map or evidence in a box from the files of the tiles in it."""
+        self._reader.state_topic(robot_id, evidence)
+
+        def part(file: TileFile) -> StoredMap:
+            result, whole = tiles.opened(file), box is None or tiles.is_inside(file, box)
+            read = result.evidence if evidence else result.map
+            return read(robot_id, at_ns=until_ns, bounds=() if whole else bounds)
+
+        return joined_map(map(part, tiles.touching(box)), self._most_bytes)
+
+    def boxes(
+        self, bounds: Sequence[float] = (), *, beside: Sequence[Result] = (), max_depth: int | None = None
+    ) -> Iterator[tuple[float, ...]]:
+        """Yield boxes for ``bounds`` of ``map``, ``evidence`` and ``history`` that hold each known cell once.
+
+        A result in tiles gives one box for each tile, so that a reader of one box after the other holds the maps of
+        one tile. An ordinary result gives the whole, ``bounds``.
+
+        Parameters
+        ----------
+        bounds : sequence of float
+            Box to cut, as in ``map``; empty for the whole map.
+        beside : sequence of Result
+            Results of the same resolution that are read together with this one: boxes hold whole tiles of all of them.
+        max_depth : int, optional
+            Depth of the finest cells that the reader makes of each part (``StoredMap.coarsened``); none is cut.
+        """
+        return boxes_of([result.tiles for result in (self, *beside)], self.config.map.resolution, bounds, max_depth)
+
+    def history(self, *, bounds: Sequence[float] = ()) -> Iterator[dict[str, StoredMap]]:
         """Yield the maps at every stored tick by robot_id, with 'central' if it is stored.
 
-        The next step changes the octrees in place. Raises PacketError as ``map`` does.
+        ``bounds`` are as in ``map``. The next step changes the octrees in place. Raises PacketError and ConfigError as
+        ``map`` does.
         """
+        box = key_box(bounds, self.config.map.resolution) if len(bounds) else None
+        if self.tiles is not None:
+            yield from self._history_of_tiles(self.tiles, bounds, box)
+            return
         octrees: dict[str, SemanticOctree] = {}
         maps: dict[str, StoredMap] = {}
         tick: int | None = None
         for state in self._reader.all_states():
             if tick is not None and state.tick != tick:
-                yield maps
+                yield maps if box is None else {name: stored.cut(bounds) for name, stored in maps.items()}
             tick = state.tick
-            octrees[state.robot_id] = self._updated(octrees.get(state.robot_id), state)
+            octrees[state.robot_id] = self._updated(octrees.get(state.robot_id), state, box)
             maps[state.robot_id] = self._stored_map(octrees[state.robot_id], state)
         if maps:
-            yield maps
+            yield maps if box is None else {name: stored.cut(bounds) for name, stored in maps.items()}
+
+    def _history_of_tiles(
+        self, tiles: ResultTiles, bounds: Sequence[float], box: KeyBox | None
+    ) -> Iterator[dict[str, StoredMap]]:
+        """Maps in a box at every stored tick from the files of the tiles in it."""
+        with ExitStack() as stack:
+            histories = []
+            for file in tiles.touching(box):
+                whole = box is None or tiles.is_inside(file, box)
+                result = stack.enter_context(tiles.open_new(file))
+                histories.append(result.history(bounds=() if whole else bounds))
+            for parts in zip(*histories, strict=True):
+                yield {name: joined_map((maps[name] for maps in parts), self._most_bytes) for name in parts[0]}
 
     def _updated(self, octree: SemanticOctree | None, state: MapState, box: KeyBox | None = None) -> SemanticOctree:
         """Octree, near a box, after a stored state.
@@ -322,9 +385,14 @@ class Result:
         """Frames of all robots by tick."""
         return self._reader.places()
 
+    def _states_reader(self, robot_id: str, *, evidence: bool = False) -> ResultReader:
+        """Reader of a file with stored states of a robot; all tiles store them at the same ticks."""
+        self._reader.state_topic(robot_id, evidence)
+        return self._reader if self.tiles is None else self.tiles.reader
+
     def _stamp_of(self, robot_id: str, tick: int, *, evidence: bool) -> int:
         """Stamp of a robot's map or evidence stored at a tick."""
-        stamp_ns = self._reader.state_stamp(robot_id, tick, evidence=evidence)
+        stamp_ns = self._states_reader(robot_id, evidence=evidence).state_stamp(robot_id, tick, evidence=evidence)
         if stamp_ns is None:
             ticks = self.evidence_ticks(robot_id) if evidence else self.stored_ticks(robot_id)
             near = sorted(sorted(ticks, key=lambda stored: abs(stored - tick))[:6])

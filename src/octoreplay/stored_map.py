@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -194,6 +195,25 @@ class StoredMap:
         half = table.sizes[:, None] / 2
         inside = ((table.centers + half > low) & (table.centers - half < high)).all(axis=1)
         return LeafTable(table.centers[inside], table.sizes[inside], table.log_odds[inside])
+
+
+def joined_map(parts: Iterable[StoredMap], most_bytes: int | None = None) -> StoredMap:
+    """Return one map of parts of it, at least one, whose cells are in different nodes of the octree.
+
+    ``most_bytes`` is the limit of its leaves in memory. At most two parts are in memory at a time if they are made one
+    by one.
+    """
+    all_parts = iter(parts)
+    first = next(all_parts)
+    second = next(all_parts, None)
+    if second is None:
+        return first
+    octree = SemanticOctree(first.resolution, first.octree.num_classes)
+    for part in itertools.chain((first, second), all_parts):
+        octree.overwrite(part.octree, np.arange(part.octree.num_bricks))
+    return StoredMap(
+        octree, first.robot_id, first.tick, first.stamp_ns, first.prior, first.num_robots, first.frame_id, most_bytes
+    )
 
 
 def key_box(bounds: Sequence[float], resolution: float) -> KeyBox:

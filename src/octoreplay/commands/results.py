@@ -135,6 +135,7 @@ def query(
     At a point: the probabilities that it is occupied and free, and those of the classes, from the posterior of the
     team. With --log-odds also h, the logarithm of each class's probability over that of free space.
     """
+    from octoreplay.report.queries import answer_query
     from octoreplay.report.query_tables import box_answer, log_odds_table, point_answers, query_content
     from octoreplay.result import open_result
 
@@ -147,12 +148,11 @@ def query(
     here = terminal()
     with open_result(result) as opened:
         robot_id = opened.robots[0] if robot is None else robot
-        stored = opened.map(robot_id, at_ns=None if seconds is None else opened.time_ns(seconds))
+        at_ns = None if seconds is None else opened.time_ns(seconds)
+        stored, answer, found = answer_query(opened, robot_id, at_ns, points=points, box=box, map_kind=map_kind)
         names, at = ("free", *opened.class_table.names), opened.seconds(stored.stamp_ns)
         title = stored.title(map_kind)
         here.line(f"map of {robot_id} {at:.1f} s after the start ({title}, frame {stored.frame_id})")
-        answer = stored.query(points, map_kind=map_kind) if points else None
-        found = None if box is None else stored.query_box(box[:3], box[3:], map_kind=map_kind)
     if answer is not None:
         here.show(point_answers(names, points, answer))
         if log_odds or here.is_verbose:

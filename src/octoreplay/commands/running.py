@@ -109,6 +109,8 @@ def _check_input(word: str) -> None:
 @click.option("--tiles-z", cls=RareOption, is_flag=True, help="cut the heights too: tiles are cubes")
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
+@click.option("--result-per-tile", cls=RareOption, is_flag=True,
+              help="write the maps of each of the --tiles to a file in OUT.maps, and all else to OUT.mcap")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
               help="write the result as a web page too, as 'octoreplay report' does")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
@@ -131,7 +133,7 @@ def _check_input(word: str) -> None:
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
     checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, tiles_z: bool,
-    jobs: int | None, report: Path | None, save_team: Path | None,
+    jobs: int | None, result_per_tile: bool, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
@@ -148,8 +150,8 @@ def run(
         )
     if resume and restart:
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
-    if tiles is None and (jobs is not None or tiles_z):
-        raise click.UsageError("--jobs and --tiles-z need --tiles")
+    if tiles is None and (jobs is not None or tiles_z or result_per_tile):
+        raise click.UsageError("--jobs, --tiles-z and --result-per-tile need --tiles")
     if tiles is not None and checkpoint_every is not None:
         raise click.UsageError("--checkpoint-every is for runs without --tiles")
     if output is not None:
@@ -194,7 +196,7 @@ def run(
     if tiles is not None:
         summary = replay_tiles_with_bar(
             config, output, None if tiles == _AUTO else float(tiles), cut_heights=tiles_z, num_jobs=jobs or 1,
-            memory_limit=memory_limit, restart=restart, resume=resume,
+            memory_limit=memory_limit, result_per_tile=result_per_tile, restart=restart, resume=resume,
         )  # fmt: skip
     else:
         summary = replay_with_bar(

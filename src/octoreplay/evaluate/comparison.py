@@ -6,9 +6,11 @@ All numbers count finest cells, independent of the leaves that store them (docs/
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
-from collections.abc import Iterator, Set
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,8 +206,49 @@ def compare_results(
 def _map_difference(
     result_a: Result, result_b: Result, robot_id: str, at: float | None, tolerance: float
 ) -> MapDifference:
-    """Compare one robot's maps."""
-    a, b = (result.map(robot_id, at_ns=None if at is None else result.time_ns(at)) for result in (result_a, result_b))
+    """Compare one robot's maps, in tiles where both results have tiles."""
+    parts = (
+        _part_difference(result_a, result_b, robot_id, at, tolerance, box) for box in result_a.boxes(beside=[result_b])
+    )
+    places = {name: place for place, name in enumerate((UNKNOWN, "free", *result_a.class_table.names))}
+    return functools.reduce(functools.partial(_joined, places), parts)
+
+
+def _joined(places: Mapping[str, int], first: MapDifference, second: MapDifference) -> MapDifference:
+    """Difference of two parts of the same maps; ``places`` order the labels."""
+    counts = {
+        item.name: getattr(first, item.name) + getattr(second, item.name)
+        for item in dataclasses.fields(MapDifference)
+        if item.name.startswith("num_")
+    }
+    changes = Counter({(change.label_a, change.label_b): change.num_cells for change in first.label_changes})
+    changes.update({(change.label_a, change.label_b): change.num_cells for change in second.label_changes})
+    ordered = sorted(changes.items(), key=lambda item: (-item[1], *(places[label] for label in item[0])))
+    largest = second if second.largest_difference > first.largest_difference else first
+    corners = [(part.lower, part.upper) for part in (first, second) if part.lower is not None]
+    return dataclasses.replace(
+        first, **counts, label_changes=tuple(LabelChange(*labels, count) for labels, count in ordered),
+        largest_difference=largest.largest_difference, largest_at=largest.largest_at,
+        lower=_extreme(min, [lower for lower, _ in corners]), upper=_extreme(max, [upper for _, upper in corners]),
+    )  # fmt: skip
+
+
+def _extreme(choose: Callable[[Iterable[float]], float], points: Sequence[Point | None]) -> Point | None:
+    """Least or largest coordinates of points; None without points."""
+    if not points:
+        return None
+    x, y, z = (choose(values) for values in zip(*(point for point in points if point is not None), strict=True))
+    return x, y, z
+
+
+def _part_difference(
+    result_a: Result, result_b: Result, robot_id: str, at: float | None, tolerance: float, bounds: Sequence[float]
+) -> MapDifference:
+    """Compare one robot's maps in a box."""
+    a, b = (
+        result.map(robot_id, at_ns=None if at is None else result.time_ns(at), bounds=bounds)
+        for result in (result_a, result_b)
+    )
     spans_a, spans_b = a.octree.spans(), b.octree.spans()
     intervals = common_intervals(spans_a, spans_b)
     known_a, known_b = intervals.leaves_a >= 0, intervals.leaves_b >= 0

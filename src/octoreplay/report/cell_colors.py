@@ -27,6 +27,8 @@ COLORS = ("label", "height", "robot", "seen-by", "disagreement", "contradiction"
 - 'contradiction': relation of the robots' evidence in the cell (``CellContradiction``)
 - 'probability': probability of the label, from 1 / (C + 1), dark, to 1, yellow
 """
+SCALED = ("height", "disagreement")
+"""Quantities whose scale depends on the shown leaves."""
 FREE_COLOR = (225, 225, 225)
 CONTRADICTION_COLORS: dict[CellContradiction, tuple[str, Color]] = {
     CellContradiction.UNCOMPARED: ("known to fewer than two robots", (190, 190, 190)),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from octoreplay.errors import InputError
 from octoreplay.mapping.octree import KEY_BITS
 from octoreplay.result import Result
-from octoreplay.stored_map import StoredMap
+from octoreplay.stored_map import StoredMap, joined_map
 
 
 class MapPart(NamedTuple):
@@ -22,9 +22,20 @@ class MapPart(NamedTuple):
     bounds: Sequence[float] = ()
     max_depth: int | None = None
 
+    def parts(self, result: Result) -> Iterator[MapPart]:
+        """Yield the parts of this one that hold one tile each; the part itself for an ordinary result."""
+        for bounds in result.boxes(self.bounds, max_depth=self.max_depth):
+            yield self._replace(bounds=bounds)
+
     def map(self, result: Result, robot_id: str) -> StoredMap:
         """Return this part of a robot's map. Raises as ``Result.map`` and ``StoredMap.coarsened``."""
-        return result.map(robot_id, at_ns=self.at_ns, bounds=self.bounds).coarsened(self.max_depth)
+        if self.max_depth is None:
+            return result.map(robot_id, at_ns=self.at_ns, bounds=self.bounds)
+        # Each part becomes coarser before the next one is read.
+        return joined_map(
+            result.map(robot_id, at_ns=self.at_ns, bounds=part.bounds).coarsened(self.max_depth)
+            for part in self.parts(result)
+        )
 
     def evidence(self, result: Result, robot_id: str) -> StoredMap:
         """Return this part of a robot's evidence. Raises as ``Result.evidence`` and ``StoredMap.coarsened``.

@@ -13,7 +13,7 @@ COLORS = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9], [250, 251, 252]], dtype=np.u
 
 def test_points_hold_centres_colours_labels_and_probabilities(tmp_path: Path) -> None:
     leaves = leaf_table()
-    (tmp_path / "a.ply").write_bytes(ply.points_file(leaves, COLORS, ["first", "second"]))
+    (tmp_path / "a.ply").write_bytes(ply.mesh_file(*ply.points(leaves, COLORS), ["first", "second"]))
     data = PlyData.read(tmp_path / "a.ply")
     vertices = data["vertex"]
     assert [p.name for p in vertices.properties] == [
@@ -32,7 +32,7 @@ def test_points_hold_centres_colours_labels_and_probabilities(tmp_path: Path) ->
 
 def test_voxels_are_closed_cubes_of_the_leaves_sizes(tmp_path: Path) -> None:
     leaves = leaf_table()
-    (tmp_path / "a.ply").write_bytes(ply.voxels_file(leaves, COLORS))
+    (tmp_path / "a.ply").write_bytes(ply.mesh_file(*ply.voxels(leaves, COLORS)))
     data = PlyData.read(tmp_path / "a.ply")
     corners = np.column_stack([data["vertex"][n] for n in "xyz"]).astype(np.float64).reshape(-1, 8, 3)
     np.testing.assert_allclose(corners.mean(axis=1), leaves.centers, atol=1e-6)
@@ -53,8 +53,8 @@ def test_voxels_are_closed_cubes_of_the_leaves_sizes(tmp_path: Path) -> None:
 def test_open3d_reads_points_labels_and_cubes(tmp_path: Path) -> None:
     o3d = pytest.importorskip("open3d", exc_type=ImportError)
     leaves = leaf_table()
-    (tmp_path / "points.ply").write_bytes(ply.points_file(leaves, COLORS, ["made by a test"]))
-    (tmp_path / "voxels.ply").write_bytes(ply.voxels_file(leaves, COLORS))
+    (tmp_path / "points.ply").write_bytes(ply.mesh_file(*ply.points(leaves, COLORS), ["made by a test"]))
+    (tmp_path / "voxels.ply").write_bytes(ply.mesh_file(*ply.voxels(leaves, COLORS)))
     cloud = o3d.t.io.read_point_cloud(str(tmp_path / "points.ply"))
     np.testing.assert_allclose(cloud.point.positions.numpy(), leaves.centers, rtol=1e-6)
     assert cloud.point.colors.numpy().tolist() == COLORS.tolist()
@@ -66,6 +66,6 @@ def test_open3d_reads_points_labels_and_cubes(tmp_path: Path) -> None:
 
 def test_an_empty_map_is_an_empty_file(tmp_path: Path) -> None:
     empty = LeafTable(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), dtype=np.float32))
-    for encode in (ply.points_file, ply.voxels_file):
-        (tmp_path / "a.ply").write_bytes(encode(empty, np.zeros((0, 3), dtype=np.uint8)))
+    for encode in (ply.points, ply.voxels):
+        (tmp_path / "a.ply").write_bytes(ply.mesh_file(*encode(empty, np.zeros((0, 3), dtype=np.uint8))))
         assert len(PlyData.read(tmp_path / "a.ply")["vertex"].data) == 0

@@ -29,6 +29,7 @@ from octoreplay.io.messages.ros_types import stamp_to_ns, typestore_of
 from octoreplay.io.results.json_records import value_of
 from octoreplay.io.results.result_writer import READABLE_VERSIONS
 from octoreplay.io.results.stored_records import fields_of, frame_place, map_state, summary_from_metrics, tick_metrics
+from octoreplay.io.results.tile_files import RECORD, TileList
 from octoreplay.io.results.topics import (
     CONTRADICTION_TOPIC,
     FRAMES_TOPIC,
@@ -140,6 +141,17 @@ class ResultReader:
         return found
 
     @property
+    def tiles(self) -> TileList | None:
+        """Files that hold the maps; None where this one does."""
+        values = self._metadata.get(RECORD)
+        if values is None:
+            return None
+        try:
+            return TileList.of(values)
+        except (LookupError, ValueError) as error:
+            raise self._wrong(RECORD, error) from error
+
+    @property
     def topics(self) -> dict[str, str]:
         """Message type of each topic, by topic."""
         summary = self._reader.get_summary()
@@ -221,12 +233,12 @@ class ResultReader:
         """Return (tick, stamp_ns) of a robot's stored maps, or of its stored evidence, in order."""
         return [
             (int(value.tick), stamp_to_ns(value.header.stamp))
-            for _, value in self._messages(self._state_topic(robot_id, evidence))
+            for _, value in self._messages(self.state_topic(robot_id, evidence))
         ]
 
     def state_stamp(self, robot_id: str, tick: int, *, evidence: bool = False) -> int | None:
         """Return the stamp [ns] of a robot's map or evidence stored at a tick, or None. Raises as ``states``."""
-        topic = self._state_topic(robot_id, evidence)
+        topic = self.state_topic(robot_id, evidence)
         for first_ns, first in self._messages(topic):
             # Ticks are one publish period apart, so only the chunks at the tick's time need be read.
             period_ns = round(self.config.network.publish_period * 1e9)
@@ -245,7 +257,7 @@ class ResultReader:
         """
         end = None if until_ns is None else until_ns + 1
         chain: list[MapState] = []
-        for _, value in self._messages(self._state_topic(robot_id, evidence), end_ns=end, reverse=True):
+        for _, value in self._messages(self.state_topic(robot_id, evidence), end_ns=end, reverse=True):
             state = map_state(value)
             if chain and state.sequence != chain[-1].base_sequence:
                 continue
@@ -364,8 +376,8 @@ class ResultReader:
             raise InputError(f"{self.path}: robot '{robot_id}' not found; robots: {', '.join(self.robots)}")
         return robot_id
 
-    def _state_topic(self, robot_id: str, evidence: bool) -> str:
-        """Return the topic of a robot's maps or evidence; raise InputError for an unknown robot."""
+    def state_topic(self, robot_id: str, evidence: bool) -> str:
+        """Return the topic of a robot's maps or evidence. Raises InputError for an unknown robot."""
         if evidence and robot_id == CENTRAL:
             raise InputError(f"{self.path}: the centralised map has no evidence; robots: {', '.join(self.robots)}")
         return (evidence_topic if evidence else map_state_topic)(self._known(robot_id))

@@ -25,6 +25,7 @@ from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_f
 from octoreplay.io.containers.mcap_writer import RosMcapWriter, Written
 from octoreplay.io.messages.ros_types import header, message
 from octoreplay.io.output_file import locked, publish, sync_folder, temporary_path, writing
+from octoreplay.io.results import tile_files
 from octoreplay.io.results.geometry_messages import (
     point,
     quaternion,
@@ -35,6 +36,7 @@ from octoreplay.io.results.geometry_messages import (
 from octoreplay.io.results.map_messages import CLOUD, GRID, OCTOMAP, cloud_message, grid_message, octomap_message
 from octoreplay.io.results.markers import graph_markers, map_markers
 from octoreplay.io.results.occupancy_grid import Grid
+from octoreplay.io.results.tile_files import TileFile, TileList
 from octoreplay.io.results.topics import (
     CONTRADICTION_TOPIC,
     FRAMES_TOPIC,
@@ -93,12 +95,16 @@ class ResultWriter:
     calls give equal bytes: no wall-clock time and nothing machine-dependent is written.
 
     An existing partial file is an error, unless it holds no message or ``restart`` removes it. With ``continues`` it
-    stays as it is until ``take_over`` has copied it. The lock of the output
-    is held until the end. Raises OutputError where the result cannot be written, is being written by another process,
-    or would overwrite an input, and InputError where an input cannot be read for its fingerprint.
+    stays as it is until ``take_over`` has copied it. The lock of the output is held until the end. ``inputs`` are the
+    fingerprints of the logs where they are known. Raises OutputError where the result cannot be written, is being
+    written by another process, or would overwrite an input, and InputError where an input cannot be read for its
+    fingerprint.
     """
 
-    def __init__(self, path: Path, config: ResolvedRun, *, restart: bool = False, continues: bool = False) -> None:
+    def __init__(
+        self, path: Path, config: ResolvedRun, *, restart: bool = False, continues: bool = False,
+        inputs: Mapping[str, Fingerprint] | None = None,
+    ) -> None:  # fmt: skip
         self.path = path
         self.partial_path = partial_path(path)
         self._work_path = temporary_path(self.partial_path) if continues else self.partial_path
@@ -107,10 +113,11 @@ class ResultWriter:
         self._started = False
         self._has_ticks = False
         self._is_kept = False
+        self._tiles: tuple[TileFile, ...] = ()
         self._check_path()
         with contextlib.ExitStack() as stack:
             stack.enter_context(locked(path))
-            inputs = self._inputs()
+            self.inputs = self._inputs() if inputs is None else inputs
             with interrupts.deferred():
                 if not restart and not continues:
                     check_unstarted(path)
@@ -118,7 +125,7 @@ class ResultWriter:
                     self._work_path.unlink(missing_ok=True)
                 self._writer = RosMcapWriter(self._work_path, data_crc=True)
                 stack.callback(self._discard)
-                self._write_description(inputs)
+                self._write_description(self.inputs)
                 # All that a reader needs besides chunks is safe before the first of them.
                 self._writer.sync()
                 with writing(path):
@@ -163,6 +170,11 @@ class ResultWriter:
         for name, values in self.description.items():
             if values != earlier[name]:
                 raise ConfigError(f"{self.path}: cannot be continued: {_difference(name, values, earlier[name])}")
+
+    def write_tiles(self, tiles: TileList) -> None:
+        """Write the list of the files that hold the maps, before the first tick."""
+        self._writer.write_metadata(tile_files.RECORD, tiles.values())
+        self._tiles = tiles.files
 
     def write_state(self, state: MapState) -> None:
         """Write one robot's map, a key frame or a delta, to ``/<robot>/map_state``."""
@@ -281,7 +293,10 @@ class ResultWriter:
         self._writer.write(packet_topic(robot_id), type_name, value, stamp_ns)
 
     def complete(self, summary: RunSummary) -> None:
-        """Write the summary of the run, finish the file and rename it to its final name."""
+        """Write the summary of the run, finish the file and rename it to its final name.
+
+        Files of tiles that only an earlier result of this name listed are removed.
+        """
         interrupts.check()
         with interrupts.deferred():
             self._writer.write_metadata("summary", _summary_values(self._with_relative_paths(summary)))
@@ -292,6 +307,7 @@ class ResultWriter:
                 )
             with writing(self.path):
                 publish(self.partial_path, self.path)
+            tile_files.remove_others(self.path, self._tiles)
 
     def _keep(self, error: BaseException) -> None:
         """Finish the file under its temporary name where that is possible, and note it in the exception."""
@@ -355,7 +371,7 @@ class ResultWriter:
         files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
 
-    def _write_description(self, inputs: dict[str, Fingerprint]) -> None:
+    def _write_description(self, inputs: Mapping[str, Fingerprint]) -> None:
         """Write the metadata: format, configuration, classes and fingerprints of the inputs."""
         config, folder = self._config, self.path.parent.resolve()
         robots = tuple(robot.with_paths_from(folder) for robot in config.robots)

@@ -43,7 +43,7 @@ class JoinedMaps:
         self.num_evidence_cells: dict[str, int] = {}
         self._config = config
         self._files = [TileFiles(folder, tile) for tile in tiles]
-        self._folder = folder / "joined"
+        self._folder = folder / f"{tiles[0].name}.joined"
         self._robot_ids = [robot.robot_id for robot in config.robots]
         self._names = (*self._robot_ids, CENTRAL)
 
@@ -114,6 +114,20 @@ class JoinedMaps:
         return SemanticOctree(self._config.map.resolution, self._config.classes.num_classes)
 
 
+class OtherMaps:
+    """Maps of a run that other files hold; ``num_evidence_cells`` are as in ``JoinedMaps``."""
+
+    def __init__(self, num_evidence_cells: Mapping[str, int]) -> None:
+        self.num_evidence_cells = num_evidence_cells
+
+    def encode(self, threads: Executor) -> None:
+        """Do nothing."""
+
+    def write(self, _: MapSink) -> Iterator[None]:
+        """Give nothing to a sink, tick after tick."""
+        yield from itertools.repeat(None)
+
+
 def _spool_name(index: int, write: str) -> str:
     """Name of the file of one map's calls of a method."""
     return f"{index}.{write}"
@@ -149,7 +163,7 @@ class _Spool:
 
 
 class _Entries:
-    """Calls in one file of a ``_Spool``; a context manager."""
+    """Calls in one file of a ``_Spool``; a context manager that removes the file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -160,6 +174,8 @@ class _Entries:
 
     def __exit__(self, *error: object) -> None:
         self._file.close()
+        with writing(self._path):
+            self._path.unlink(missing_ok=True)
 
     def of_tick(self, number: int) -> Iterator[tuple[Any, ...]]:
         """Arguments of the calls of one tick."""

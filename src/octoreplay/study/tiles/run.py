@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import logging
 import math
@@ -11,7 +12,6 @@ import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -26,19 +26,17 @@ from octoreplay.io.output_file import write_whole, writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.mapping.warm_up import second_compiler
-from octoreplay.records import CONVERGED, FilePath, FrameCounts
+from octoreplay.records import FilePath, FrameCounts
 from octoreplay.replay.run import check_num_ticks, frame_causes
-from octoreplay.replay.team_recorder import TeamRecorder
-from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
 from octoreplay.study.tiles.forecast import BLOCK_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
-from octoreplay.study.tiles.joined_maps import JoinedMaps
-from octoreplay.study.tiles.joined_ticks import joined_ticks
+from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index
 from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
 from octoreplay.study.tiles.worker import Request, Setup, Workers
+from octoreplay.study.tiles.written import Outcome, write_result, write_tiles
 
 _log = logging.getLogger(__name__)
 
@@ -64,6 +62,7 @@ def replay_tiles(
     num_threads: int | None = None,
     memory_limit: int | None = None,
     progress: Progress | None = None,
+    result_per_tile: bool = False,
     restart: bool = False,
     resume: bool = False,
 ) -> RunSummary:
@@ -87,8 +86,11 @@ def replay_tiles(
     memory_limit : int, optional
         Largest memory of all processes together [byte], by default 80 % of what is free.
     progress : function, optional
-        Called with the stage ('cast', 'replay', 'settle' or 'write'), and the numbers of finished robots, tiles or
-        ticks and of all.
+        Called with the stage ('cast', 'replay', 'settle', 'write tiles' or 'write'), and the numbers of finished
+        robots, tiles or ticks and of all.
+    result_per_tile : bool
+        True to write the maps of each tile into a result of its own in the folder ``OUT.maps`` beside the output, which
+        is then the index of them: ``open_result`` reads both as one result. Cubes above each other share a result.
     restart, resume : bool
         Remove, or use, the tiles that an interrupted run has finished. Without either they are an error.
 
@@ -123,9 +125,21 @@ def replay_tiles(
         scans = _cast_scans(setup, num_jobs, given_cells or BLOCK_CELLS, num_axes, progress)
         stages = _replay_all(setup, scans, given_cells, memory_limit, num_jobs, progress)
         tiles = tuple(stages)
-        counts = _counts(config, scans, next(iter(stages.values())).num_frames_off)
+        outcome = Outcome.of(stages, _counts(config, scans, next(iter(stages.values())).num_frames_off))
+        show = progress or (lambda *_: None)
+        maps: JoinedMaps | OtherMaps = JoinedMaps(config, tiles, folder)
+        if result_per_tile:
+            with Workers(setup, num_jobs) as workers:
+                show_tiles = functools.partial(show, "write tiles")
+                files, maps = write_tiles(output, tiles, workers, outcome, writer.inputs, show_tiles)
+            writer.write_tiles(files)
         with interrupts.deferred() as deliver_interrupts:
-            summary = _write(config, writer, tiles, stages, folder, counts, num_threads, progress, deliver_interrupts)
+
+            def show_ticks(done: int) -> None:
+                show("write", done, outcome.num_ticks)
+                deliver_interrupts()
+
+            summary = write_result(config, writer, maps, tiles, folder, outcome, num_threads, show_ticks)
             summary = dataclasses.replace(summary, wall_seconds=time.monotonic() - started)
             deliver_interrupts()
             writer.complete(summary)
@@ -341,36 +355,3 @@ def _settle(
             num_done += 1
             if progress is not None:
                 progress("settle", num_done, len(tiles))
-
-
-def _write(
-    config: ResolvedRun, writer: ResultWriter, tiles: Sequence[Tile], stages: Mapping[Tile, Stage], folder: Path,
-    counts: Mapping[str, FrameCounts], num_threads: int, progress: Progress | None,
-    deliver_interrupts: Callable[[], None],
-) -> RunSummary:  # fmt: skip
-    """Write all ticks and maps of the run, and return its summary without the wall time."""
-    first = next(iter(stages.values()))
-    maps = JoinedMaps(config, tiles, folder)
-    with ThreadPoolExecutor(num_threads) as threads, TeamRecorder(config, writer, threads) as recorder:
-        maps.encode(threads)
-        deliver_interrupts()
-        written_maps = maps.write(recorder.queue)
-        for tick in joined_ticks(config, tiles, folder):
-            recorder.record(tick.metrics, tick.graph, tick.poses)
-            next(written_maps)
-            recorder.queue.start()
-            if progress is not None:
-                progress("write", tick.metrics.tick + 1, first.num_ticks)
-            deliver_interrupts()
-        assert recorder.last is not None
-        warnings = (
-            *config.warnings,
-            *rule_warnings(config, first.is_symmetric),
-            *map_warnings(recorder.last.num_known_cells),
-            *team_frame_warnings(recorder.last, {name: n for name, n in maps.num_evidence_cells.items() if n}),
-            *coverage_warnings(counts),
-        )
-        # A tile that has not settled stands for the team.
-        reasons = {stage.stop_reason for stage in stages.values()}
-        reason = next(iter(reasons - {CONVERGED}), CONVERGED)
-        return recorder.finish(reason, counts, warnings, math.nan)
