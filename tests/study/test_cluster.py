@@ -3,66 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from octoreplay import __version__
 from octoreplay.errors import ConfigError, InputError
-from octoreplay.study import cluster
+from octoreplay.study import cluster, dask_client
 from octoreplay.study.sweep import check_workers
 from octoreplay.study.task import Task
+from support.clusters import Cluster, dask
 from support.command_line import octoreplay_process, started, wait_for
 from support.fixture_paths import PAIR_TEAM
 from support.sweeps import QUICK, is_running, table
 
 pytestmark = pytest.mark.long
 
+__all__ = ["dask"]
+
 GRID = ("--vary", "rule=gradient,bayes", "--vary", "loss=0,0.3", *QUICK)
 ENDLESS = ("--settle", "100000", "--settle-max", "100000", *QUICK)
-
-
-@dataclasses.dataclass
-class Cluster:
-    address: str
-    scheduler: subprocess.Popen[bytes]
-    workers: list[subprocess.Popen[bytes]]
-
-    def children(self) -> list[Path]:
-        """Child processes of the workers, as folders in /proc."""
-        lists = (path for worker in self.workers for path in Path(f"/proc/{worker.pid}/task").glob("*/children"))
-        return [Path("/proc") / pid for path in lists for pid in path.read_text().split()]
-
-
-@pytest.fixture
-def dask(tmp_path: Path) -> Iterator[Cluster]:
-    """Scheduler with two workers."""
-    pytest.importorskip("distributed")
-    file = tmp_path / "scheduler.json"
-    started: list[subprocess.Popen[bytes]] = []
-
-    def start(*arguments: str) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "dask", *arguments, "--no-dashboard"], cwd=tmp_path, stderr=subprocess.DEVNULL
-        )
-        started.append(process)
-        return process
-
-    try:
-        scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
-        wait_for(file.exists)
-        address = json.loads(file.read_text())["address"]
-        workers = [start("worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2)]
-        yield Cluster(address, scheduler, workers)
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
 
 
 def test_a_cluster_gives_the_same_table(dask: Cluster, tmp_path: Path) -> None:
@@ -125,7 +87,7 @@ def test_a_lost_scheduler_is_reported_in_one_sentence(dask: Cluster, tmp_path: P
 
 def test_an_unusable_scheduler_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = some_task(tmp_path)
-    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr(dask_client, "_CONNECT_SECONDS", 1.0)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: no dask scheduler answered within 1 s; start one"):
         list(cluster.execute_on_cluster([task], "tcp://127.0.0.1:9"))
     for address in ("here", "http://127.0.0.1:80", "tcp://here", "tcp://:x"):

@@ -109,6 +109,8 @@ def _check_input(word: str) -> None:
 @click.option("--tiles-z", cls=RareOption, is_flag=True, help="cut the heights too: tiles are cubes")
 @click.option("--jobs", cls=RareOption, type=click.IntRange(min=1), metavar="N",
               help="number of --tiles that are replayed at once  [default: 1]")  # fmt: skip
+@click.option("--scheduler", cls=RareOption, metavar="tcp://HOST:PORT",
+              help="address of a dask scheduler; --tiles are replayed on its workers")  # fmt: skip
 @click.option("--result-per-tile", cls=RareOption, is_flag=True,
               help="write the maps of each of the --tiles to a file in OUT.maps, and all else to OUT.mcap")  # fmt: skip
 @click.option("--report", type=existing_path, metavar="PAGE.html",
@@ -133,7 +135,7 @@ def _check_input(word: str) -> None:
 def run(
     inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
     checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, tiles_z: bool,
-    jobs: int | None, result_per_tile: bool, report: Path | None, save_team: Path | None,
+    jobs: int | None, scheduler: str | None, result_per_tile: bool, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,
     dof: str | None, static_poses: tuple[str, ...], classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
@@ -150,8 +152,8 @@ def run(
         )
     if resume and restart:
         raise click.UsageError("--resume continues an earlier run and --restart removes it; give one of them")
-    if tiles is None and (jobs is not None or tiles_z or result_per_tile):
-        raise click.UsageError("--jobs, --tiles-z and --result-per-tile need --tiles")
+    if tiles is None and (jobs is not None or scheduler is not None or tiles_z or result_per_tile):
+        raise click.UsageError("--jobs, --scheduler, --tiles-z and --result-per-tile need --tiles")
     if tiles is not None and checkpoint_every is not None:
         raise click.UsageError("--checkpoint-every is for runs without --tiles")
     if output is not None:
@@ -196,7 +198,8 @@ def run(
     if tiles is not None:
         summary = replay_tiles_with_bar(
             config, output, None if tiles == _AUTO else float(tiles), cut_heights=tiles_z, num_jobs=jobs or 1,
-            memory_limit=memory_limit, result_per_tile=result_per_tile, restart=restart, resume=resume,
+            scheduler=scheduler, memory_limit=memory_limit, result_per_tile=result_per_tile,
+            restart=restart, resume=resume,
         )  # fmt: skip
     else:
         summary = replay_with_bar(
@@ -234,7 +237,8 @@ def _takes_more(config: ResolvedRun, output: Path, memory_limit: int, *, resume:
     """Return True for a run that takes more memory than a limit without tiles, and can be replayed in them."""
     from octoreplay.replay.checkpoint import can_resume
     from octoreplay.study.tiles.forecast import takes_tiles
-    from octoreplay.study.tiles.run import can_resume_tiles, check_separable
+    from octoreplay.study.tiles.run import check_separable
+    from octoreplay.study.tiles.work_folder import can_resume_tiles
 
     if resume and (can_resume_tiles(output) or can_resume(output)):
         return can_resume_tiles(output)

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import logging
 from collections.abc import Generator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from octoreplay._version import __version__
-from octoreplay.errors import ConfigError, InputError
+from octoreplay.errors import InputError
+from octoreplay.study.dask_client import connected, distributed
 from octoreplay.study.process import TaskProcess
 from octoreplay.study.task import Row, Task, failed
 
-logger = logging.getLogger(__name__)
-
-_CONNECT_SECONDS = 5.0
 _POLL_SECONDS = 1.0
 """Period at which a worker checks that the sweep has not ended."""
 
@@ -33,14 +27,12 @@ def execute_on_cluster(tasks: Sequence[Task], scheduler: str) -> Generator[tuple
 
     Raises ConfigError if dask.distributed is not installed, InputError if the scheduler does not answer or is lost.
     """
-    distributed = _distributed()
-    with _quiet(), _connected(scheduler) as client:
-        if not client.scheduler_info(n_workers=1)["workers"]:
-            logger.info("%s: no worker is connected; waiting for one", scheduler)
+    dask = distributed()
+    with connected(scheduler) as client:
         # For pure functions dask returns the cached result of an equal call.
         waiting = {client.submit(execute_on_worker, dataclasses.asdict(task), pure=False): task for task in tasks}
         try:
-            for future in distributed.as_completed(list(waiting), loop=client.loop):
+            for future in dask.as_completed(list(waiting), loop=client.loop):
                 yield waiting.pop(future), _row(future, scheduler)
         finally:
             client.cancel(list(waiting))
@@ -77,49 +69,9 @@ def _row(future: Any, scheduler: str) -> Row:
             f"{scheduler}: the connection to the scheduler was lost; finished runs are kept, and the same command"
             " continues with the others"
         ) from None
-    except _distributed().KilledWorker:
+    except distributed().KilledWorker:
         return failed("every worker that executed the run was lost; the workers may be out of memory")
     # A worker may raise anything before it starts the process, such as ImportError without octoreplay.
     except Exception as error:
         return failed(f"the worker could not start the run: {type(error).__name__}: {error}")
     return row
-
-
-@contextmanager
-def _connected(scheduler: str) -> Generator[Any]:
-    """Client of the scheduler that does not become dask's default client."""
-    distributed = _distributed()
-    try:
-        client = distributed.Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
-    # A server of another kind may cause any exception.
-    except Exception as error:
-        raise InputError(
-            f"{scheduler}: no dask scheduler answered within {_CONNECT_SECONDS:g} s; start one with 'dask scheduler'"
-        ) from error
-    with client:
-        yield client
-
-
-def _distributed() -> ModuleType:
-    """Import dask.distributed, an optional dependency."""
-    try:
-        return importlib.import_module("distributed")
-    except ImportError:
-        raise ConfigError(
-            "scheduler: dask.distributed is not installed; use pip install 'octoreplay[cluster]'"
-        ) from None
-
-
-@contextmanager
-def _quiet() -> Generator[None]:
-    """Silence dask's logs of lost workers and connections, which the rows and InputError report."""
-    # dask sets levels on some of its own loggers.
-    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
-    levels = {dask_logger: dask_logger.level for dask_logger in map(logging.getLogger, names)}
-    for dask_logger in levels:
-        dask_logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for dask_logger, level in levels.items():
-            dask_logger.setLevel(level)

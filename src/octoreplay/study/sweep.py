@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -24,6 +23,7 @@ from octoreplay.io.containers.fingerprint import fingerprint, log_files
 from octoreplay.io.output_file import mark_written
 from octoreplay.records import FilePath
 from octoreplay.report.sweep_plots import write_sweep_figures
+from octoreplay.study.dask_client import check_address
 from octoreplay.study.folder import SweepFolder
 from octoreplay.study.grid import Combination, Variation, check_variations, combinations, parse_variation
 from octoreplay.study.local import execute_locally
@@ -189,8 +189,7 @@ def check_workers(num_jobs: int | None, num_threads: int, scheduler: str | None)
     if scheduler is not None:
         if num_jobs is not None:
             raise ConfigError("--jobs applies to this machine and --scheduler to a cluster; leave one out")
-        if not re.fullmatch(r"(tcp|tls|ucx|ws|wss)://[^/\s]+:\d{1,5}/?", scheduler):
-            raise ConfigError(f"scheduler: '{scheduler}' is not an address such as tcp://host:8786")
+        check_address(scheduler)
 
 
 class _Table:

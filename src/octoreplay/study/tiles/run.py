@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import logging
 import math
 import os
 import resource
-import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +19,8 @@ from octoreplay import interrupts
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
-from octoreplay.errors import ConfigError, InputError, MemoryLimitError, OutputError
-from octoreplay.io.output_file import write_whole, writing
+from octoreplay.errors import ConfigError, InputError, MemoryLimitError
+from octoreplay.io.output_file import writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
 from octoreplay.mapping.warm_up import second_compiler
@@ -30,24 +28,25 @@ from octoreplay.records import FilePath, FrameCounts
 from octoreplay.replay.run import check_num_ticks, frame_causes
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
+from octoreplay.study.tiles.cluster_workers import ClusterWorkers, check_cluster
 from octoreplay.study.tiles.forecast import BLOCK_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index
 from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
-from octoreplay.study.tiles.worker import Request, Setup, Workers
+from octoreplay.study.tiles.work_folder import keep_tiles_of, work_folder
+from octoreplay.study.tiles.worker import LocalWorkers, Request, Setup, Workers
 from octoreplay.study.tiles.written import Outcome, write_result, write_tiles
 
 _log = logging.getLogger(__name__)
 
-_DESCRIPTION = "run.json"
-_EDGE = "edge"
-"""File with the edge of the tiles in a work folder [cell]."""
 _RETRY_SHARE = 0.7
 """Share of the forecast that was too low, into which the tiles of the next try must fit."""
 _OTHER_FILES = 64
 """Open files of a process besides those of tiles."""
 
+StartWorkers = Callable[[Setup], Workers]
+"""Function that starts the workers of a run."""
 Progress = Callable[[str, int, int], None]
 """Function that is called with a stage, and the numbers of finished robots, tiles or ticks and of all."""
 
@@ -59,6 +58,7 @@ def replay_tiles(
     *,
     cut_heights: bool = False,
     num_jobs: int = 1,
+    scheduler: str | None = None,
     num_threads: int | None = None,
     memory_limit: int | None = None,
     progress: Progress | None = None,
@@ -81,10 +81,15 @@ def replay_tiles(
         Cut the heights too: tiles are cubes.
     num_jobs : int
         Number of tiles that are replayed at the same time, each in a process of its own.
+    scheduler : str, optional
+        Address of a dask scheduler such as ``tcp://host:8786``: tiles are replayed on its workers, which need the
+        output's folder and the logs at the same paths.
     num_threads : int, optional
-        Threads of each process; by default the processors are shared among the processes.
+        Threads of each process; by default the processors are shared among the processes, and a process on a cluster
+        has one.
     memory_limit : int, optional
-        Largest memory of all processes together [byte], by default 80 % of what is free.
+        Largest memory of all processes together [byte], by default 80 % of what is free. On a cluster, that of one
+        process; tiles of a given edge then need none.
     progress : function, optional
         Called with the stage ('cast', 'replay', 'settle', 'write tiles' or 'write'), and the numbers of finished
         robots, tiles or ticks and of all.
@@ -116,20 +121,28 @@ def replay_tiles(
     given_cells = None if edge is None else tile_cells(edge, config.map.resolution)
     check_separable(config)
     check_num_ticks(config, config.total_ns)
-    num_threads = num_threads or max(1, (os.cpu_count() or 1) // num_jobs)
+    if scheduler is None:
+        start_workers: StartWorkers = functools.partial(LocalWorkers, num_jobs=num_jobs)
+        needs_limit = edge is None or memory_limit is not None
+        room = worker_memory(memory_limit or available_memory(), num_jobs) if needs_limit else None
+    else:
+        check_cluster(scheduler, num_jobs, is_auto=edge is None, has_limit=memory_limit is not None)
+        start_workers, room = functools.partial(ClusterWorkers, scheduler=scheduler), memory_limit
+    num_threads = num_threads or (1 if scheduler else max(1, (os.cpu_count() or 1) // num_jobs))
     with ExitStack() as stack:
         stack.enter_context(second_compiler())
         writer = stack.enter_context(ResultWriter(output, config, restart=restart or resume))
-        folder = stack.enter_context(_work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
-        setup = Setup(config, folder, num_threads)
-        scans = _cast_scans(setup, num_jobs, given_cells or BLOCK_CELLS, num_axes, progress)
-        stages = _replay_all(setup, scans, given_cells, memory_limit, num_jobs, progress)
+        folder = stack.enter_context(work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
+        robots = tuple(robot.with_absolute_paths() for robot in config.robots)
+        setup = Setup(dataclasses.replace(config, robots=robots), folder.absolute(), num_threads, room)
+        scans = _cast_scans(setup, start_workers, given_cells or BLOCK_CELLS, num_axes, progress)
+        stages = _replay_all(setup, start_workers, scans, given_cells, progress)
         tiles = tuple(stages)
         outcome = Outcome.of(stages, _counts(config, scans, next(iter(stages.values())).num_frames_off))
         show = progress or (lambda *_: None)
         maps: JoinedMaps | OtherMaps = JoinedMaps(config, tiles, folder)
         if result_per_tile:
-            with Workers(setup, num_jobs) as workers:
+            with start_workers(setup) as workers:
                 show_tiles = functools.partial(show, "write tiles")
                 files, maps = write_tiles(output, tiles, workers, outcome, writer.inputs, show_tiles)
             writer.write_tiles(files)
@@ -177,68 +190,8 @@ def _allow_open_files(num_tiles: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def can_resume_tiles(output: Path) -> bool:
-    """Return True where an interrupted run in tiles left its work folder."""
-    return (_folder_of(output) / _DESCRIPTION).exists()
-
-
-def _folder_of(output: Path) -> Path:
-    """Work folder of a result."""
-    return output.with_name(f"{output.stem}.tiles")
-
-
-@contextmanager
-def _work_folder(
-    writer: ResultWriter, num_cells: int | None, num_axes: int, *, restart: bool, resume: bool
-) -> Iterator[Path]:
-    """Folder of the work files; after an error it is kept if a tile is finished, and a note of the error names it.
-
-    Raises OutputError, InputError and ConfigError where an earlier run left a folder that cannot be used.
-    """
-    folder = _folder_of(writer.path)
-    description = {**writer.description, "tiles": {"cells": str(num_cells or "auto"), "axes": str(num_axes)}}
-    with writing(folder):
-        if folder.exists() and not (restart or resume):
-            raise OutputError(
-                f"{folder}: an earlier run left these tiles; continue it with --resume, or remove them and start again"
-                " with --restart"
-            )
-        continues = resume and (folder / _DESCRIPTION).exists()
-        if not continues:
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-    if continues:
-        _check_same(writer, folder / _DESCRIPTION, description)
-    else:
-        write_whole(folder / _DESCRIPTION, json.dumps(description))
-    try:
-        yield folder
-    except BaseException as error:
-        if any(folder.glob("robot_*.index")):
-            error.add_note(f"the finished parts are in {folder}; --resume continues the run")
-        elif not continues:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _check_same(writer: ResultWriter, path: Path, description: Mapping[str, Mapping[str, str]]) -> None:
-    """Raise ConfigError where the tiles of an earlier run are those of other settings."""
-    try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
-        tiles = earlier["tiles"]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read; run with --restart to start from the beginning") from error
-    if tiles != description["tiles"]:
-        raise ConfigError(
-            f"{writer.path}: cannot be continued: the tiles had another form; use the same --tiles and --tiles-z, or"
-            " run with --restart to start from the beginning"
-        )
-    writer.check_same(earlier)
-
-
 def _cast_scans(
-    setup: Setup, num_jobs: int, block_cells: int, num_axes: int, progress: Progress | None
+    setup: Setup, start_workers: StartWorkers, block_cells: int, num_axes: int, progress: Progress | None
 ) -> list[ScanIndex]:
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
     config, folder = setup.config, setup.folder
@@ -249,7 +202,7 @@ def _cast_scans(
         for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
-    with Workers(setup, num_jobs) as workers:
+    with start_workers(setup) as workers:
         for num_robots in workers.answers(requests):
             num_done += num_robots
             if progress is not None:
@@ -265,39 +218,26 @@ def _cast_scans(
 
 
 def _replay_all(
-    setup: Setup, scans: Sequence[ScanIndex], given_cells: int | None, memory_limit: int | None, num_jobs: int,
+    setup: Setup, start_workers: StartWorkers, scans: Sequence[ScanIndex], given_cells: int | None,
     progress: Progress | None,
 ) -> dict[Tile, Stage]:  # fmt: skip
     """Replay all tiles up to their last tick, with a given edge or with the largest one that fits into the memory."""
-    room = math.inf
-    if given_cells is None or memory_limit is not None:
-        setup = dataclasses.replace(setup, memory_limit=worker_memory(memory_limit or available_memory(), num_jobs))
-        assert setup.memory_limit is not None
-        room = setup.memory_limit
+    room: float = setup.memory_limit or math.inf
     while True:
         num_cells = given_cells or chosen_cells(setup.config, scans, room)
         tiles = _tiles(setup.config, scans, num_cells)
         _allow_open_files(len(tiles))
-        _keep_tiles_of(setup.folder, num_cells)
+        keep_tiles_of(setup.folder, num_cells)
         try:
-            with Workers(setup, num_jobs) as workers:
-                stages = _replay_logs(tiles, workers, setup.folder, progress)
-                return _settle(tiles, stages, workers, progress)
+            memory = tile_memory(setup.config, scans, num_cells)
+            with start_workers(setup) as workers:
+                stages = _replay_logs(tiles, workers, setup.folder, memory, progress)
+                return _settle(tiles, stages, workers, memory, progress)
         except MemoryLimitError as error:
             if given_cells is not None:
                 raise
             _log.info("%s; the run goes on with smaller tiles", str(error).partition(";")[0])
-            room = _RETRY_SHARE * tile_memory(setup.config, scans, num_cells)
-
-
-def _keep_tiles_of(folder: Path, num_cells: int) -> None:
-    """Remove the work files of tiles with another edge."""
-    path, text = folder / _EDGE, str(num_cells)
-    if not path.exists() or path.read_text(encoding="utf-8") != text:
-        with writing(folder):
-            for tile in folder.glob("tile_*"):
-                tile.unlink()
-        write_whole(path, text)
+            room = _RETRY_SHARE * memory
 
 
 def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> tuple[Tile, ...]:
@@ -322,12 +262,14 @@ def _counts(
     }
 
 
-def _replay_logs(tiles: Sequence[Tile], workers: Workers, folder: Path, progress: Progress | None) -> dict[Tile, Stage]:
+def _replay_logs(
+    tiles: Sequence[Tile], workers: Workers, folder: Path, memory: int, progress: Progress | None
+) -> dict[Tile, Stage]:
     """Replay the logs of all tiles that an earlier run has not finished."""
     stages = {tile: stage for tile in tiles if (stage := TileFiles(folder, tile).read_stage()) is not None}
     if stages:
         _log.info("%d of %d tiles were finished before", len(stages), len(tiles))
-    requests = [Request(tile.name, replay_logs, (tile,)) for tile in tiles if tile not in stages]
+    requests = [Request(tile.name, replay_logs, (tile,), memory) for tile in tiles if tile not in stages]
     for tile, stage in workers.answers(requests):
         stages[tile] = stage
         if progress is not None:
@@ -336,7 +278,7 @@ def _replay_logs(tiles: Sequence[Tile], workers: Workers, folder: Path, progress
 
 
 def _settle(
-    tiles: Sequence[Tile], stages: dict[Tile, Stage], workers: Workers, progress: Progress | None
+    tiles: Sequence[Tile], stages: dict[Tile, Stage], workers: Workers, memory: int, progress: Progress | None
 ) -> dict[Tile, Stage]:
     """Let all tiles settle, in rounds, until all have the same number of ticks.
 
@@ -349,7 +291,7 @@ def _settle(
         if not left:
             return stages
         num_done = len(tiles) - len(left)
-        requests = [Request(tile.name, settle, (tile, largest, least)) for tile in left]
+        requests = [Request(tile.name, settle, (tile, largest, least), memory) for tile in left]
         for tile, stage in workers.answers(requests):
             stages[tile] = stage
             num_done += 1

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, Protocol, Self
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.errors import InputError, OctoreplayError
@@ -53,19 +53,21 @@ class Setup:
 class Request:
     """Work for a worker: a function of a module, called with the ``Setup`` and the arguments; all can be pickled.
 
-    ``name`` is its subject in messages, such as that of a tile.
+    ``name`` is its subject in messages, such as that of a tile. ``memory_bytes`` is the memory that it takes by a
+    forecast.
     """
 
     name: str
     function: Callable[..., Any]
     arguments: tuple[Any, ...] = ()
+    memory_bytes: int = 1_000_000_000
 
 
-class _DiedError(Exception):
+class DiedError(Exception):
     """The worker process ended without an answer."""
 
 
-class _Worker:
+class WorkerProcess:
     """A worker process, started with the first request and again after its death."""
 
     def __init__(self, setup: Setup) -> None:
@@ -73,7 +75,7 @@ class _Worker:
         self._process: subprocess.Popen[bytes] | None = None
 
     def answer(self, request: Request) -> Any:
-        """Return the answer to a request. Raises the error of the request, and _DiedError."""
+        """Return the answer to a request. Raises the error of the request, and DiedError."""
         try:
             if self._process is None:
                 # With -P nothing is imported from the working folder. In a session of its own the child gets no Ctrl-C.
@@ -87,7 +89,7 @@ class _Worker:
             answer = pickle.load(self._process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             code = self.stop()
-            raise _DiedError(f"ended with code {code}" if code >= 0 else f"was killed by signal {-code}") from error
+            raise DiedError(f"ended with code {code}" if code >= 0 else f"was killed by signal {-code}") from error
         if isinstance(answer, BaseException):
             raise answer
         return answer
@@ -98,8 +100,14 @@ class _Worker:
         pickle.dump(content, self._process.stdin, protocol=5)
         self._process.stdin.flush()
 
+    def kill(self) -> None:
+        """Kill the process; the request that it works on ends with DiedError."""
+        if self._process is not None:
+            with contextlib.suppress(OSError):
+                self._process.kill()
+
     def stop(self) -> int:
-        """Kill the process; return its exit code."""
+        """End the process; return its exit code."""
         process, self._process = self._process, None
         if process is None:
             return 0
@@ -112,18 +120,34 @@ class _Worker:
         return process.wait()
 
 
-class Workers:
-    """Worker processes of one run; a context manager that ends them."""
+class Workers(Protocol):
+    """Workers of one run; a context manager that ends their work."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def answers(self, requests: Sequence[Request]) -> Iterator[Any]:
+        """Yield the answers to requests in the order in which they come.
+
+        A request whose process died is given to another one, MAX_TRIES times. Raises the error of a request, and
+        InputError where all processes died or the workers are lost.
+        """
+        ...
+
+
+class LocalWorkers:
+    """Worker processes on this machine (``Workers``)."""
 
     def __init__(self, setup: Setup, num_jobs: int) -> None:
-        self._all = [_Worker(setup) for _ in range(num_jobs)]
-        self._free: SimpleQueue[_Worker] = SimpleQueue()
+        self._all = [WorkerProcess(setup) for _ in range(num_jobs)]
+        self._free: SimpleQueue[WorkerProcess] = SimpleQueue()
         for worker in self._all:
             self._free.put(worker)
         self._is_closed = threading.Event()
         self._threads = ThreadPoolExecutor(num_jobs)
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -133,10 +157,7 @@ class Workers:
         self._threads.shutdown(cancel_futures=True)
 
     def answers(self, requests: Sequence[Request]) -> Iterator[Any]:
-        """Yield the answers to requests in the order in which they come.
-
-        A request whose process died is given to another one, MAX_TRIES times. Raises InputError where all of them died.
-        """
+        """Yield the answers to requests in the order in which they come; see ``Workers``."""
         futures = [self._threads.submit(self._answer, request) for request in requests]
         for future in as_completed(futures):
             yield future.result()
@@ -148,16 +169,26 @@ class Workers:
             for number in range(MAX_TRIES):
                 try:
                     return worker.answer(request)
-                except _DiedError as error:
+                except DiedError as error:
                     if self._is_closed.is_set() or number == MAX_TRIES - 1:
-                        raise InputError(
-                            f"{request.name}: its process {error}, {MAX_TRIES} times; if memory ran out, give a"
-                            " smaller --tiles or fewer --jobs, and --resume"
-                        ) from error
-                    _log.warning("warning: %s: its process %s; it is started again", request.name, error)
+                        raise died(request.name, str(error)) from error
+                    warn_of_death(request.name, str(error))
         finally:
             self._free.put(worker)
         raise AssertionError
+
+
+def died(name: str, cause: str) -> InputError:
+    """Return the error of a request whose processes all died."""
+    return InputError(
+        f"{name}: its process {cause}, {MAX_TRIES} times; if memory ran out, give a smaller --tiles or fewer --jobs,"
+        " and --resume"
+    )
+
+
+def warn_of_death(name: str, cause: str) -> None:
+    """Warn of a process that died."""
+    _log.warning("warning: %s: its process %s; it is started again", name, cause)
 
 
 def serve() -> None:
