@@ -141,7 +141,8 @@ def test_other_files_are_those_of_the_whole_run(results, tmp_path: Path, name: s
 
 @long
 def test_queries_are_those_of_the_whole_run(results: tuple[Path, Path]) -> None:
-    points = np.random.default_rng(0).uniform((-12, -12, -0.5), (15, 12, 3), (200, 3)).tolist() + [[1e6, 0.0, 0.0]]
+    inside = np.random.default_rng(0).uniform((-12, -12, -0.5), (15, 12, 3), (200, 3))
+    points = [*inside.tolist(), [1e6, 0.0, 0.0]]
     answers = []
     for path in results:
         with open_result(path) as result:
