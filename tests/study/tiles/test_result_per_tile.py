@@ -52,7 +52,7 @@ def moved(results: tuple[Path, Path], tmp_path: Path) -> Path:
 
 
 def check_close(one, other, place: str = "") -> None:
-    """Compare records: real numbers to 1e-12, all else exactly."""
+    """Compare records: real numbers to 1e-12, calibration errors to 1e-9, all else exactly."""
     if dataclasses.is_dataclass(one):
         one, other = vars(one), vars(other)
     if isinstance(one, dict):
@@ -63,7 +63,9 @@ def check_close(one, other, place: str = "") -> None:
         for number, pair in enumerate(zip(one, other, strict=True)):
             check_close(*pair, f"{place}[{number}]")
     elif isinstance(one, float) and not math.isnan(one):
-        assert other == pytest.approx(one, rel=1e-12, abs=1e-12), place
+        # Probabilities are rounded to 24 bits, which depends on the number of leaves that are computed together.
+        tolerance = 1e-9 if "calibration" in place else 1e-12
+        assert other == pytest.approx(one, rel=tolerance, abs=tolerance), place
     else:
         assert one == other or (one != one and other != other), place
 
