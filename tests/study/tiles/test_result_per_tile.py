@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from octoreplay.config.team_file import load_team_file
-from octoreplay.errors import InputError
+from octoreplay.errors import InputError, OutputError
 from octoreplay.evaluate.comparison import compare_results
 from octoreplay.evaluate.evaluation import evaluate_result
 from octoreplay.io.results.tile_files import maps_folder
@@ -22,6 +22,7 @@ from octoreplay.report.cell_colors import COLORS
 from octoreplay.report.export import export_map
 from octoreplay.report.queries import answer_query
 from octoreplay.result import open_result
+from octoreplay.study.tiles import run as tiled_run
 from octoreplay.study.tiles.run import replay_tiles
 from support.command_line import octoreplay
 from support.fixture_paths import TRIO_TEAM
@@ -188,6 +189,33 @@ def test_a_moved_result_is_read_and_lost_or_damaged_files_are_named(moved: Path)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert f"{first.name}: is damaged" in done.stderr
+
+
+@long
+def test_an_interrupted_run_keeps_the_earlier_result_and_a_finished_one_replaces_its_files(
+    moved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load_team_file(TRIO_TEAM).with_parameters({"duration": 4.0})
+    earlier = {path.name for path in maps_folder(moved).iterdir()}
+
+    def fail(*_, **__):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tiled_run, "write_result", fail)
+        with pytest.raises(OutputError, match="disk is full"):
+            replay_tiles(config, moved, EDGE, result_per_tile=True)
+    assert earlier < {path.name for path in maps_folder(moved).iterdir()}
+    with open_result(moved) as result:
+        assert result.summary.log_seconds > 4.0
+        assert result.map(CENTRAL).octree.num_cells
+    replay_tiles(config, moved, EDGE, result_per_tile=True, resume=True)
+    with open_result(moved) as result:
+        assert result.tiles is not None
+        listed = {Path(file.file).name for file in result.tiles.files}
+        assert {path.name for path in maps_folder(moved).iterdir()} == listed
+    replay_team(config, moved)
+    assert not maps_folder(moved).exists()
 
 
 @long
