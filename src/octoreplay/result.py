@@ -59,7 +59,7 @@ class Result:
         self.path = path
         self._reader = ResultReader(path)
         tiles = self._reader.tiles
-        self.tiles = None if tiles is None else ResultTiles(path, tiles, Result)
+        self.tiles: ResultTiles[Result] | None = None if tiles is None else ResultTiles(path, tiles, Result)
         self._most_bytes = max_memory(path.stat().st_size if self.tiles is None else self.tiles.num_bytes)
         self._octrees: WeakSet[SemanticOctree] = WeakSet()
 
@@ -262,8 +262,8 @@ class Result:
         return stored.cut(bounds) if len(bounds) else stored
 
     def _of_tiles(
-        self, tiles: ResultTiles, robot_id: str, until_ns: int | None, bounds: Sequence[float], box: KeyBox | None,
-        *, evidence: bool,
+        self, tiles: ResultTiles[Result], robot_id: str, until_ns: int | None, bounds: Sequence[float],
+        box: KeyBox | None, *, evidence: bool,
     ) -> StoredMap:  # fmt: skip
         """Map or evidence in a box from the files of the tiles in it."""
         self._reader.state_topic(robot_id, evidence)
@@ -317,7 +317,7 @@ class Result:
             yield maps if box is None else {name: stored.cut(bounds) for name, stored in maps.items()}
 
     def _history_of_tiles(
-        self, tiles: ResultTiles, bounds: Sequence[float], box: KeyBox | None
+        self, tiles: ResultTiles[Result], bounds: Sequence[float], box: KeyBox | None
     ) -> Iterator[dict[str, StoredMap]]:
         """Maps in a box at every stored tick from the files of the tiles in it."""
         with ExitStack() as stack:

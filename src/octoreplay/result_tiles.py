@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -15,25 +15,29 @@ from octoreplay.mapping.key_box import KeyBox
 from octoreplay.mapping.octree import KEY_BITS, KEY_OFFSET
 from octoreplay.records import Int64Array
 
-if TYPE_CHECKING:
-    from octoreplay.result import Result
-
 MOST_OPEN = 16
 """Number of files that stay open."""
 
 Bounds = tuple[float, ...]
 
 
-class ResultTiles:
+class _Closing(Protocol):
+    def close(self) -> None: ...
+
+
+ResultT = TypeVar("ResultT", bound=_Closing)
+
+
+class ResultTiles(Generic[ResultT]):
     """Results of the tiles of the result ``path``; ``open_file`` opens one."""
 
-    def __init__(self, path: Path, tiles: TileList, open_file: Callable[[Path], Result]) -> None:
+    def __init__(self, path: Path, tiles: TileList, open_file: Callable[[Path], ResultT]) -> None:
         self.num_cells = tiles.num_cells
         self.files = tiles.files
         self.num_bytes = sum(file.size for file in tiles.files)
         self._path = path
         self._open_file = open_file
-        self._opened: dict[TileFile, Result] = {}
+        self._opened: dict[TileFile, ResultT] = {}
         self._reader: ResultReader | None = None
 
     @property
@@ -62,7 +66,7 @@ class ResultTiles:
             (box.low[:2] <= low).all() and (box.high[:2] >= high).all() and (box.low[2], box.high[2]) == heights
         )
 
-    def opened(self, file: TileFile) -> Result:
+    def opened(self, file: TileFile) -> ResultT:
         """Return the result of a tile, which stays open until others were opened. Raises InputError as ``open_new``."""
         found = self._opened.pop(file, None) or self.open_new(file)
         self._opened[file] = found
@@ -70,7 +74,7 @@ class ResultTiles:
             self._opened.pop(next(iter(self._opened))).close()
         return found
 
-    def open_new(self, file: TileFile) -> Result:
+    def open_new(self, file: TileFile) -> ResultT:
         """Return the result of a tile, opened anew. Raises InputError for a file that is missing or another one."""
         return self._open_file(file.checked_path(self._path))
 
@@ -85,7 +89,7 @@ class ResultTiles:
 
 
 def boxes_of(
-    tiles: Sequence[ResultTiles | None], resolution: float, bounds: Sequence[float], max_depth: int | None
+    tiles: Sequence[ResultTiles[Any] | None], resolution: float, bounds: Sequence[float], max_depth: int | None
 ) -> Iterator[Bounds]:
     """Yield boxes that cut the cells in ``bounds`` along the tiles of all results; see ``Result.boxes``."""
     present = [of_result for of_result in tiles if of_result is not None]

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from octoreplay.evaluate.morton_intervals import Region
-from octoreplay.evaluate.scores import agreement, truth_scores
+from octoreplay.evaluate.scores import agreements, truth_counts
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import SemanticOctree, keys_to_codes
 from support import dense_scores
@@ -36,7 +36,8 @@ def scores_of(cells, classes, *, prior=0.0, team=None, observed=None):
     octree, truth = octree_of(cells), truth_of(classes)
     region = Region([octree_of(cells if team is None else team).spans()])
     at_end = region if observed is None else Region([octree_of(observed).spans()])
-    return truth_scores(octree.spans(), prior, truth, region, at_end.holds(truth.codes))
+    counts = truth_counts(octree.spans(), prior, truth, region, at_end.holds(truth.codes))
+    return counts.scores(int(truth.is_class.sum()))
 
 
 @st.composite
@@ -100,7 +101,7 @@ def test_agreement_equals_that_over_cells(scene, prior):
         np.mean([a == b for a, b in labels.values()]),
         np.mean([a == b for a, b in occupied]) if occupied else 1.0,
     )
-    found = agreement(octree_of(cells).spans(), prior, octree_of(reference).spans(), prior, len(both))
+    found = agreements(octree_of(cells).spans(), prior, octree_of(reference).spans(), prior, len(both)).shares
     np.testing.assert_allclose(found, expected)
 
 
@@ -108,9 +109,9 @@ def test_a_tie_in_the_reference_is_agreement():
     here = octree_of({(0, 0, 0): (1.0, 2.0), (1, 0, 0): FREE})
     for scale in (1.0, 0.01):
         tied = {(0, 0, 0): (2.0 * scale, 1.99985 * scale), (1, 0, 0): (0.00015 * scale, -2.0 * scale)}
-        assert agreement(here.spans(), 0.0, octree_of(tied).spans(), 0.0, 2) == (1.0, 1.0)
+        assert agreements(here.spans(), 0.0, octree_of(tied).spans(), 0.0, 2).shares == (1.0, 1.0)
         apart = {(0, 0, 0): (2.0 * scale, 1.99975 * scale), (1, 0, 0): (0.00025 * scale, -2.0 * scale)}
-        assert agreement(here.spans(), 0.0, octree_of(apart).spans(), 0.0, 2) == (0.0, 0.0)
+        assert agreements(here.spans(), 0.0, octree_of(apart).spans(), 0.0, 2).shares == (0.0, 0.0)
 
 
 def test_a_perfect_map_scores_one():
@@ -192,18 +193,18 @@ def test_a_shifted_map_has_lower_scores():
     assert wrong.mean_iou == 3 / 5
     assert (wrong.coverage, wrong.free_accuracy) == (3 / 4, 4 / 5)
     spans = [octree_of(content).spans() for content in (cells, shifted)]
-    assert agreement(spans[0], 0.0, spans[0], 0.0, 512) == (1.0, 1.0)
-    assert agreement(spans[1], 0.0, spans[0], 0.0, 576) == (6 * 64 / 576, 3 / 4)
+    assert agreements(spans[0], 0.0, spans[0], 0.0, 512).shares == (1.0, 1.0)
+    assert agreements(spans[1], 0.0, spans[0], 0.0, 576).shares == (6 * 64 / 576, 3 / 4)
 
 
 def test_scores_of_an_empty_map():
     empty = SemanticOctree(0.25, 2).spans()
     truth = truth_of({(0, 0, 0): 1})
     region = Region([octree_of({(0, 0, 0): GROUND}).spans()])
-    found = truth_scores(empty, 0.0, truth, region, np.array([True]))
+    found = truth_counts(empty, 0.0, truth, region, np.array([True])).scores(int(truth.is_class.sum()))
     assert (found.iou[0], found.mean_iou, found.coverage, found.world_coverage) == (0.0, 0.0, 0.0, 0.0)
     assert np.isnan([found.mean_iou_known, found.occupied_accuracy, found.calibration_error]).all()
-    assert agreement(empty, 0.0, empty, 0.0, 0) == (1.0, 1.0)
+    assert agreements(empty, 0.0, empty, 0.0, 0).shares == (1.0, 1.0)
     assert Region([empty]).num_cells == 0
     assert Region([]).num_inside(octree_of({(0, 0, 0): GROUND}).spans()).tolist() == [0]
 

@@ -19,8 +19,51 @@ NUM_BINS = 15
 """Number of bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
 
 
-def truth_scores(spans: LeafSpans, prior: float, truth: Truth, region: Region, is_observed: BoolArray) -> TruthScores:
-    """Return the scores of a map with prior h_0 against the truth.
+class TruthCounts(NamedTuple):
+    """Counts of a map against the truth. Counts of different cells add up with ``plus``.
+
+    Attributes
+    ----------
+    known : (C + 1, C + 1) int64
+        Cells that the map knows, by truth and label.
+    of_team : (C + 1, C + 2) int64
+        Cells of the team's region, by truth and label; the last column counts unknown cells.
+    num_seen, num_observed, num_seen_observed : int
+        Surface cells that the map calls occupied, that the team observed, and both.
+    calibration, calibration_occupied : (3, NUM_BINS) float64
+        Of each bin, correct cells, summed confidence and all cells: of known cells, and of occupied ones.
+    """
+
+    known: Int64Array
+    of_team: Int64Array
+    num_seen: int
+    num_observed: int
+    num_seen_observed: int
+    calibration: Float64Array
+    calibration_occupied: Float64Array
+
+    def plus(self, other: TruthCounts) -> TruthCounts:
+        """Return the counts of the cells of both."""
+        return TruthCounts(**{name: value + getattr(other, name) for name, value in self._asdict().items()})
+
+    def scores(self, num_surface: int) -> TruthScores:
+        """Return the scores against a truth with ``num_surface`` cells of the result's classes."""
+        known, iou = self.known, _intersections_over_unions(self.of_team)
+        return TruthScores(
+            tuple(iou.tolist()),
+            _mean(iou, self.of_team),
+            _mean(_intersections_over_unions(known), known),
+            _ratio(known[1:, 1:].sum(), known[1:].sum()),
+            _ratio(known[0, 0], known[0].sum()),
+            _ratio(self.num_seen_observed, self.num_observed),
+            _ratio(self.num_seen, num_surface),
+            _calibration_error(self.calibration),
+            _calibration_error(self.calibration_occupied),
+        )
+
+
+def truth_counts(spans: LeafSpans, prior: float, truth: Truth, region: Region, is_observed: BoolArray) -> TruthCounts:
+    """Return the counts of a map with prior h_0 against the truth.
 
     ``region`` holds the cells that the team's evidence covers at this tick. ``is_observed`` (M,) bool is True for the
     truth's cells that it covers at the end of the run.
@@ -29,34 +72,54 @@ def truth_scores(spans: LeafSpans, prior: float, truth: Truth, region: Region, i
     surface = _surface_in_leaves(spans, truth)
     log_odds = spans.deviations + np.float32(prior)
     labels = best_labels(log_odds)
-    confusion = of_team = _confusion(labels, surface, truth.class_ids, spans.num_cells, num_classes)
+    known = _confusion(labels, surface, truth.class_ids, spans.num_cells, num_classes)
     # At the end of a run the map often knows all of the region.
-    if not region.is_same(Region([spans])):
+    if region.is_same(Region([spans])):
+        of_team = np.column_stack([known, np.zeros(num_classes + 1, np.int64)])
+    else:
         of_team = _confusion_of_region(labels, surface, spans, truth, region)
-    iou = _intersections_over_unions(of_team)
     is_seen = np.zeros(truth.codes.size, np.bool_)
     is_seen[surface.is_known] = labels[surface.leaves] > 0
+    is_seen &= truth.is_class
     # Classes come first: sums along the short axis would take several times as long.
     by_class = np.ascontiguousarray(log_odds.T)
-    return TruthScores(
-        tuple(iou.tolist()),
-        _mean(iou, of_team),
-        _mean(_intersections_over_unions(confusion), confusion),
-        _ratio(confusion[1:, 1:].sum(), confusion[1:].sum()),
-        _ratio(confusion[0, 0], confusion[0].sum()),
-        _ratio((is_seen & is_observed & truth.is_class).sum(), (is_observed & truth.is_class).sum()),
-        _ratio((is_seen & truth.is_class).sum(), truth.is_class.sum()),
-        *_calibration_errors(by_class, labels, surface, truth.class_ids, spans.num_cells),
-    )
+    return TruthCounts(
+        known, of_team, int(is_seen.sum()), int((is_observed & truth.is_class).sum()),
+        int((is_seen & is_observed).sum()),
+        *_calibrations(by_class, labels, surface, truth.class_ids, spans.num_cells),
+    )  # fmt: skip
 
 
-def agreement(
+class Agreements(NamedTuple):
+    """Cells in which a map has a reference's label, of all cells and of those that the reference calls occupied.
+
+    Counts of different cells add up.
+    """
+
+    num_equal: int
+    num_equal_occupied: int
+    num_cells: int
+    num_occupied: int
+
+    def plus(self, other: Agreements) -> Agreements:
+        """Return the counts of the cells of both."""
+        return Agreements(**{name: value + getattr(other, name) for name, value in self._asdict().items()})
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """Shares of equal labels, of all cells and of the occupied ones; a share of no cells is 1."""
+        return (
+            self.num_equal / self.num_cells if self.num_cells else 1.0,
+            self.num_equal_occupied / self.num_occupied if self.num_occupied else 1.0,
+        )
+
+
+def agreements(
     spans: LeafSpans, prior: float, reference: LeafSpans, reference_prior: float, num_cells: int
-) -> tuple[float, float]:
-    """Return the shares of cells in which a map has the reference's label.
+) -> Agreements:
+    """Return the numbers of cells in which a map has the reference's label, of ``num_cells`` cells.
 
-    The first is of ``num_cells`` cells, the second of the cells that the reference calls occupied. A cell that only one
-    of the maps knows is a disagreement. A share of no cells is 1.
+    A cell that only one of the maps knows is a disagreement.
     """
     intervals = common_intervals(spans, reference)
     both = (intervals.leaves_a >= 0) & (intervals.leaves_b >= 0)
@@ -69,10 +132,10 @@ def agreement(
     agrees = of_label >= best - tolerance
     is_occupied = best_labels(values) > 0
     weights = intervals.num_cells[both] * agrees
-    parts = weights.sum(), weights[is_occupied[other]].sum()
-    wholes = num_cells, reference.num_cells[is_occupied].sum()
-    shares = [float(part / whole) if whole else 1.0 for part, whole in zip(parts, wholes, strict=True)]
-    return shares[0], shares[1]
+    return Agreements(
+        int(weights.sum()), int(weights[is_occupied[other]].sum()), num_cells,
+        int(reference.num_cells[is_occupied].sum()),
+    )  # fmt: skip
 
 
 class _Surface(NamedTuple):
@@ -138,10 +201,10 @@ def _intersections_over_unions(confusion: Int64Array) -> Float64Array:
     return iou
 
 
-def _calibration_errors(
+def _calibrations(
     by_class: Float32Array, labels: UInt8Array, surface: _Surface, class_ids: UInt8Array, num_cells: Int64Array
-) -> tuple[float, float]:
-    """Expected calibration errors of log-odds (C, L): over all cells, and over those occupied in map or truth."""
+) -> tuple[Float64Array, Float64Array]:
+    """Counts of bins of log-odds (C, L): of all cells, and of those occupied in map or truth."""
     is_hit = class_ids[surface.is_known] == labels[surface.leaves]
     num_hits = np.bincount(surface.leaves[is_hit & (labels[surface.leaves] > 0)], minlength=labels.size)
     is_occupied = labels > 0
@@ -151,18 +214,17 @@ def _calibration_errors(
     num_surface = surface.num_cells - surface.num_void
     confidence = 1.0 / shifted_exp_sum(by_class, class_axis=0).astype(np.float64)
     bins = np.clip(np.ceil(confidence * NUM_BINS).astype(np.int64) - 1, 0, NUM_BINS - 1)
-    return (
-        _calibration_error(bins, confidence, num_correct, num_judged),
-        _calibration_error(bins, confidence, num_hits, np.where(is_occupied, num_judged, num_surface)),
-    )
+
+    def counts(of_correct: Int64Array, of_all: Int64Array) -> Float64Array:
+        rows = of_correct, confidence * of_all, of_all
+        return np.array([np.bincount(bins, weights, NUM_BINS) for weights in rows])
+
+    return counts(num_correct, num_judged), counts(num_hits, np.where(is_occupied, num_judged, num_surface))
 
 
-def _calibration_error(
-    bins: Int64Array, confidence: Float64Array, num_correct: Int64Array, num_cells: Int64Array
-) -> float:
+def _calibration_error(counts: Float64Array) -> float:
     """Sum over bins of |correct cells - summed confidence|, divided by the number of cells: Guo et al., equation 3."""
-    correct = _sums(bins, num_correct, NUM_BINS)
-    expected = np.bincount(bins, confidence * num_cells, NUM_BINS)
+    correct, expected, num_cells = counts
     return _ratio(np.abs(correct - expected).sum(), num_cells.sum())
 
 

@@ -1,0 +1,231 @@
+"""A result in tiles reads as that of the whole run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octoreplay.config.team_file import load_team_file
+from octoreplay.errors import InputError, OutputError
+from octoreplay.evaluate.comparison import compare_results
+from octoreplay.evaluate.evaluation import evaluate_result
+from octoreplay.io.results.tile_files import maps_folder
+from octoreplay.records import CENTRAL
+from octoreplay.replay.run import replay_team
+from octoreplay.report.cell_colors import COLORS
+from octoreplay.report.export import export_map
+from octoreplay.report.queries import answer_query
+from octoreplay.result import open_result
+from octoreplay.study.tiles import run as tiled_run
+from octoreplay.study.tiles.run import replay_tiles
+from support.command_line import octoreplay
+from support.fixture_paths import TRIO_TEAM
+from support.long_suite import long
+
+EDGE = 9.6
+"""Least edge of tiles of the fixture, 32 cells [m]."""
+BOUNDS = (-2.0, -3.0, 0.0, 11.5, 4.0, 2.0)
+"""Box over several tiles [m]."""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Result of a whole run, and of the same run in tiles."""
+    folder = tmp_path_factory.mktemp("results")
+    config = load_team_file(TRIO_TEAM).with_parameters({"state_every": 4.0, "evidence_every": 4.0, "duration": 8.0})
+    replay_team(config, folder / "whole.mcap")
+    replay_tiles(config, folder / "tiled.mcap", EDGE, num_jobs=2, result_per_tile=True)
+    return folder / "whole.mcap", folder / "tiled.mcap"
+
+
+@pytest.fixture
+def moved(results: tuple[Path, Path], tmp_path: Path) -> Path:
+    """Copy of the result in tiles, with its files, in another folder."""
+    shutil.copy(results[1], tmp_path)
+    shutil.copytree(maps_folder(results[1]), tmp_path / "tiled.maps")
+    return tmp_path / "tiled.mcap"
+
+
+def check_close(one, other, place: str = "") -> None:
+    """Compare records: real numbers to 1e-12, calibration errors to 1e-9, all else exactly."""
+    if dataclasses.is_dataclass(one):
+        one, other = vars(one), vars(other)
+    if isinstance(one, dict):
+        for name in one.keys() - {"result", "b"}:
+            check_close(one[name], other[name], f"{place}.{name}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other), place
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            check_close(*pair, f"{place}[{number}]")
+    elif isinstance(one, float) and not math.isnan(one):
+        # Probabilities are rounded to 24 bits, which depends on the number of leaves that are computed together.
+        tolerance = 1e-9 if "calibration" in place else 1e-12
+        assert other == pytest.approx(one, rel=tolerance, abs=tolerance), place
+    else:
+        assert one == other or (one != one and other != other), place
+
+
+def leaves(stored) -> dict[bytes, bytes]:
+    """Log-odds of leaves by their place and size."""
+    table = stored.leaves()
+    places = np.column_stack([table.centers, table.sizes])
+    return {place.tobytes(): values.tobytes() for place, values in zip(places, table.log_odds, strict=True)}
+
+
+@long
+def test_maps_and_evidence_are_those_of_the_whole_run(results: tuple[Path, Path]) -> None:
+    with open_result(results[0]) as whole, open_result(results[1]) as tiled:
+        assert len(list(tiled.boxes())) > 4
+        assert list(whole.boxes(BOUNDS)) == [BOUNDS]
+        for name in (*whole.robots, CENTRAL):
+            assert tiled.stored_ticks(name) == whole.stored_ticks(name)
+            assert leaves(tiled.map(name)) == leaves(whole.map(name))
+            tick = whole.stored_ticks(name)[1]
+            part = whole.map(name, tick=tick, bounds=BOUNDS)
+            assert leaves(tiled.map(name, tick=tick, bounds=BOUNDS)) == leaves(part)
+            cells = [tiled.map(name, tick=tick, bounds=box).octree.num_cells for box in tiled.boxes(BOUNDS)]
+            assert sum(cells) == part.octree.num_cells
+        for robot_id in whole.robots:
+            assert leaves(tiled.evidence(robot_id)) == leaves(whole.evidence(robot_id))
+        for one, other in zip(whole.history(), tiled.history(), strict=True):
+            assert {name: leaves(stored) for name, stored in one.items()} == {
+                name: leaves(stored) for name, stored in other.items()
+            }
+
+
+@long
+def test_comparison_and_evaluation_are_those_of_the_whole_run(results: tuple[Path, Path]) -> None:
+    whole, tiled = results
+    assert compare_results(whole, tiled).is_same
+    assert compare_results(tiled, tiled).is_same
+    truth = TRIO_TEAM.parent / "world.npz"
+    check_close(evaluate_result(whole, truth=truth), evaluate_result(tiled, truth=truth))
+    check_close(evaluate_result(whole, against=whole, over_time=False).ticks,
+                evaluate_result(tiled, against=tiled, over_time=False).ticks)  # fmt: skip
+
+
+@long
+def test_differences_between_results_in_tiles_of_two_sizes(results: tuple[Path, Path], tmp_path: Path) -> None:
+    config = load_team_file(TRIO_TEAM).with_parameters({"state_every": 4.0, "duration": 8.0, "rule": "gradient"})
+    replay_team(config, tmp_path / "whole.mcap")
+    replay_tiles(config, tmp_path / "tiled.mcap", 2 * EDGE, result_per_tile=True)
+    expected = compare_results(results[0], tmp_path / "whole.mcap")
+    assert not expected.is_same
+    assert compare_results(results[1], tmp_path / "tiled.mcap").maps == expected.maps
+
+
+@long
+@pytest.mark.parametrize("color", COLORS)
+def test_ply_files_have_the_leaves_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path, color: str) -> None:
+    found = []
+    for path in results:
+        export_map(path, tmp_path / "map.ply", color=color, free=True, bounds=BOUNDS)
+        header, _, rows = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+        found.append((header, sorted(np.frombuffer(rows, "V24").tolist())))
+    assert found[0] == found[1]
+
+
+@long
+@pytest.mark.parametrize("name", ["map.npz", "map.ot", "map.yaml"])
+@pytest.mark.parametrize("options", [{}, {"max_depth": 17}])
+def test_other_files_are_those_of_the_whole_run(results, tmp_path: Path, name: str, options) -> None:
+    contents = []
+    for path in results:
+        files = export_map(path, tmp_path / name, heights=(0.2, 2.0), **options)
+        contents.append({file.name: file.read_bytes() for file in files})
+    assert contents[0] == contents[1]
+
+
+@long
+def test_queries_are_those_of_the_whole_run(results: tuple[Path, Path]) -> None:
+    inside = np.random.default_rng(0).uniform((-12, -12, -0.5), (15, 12, 3), (200, 3))
+    points = [*inside.tolist(), [1e6, 0.0, 0.0]]
+    answers = []
+    for path in results:
+        with open_result(path) as result:
+            found = answer_query(result, "husky_2", points=points, box=BOUNDS)
+            assert found.points is not None
+            assert found.points.known.any()
+            assert not found.points.known[-1]
+            answers.append(found)
+    for name, values in vars(answers[0].points).items():
+        np.testing.assert_array_equal(values, getattr(answers[1].points, name))
+    rows = [sorted(np.column_stack([a.box.centers, a.box.sizes, a.box.log_odds]).tolist()) for a in answers]
+    assert rows[0] == rows[1]
+
+
+@long
+def test_files_are_the_same_for_any_number_of_jobs_and_replace_earlier_ones(results, tmp_path: Path) -> None:
+    config = load_team_file(TRIO_TEAM).with_parameters({"state_every": 4.0, "evidence_every": 4.0, "duration": 8.0})
+    output, before = tmp_path / "tiled.mcap", tmp_path / "tiled.maps" / "tile_9_9-0123456789abcdef.mcap"
+    before.parent.mkdir()
+    before.write_bytes(b"of an earlier result")
+    (before.parent / "notes.txt").write_text("not a tile")
+    replay_tiles(config, output, EDGE, result_per_tile=True)
+    names = {path.name for path in maps_folder(output).iterdir()}
+    assert names == {path.name for path in maps_folder(results[1]).iterdir()} | {"notes.txt"}
+
+
+@long
+def test_a_moved_result_is_read_and_lost_or_damaged_files_are_named(moved: Path) -> None:
+    with open_result(moved) as result:
+        assert result.map(CENTRAL).octree.num_cells
+    first, second = sorted(maps_folder(moved).iterdir())[:2]
+    content = first.read_bytes()
+    first.unlink()
+    with open_result(moved) as result, pytest.raises(InputError, match=rf"{first.name}: is missing, .* run the logs"):
+        result.map(CENTRAL)
+    shutil.copy(second, first)
+    with open_result(moved) as result, pytest.raises(InputError, match=rf"{first.name}: is damaged, or not the file"):
+        result.map(CENTRAL)
+    first.write_bytes(content[:-200])
+    done = octoreplay("query", moved, "--box", -90, -90, -90, 90, 90, 90)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert f"{first.name}: is damaged" in done.stderr
+
+
+@long
+def test_an_interrupted_run_keeps_the_earlier_result_and_a_finished_one_replaces_its_files(
+    moved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load_team_file(TRIO_TEAM).with_parameters({"duration": 4.0})
+    earlier = {path.name for path in maps_folder(moved).iterdir()}
+
+    def fail(*_, **__):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tiled_run, "write_result", fail)
+        with pytest.raises(OutputError, match="disk is full"):
+            replay_tiles(config, moved, EDGE, result_per_tile=True)
+    assert earlier < {path.name for path in maps_folder(moved).iterdir()}
+    with open_result(moved) as result:
+        assert result.summary.log_seconds > 4.0
+        assert result.map(CENTRAL).octree.num_cells
+    replay_tiles(config, moved, EDGE, result_per_tile=True, resume=True)
+    with open_result(moved) as result:
+        assert result.tiles is not None
+        listed = {Path(file.file).name for file in result.tiles.files}
+        assert {path.name for path in maps_folder(moved).iterdir()} == listed
+    replay_team(config, moved)
+    assert not maps_folder(moved).exists()
+
+
+@long
+def test_the_command_writes_and_reads_a_result_per_tile(tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    done = octoreplay("run", TRIO_TEAM, "-o", output, "--tiles", EDGE, "--result-per-tile", "--duration", 4, "-q")
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir() if not path.name.startswith(".")) == ["out.maps", "out.mcap"]
+    done = octoreplay("query", output, "--point", 3, -2, 0.4, "--json")
+    assert json.loads(done.stdout)["points"][0]["known"]
+    assert octoreplay("report", output, "-o", tmp_path / "page.html").returncode == 0
+    done = octoreplay("run", TRIO_TEAM, "-o", output, "--result-per-tile", "--force")
+    assert (done.returncode, "--result-per-tile needs --tiles" in done.stderr) == (2, True)
