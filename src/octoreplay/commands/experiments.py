@@ -38,7 +38,7 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     same settings in DIR are used again.
     """
     from octoreplay.io.output_file import mark_written
-    from octoreplay.report.experiment_tables import paper_table
+    from octoreplay.report.paper_table import paper_table
     from octoreplay.report.tables import made_files, number
     from octoreplay.study import paper as study
 
@@ -79,26 +79,30 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         villages: int = 1,
         jobs: int | None = None,
         scheduler: str | None = None,
+        teams: Path | None = None,
     ) -> int:
         from octoreplay.io.output_file import mark_written, write_whole
-        from octoreplay.report.experiment_plots import figures
-        from octoreplay.report.experiment_tables import answer_tables
+        from octoreplay.report.comparisons import latex, markdown
         from octoreplay.report.figures import save_figures
         from octoreplay.report.tables import made_files
         from octoreplay.study.experiments import run_experiment
         from octoreplay.study.questions import QUESTIONS
 
         lock_folder(folder)
+        question = QUESTIONS[name]
         with progress_bar(name) as update:
             found = run_experiment(
-                QUESTIONS[name](duration, villages), folder, num_jobs=jobs, scheduler=scheduler,
+                question.experiment(duration, villages), folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler,
                 progress=lambda stage, share: update(share, None, stage),
             )  # fmt: skip
-        summary = folder / "tables.md"
-        write_whole(summary, answer_tables(name, found))
+        tables = question.tables(found)
+        write_whole(folder / "tables.md", "\n".join(map(markdown, tables)))
+        write_whole(folder / "tables.tex", "\n".join(map(latex, tables)))
+        drawn = {file: drawing.draw(found) for file, drawing in question.drawings.items()}
         written = {
-            **dict.fromkeys(save_figures(figures(name, found), folder / "figures"), "figure"),
-            summary: "tables",
+            **dict.fromkeys(save_figures(drawn, folder / "figures"), "figure"),
+            folder / "tables.md": "tables",
+            folder / "tables.tex": "tables as LaTeX",
             **{folder / f"{plan}.csv": "numbers of every run" for plan in found},
         }
         mark_written(folder)
@@ -119,6 +123,12 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
     options = (
         click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False),
         click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]"),
+        click.option(
+            "--teams",
+            type=existing_path,
+            metavar="DIR",
+            help="folder of the simulated teams, which experiments can share  [default: DIR/teams]",
+        ),
         *(() if is_timed else sweep_options),
     )
     text = (
@@ -131,13 +141,16 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
     experiment.command(name, help=text, short_help=question)(command)
 
 
-_add_experiment("rules", 60.0, 3, "Compare the consensus rules on four graphs.")
-_add_experiment("steps", 60.0, 1, "Vary the step sizes epsilon and gamma.")
-_add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
+_add_experiment("rules", 300.0, 10, "Compare the consensus rules.")
 _add_experiment(
-    "noise", 60.0, 1, "Measure which errors of noisy labels, poses and depths consensus repairs and spreads."
+    "forgetting", 60.0, 10, "Measure what is kept by a robot that is cut off, and by a team that separates."
 )
-_add_experiment("choose", 60.0, 2, "Compare settings for a good radio, for a poor radio and for many robots.")
+_add_experiment("packets", 60.0, 10, "Compare packet formats.")
+_add_experiment("radio", 60.0, 10, "Measure what each fault of a radio costs.")
+_add_experiment("noise", 60.0, 10, "Measure which wrong labels, poses and depths the exchange repairs and spreads.")
+_add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
+_add_experiment("steps", 60.0, 10, "Vary the step sizes epsilon and gamma.")
+_add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig, *, replaces_others: bool = False) -> Path:

@@ -65,20 +65,26 @@ class MeshCamera:
 class LabelPatches:
     """Places at which a robot's network gives a wrong class: cubes of space that keep their error in every image.
 
-    In a ``share`` of the cubes the classes are shifted cyclically by a number that is drawn for the cube. Errors
-    of this kind do not average out over images.
+    In a ``share`` of the cubes the classes are shifted cyclically by a number that is drawn for the cube, or replaced
+    by their ``similar`` classes (C + 1,) uint8 where these are given. Errors of this kind do not average out over
+    images.
     """
 
-    def __init__(self, share: float, num_classes: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, share: float, num_classes: int, rng: np.random.Generator, similar: UInt8Array | None = None
+    ) -> None:
         wrong = rng.random(_PATCH_GRID) < share
         self._shifts = np.where(wrong, rng.integers(1, num_classes, _PATCH_GRID), 0)
         self._num_classes = num_classes
+        self._similar = similar
 
     def apply(self, labels: UInt8Array, points: Float64Array) -> UInt8Array:
         """Return the label image (H, W) with the errors at ``points`` (H, W, 3), the pixels' world coordinates [m]."""
         # The grid repeats itself beyond its edges.
         cubes = np.mod(np.floor(points / _PATCH_EDGE).astype(np.int64), _PATCH_GRID)
         shifts = self._shifts[cubes[..., 0], cubes[..., 1], cubes[..., 2]]
+        if self._similar is not None:
+            return np.where((labels == NO_LABEL) | (shifts == 0), labels, _similar_labels(labels, self._similar))
         shifted = (labels.astype(np.int64) - 1 + shifts) % self._num_classes + 1
         return np.where(labels == NO_LABEL, labels, shifted).astype(np.uint8)
 
@@ -106,11 +112,24 @@ def depth_to_millimetres(depth: Float32Array) -> npt.NDArray[np.uint16]:
     return millimetres
 
 
-def add_label_noise(labels: UInt8Array, share: float, num_classes: int, rng: np.random.Generator) -> UInt8Array:
-    """Return the label image with this share of its measured pixels changed to another class, uniformly drawn."""
+def add_label_noise(
+    labels: UInt8Array, share: float, num_classes: int, rng: np.random.Generator, similar: UInt8Array | None = None
+) -> UInt8Array:
+    """Return the label image with this share of its measured pixels changed to another class.
+
+    The other class is drawn uniformly, or is the ``similar`` one of each class (C + 1,) uint8 where these are given.
+    """
     wrong = (rng.random(labels.shape, dtype=np.float32) < share) & (labels != NO_LABEL)
+    if similar is not None:
+        return np.where(wrong, _similar_labels(labels, similar), labels)
     noisy = labels.copy()
     # Adding 1 to C - 1 modulo C gives each other class with equal probability.
     shift = rng.integers(1, num_classes, int(wrong.sum()), dtype=np.int64)
     noisy[wrong] = (labels[wrong].astype(np.int64) - 1 + shift) % num_classes + 1
     return noisy
+
+
+def _similar_labels(labels: UInt8Array, similar: UInt8Array) -> UInt8Array:
+    """Similar class of each label (H, W); pixels without a label get any."""
+    found: UInt8Array = similar[np.minimum(labels, similar.size - 1)]
+    return found

@@ -15,7 +15,7 @@ from octoreplay.simulate.colour import ColourCamera
 from octoreplay.simulate.lidar import MeshLidar, add_range_noise
 from octoreplay.simulate.odometry import HEIGHT_FACTOR, drift_corrections, own_frame, position_fixes
 from octoreplay.simulate.settings import SimulationConfig
-from octoreplay.simulate.world import Terrain
+from octoreplay.simulate.world import Terrain, similar_classes
 from octoreplay.transforms import inverse
 
 START_NS = 1_700_000_000_000_000_000
@@ -93,10 +93,11 @@ class Recorder:
             self._fixes = dict(zip(steps, position_fixes(self.poses[steps, :3, 3], config.fixes, rng), strict=True))
         self._exposures = schedule.exposures(index, config.num_robots)
         self._rng = np.random.default_rng([config.seed, 2, index])
+        self._similar = similar_classes(config.kinds_per_class) if config.similar_errors else None
         self._patches: LabelPatches | None = None
         if config.patchy_noise > 0:
             rng = np.random.default_rng([config.seed, 7, index])
-            self._patches = LabelPatches(config.patchy_noise, config.class_table.num_classes, rng)
+            self._patches = LabelPatches(config.patchy_noise, config.class_table.num_classes, rng, self._similar)
         self._colour: ColourCamera | None = None
         self.T_body_color: Float64Array | None = None
         if config.colour is not None and isinstance(sensor, MeshCamera):
@@ -158,5 +159,7 @@ class Recorder:
         if self._patches is not None:
             labels = self._patches.apply(labels, points())
         if config.label_noise > 0:
-            labels = add_label_noise(labels, config.label_noise, config.class_table.num_classes, self._rng)
+            labels = add_label_noise(
+                labels, config.label_noise, config.class_table.num_classes, self._rng, self._similar
+            )
         return labels

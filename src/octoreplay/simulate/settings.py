@@ -45,6 +45,9 @@ class SimulationConfig:
         Share of the pixels or points that get a wrong class.
     patchy_noise : float
         Share of the cubes of 2 m in which a robot's labels are always wrong; drawn for each robot.
+    similar_errors : bool
+        True where a wrong label is that of the class which resembles the right one: grass and road, building and roof,
+        trunk and foliage, fence and car. False for any other class, each equally likely.
     depth_noise : float
         Factor on the standard deviation of the noise of a depth camera, or of a LiDAR's ranges.
     pose_noise : float
@@ -89,6 +92,7 @@ class SimulationConfig:
     resolution: float = 0.3
     label_noise: float = 0.1
     patchy_noise: float = 0.0
+    similar_errors: bool = False
     depth_noise: float = 1.0
     pose_noise: float = 0.0
     odometry_drift: tuple[float, float] = (0.0, 0.0)

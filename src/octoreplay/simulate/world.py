@@ -49,6 +49,17 @@ def village_classes(kinds: int = 1) -> ClassTable:
     )
 
 
+def similar_classes(kinds: int = 1) -> UInt8Array:
+    """Return the class_id (C + 1,) uint8 of the class that resembles each class of ``village_classes(kinds)``.
+
+    Grass and road, building and roof, trunk and foliage, fence and car resemble each other. 0 stays 0.
+    """
+    indices = np.arange(len(_CLASSES) * kinds)
+    # Similar classes stand beside each other in the table.
+    similar = (indices // kinds ^ 1) * kinds + indices % kinds + 1
+    return np.concatenate([[0], similar]).astype(np.uint8)
+
+
 _KIND_SQUARE = 8.0
 
 

@@ -1,19 +1,24 @@
-"""Experiments: simulated teams and the sweeps over them whose tables answer a question (docs/experiments.md)."""
+"""Experiments: simulated teams, sweeps over them, and what of the runs is compared (docs/experiments.md)."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from octoreplay.config.class_tables.edits import Merges
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.output_file import write_whole
+from octoreplay.io.text_files import json_text
 from octoreplay.replay.run import replay_team
+from octoreplay.report.comparisons import TEAM, Comparison, Tables, TextTable, tables_of
+from octoreplay.report.experiment_plots import Drawing
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.folder import table_csv
 from octoreplay.study.sweep import Sweep, SweepProgress, check_workers, run_sweep
@@ -26,10 +31,11 @@ TRUTH = "world.npz"
 
 @dataclass(frozen=True)
 class SimulatedTeam:
-    """Settings of a simulated team, and the classes that its team file merges."""
+    """Settings of a simulated team, and the merged classes and the network's schedule of its team file."""
 
     simulation: SimulationConfig
     merge_classes: Merges = ()
+    schedule: tuple[ScheduleEntry, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,29 @@ class Experiment:
     plans: tuple[Plan, ...]
 
 
+@dataclass(frozen=True)
+class Question:
+    """Experiment, and the tables and figures that answer its question.
+
+    Attributes
+    ----------
+    experiment : function
+        Experiment with logs of a length [s] and with a number of villages.
+    comparisons : tuple of Comparison
+        Tables.
+    drawings : dict
+        Figures by file name.
+    """
+
+    experiment: Callable[[float, int], Experiment]
+    comparisons: tuple[Comparison, ...]
+    drawings: Mapping[str, Drawing]
+
+    def tables(self, found: Tables) -> list[TextTable]:
+        """Return the tables of an experiment's runs."""
+        return [table for comparison in self.comparisons for table in tables_of(comparison, found)]
+
+
 Stage = Callable[[str, float], None]
 """Progress callback: description of the current stage, and the finished share of it, 0 to 1."""
 
@@ -80,21 +109,22 @@ def run_experiment(
     experiment: Experiment,
     folder: Path,
     *,
+    teams_folder: Path | None = None,
     num_jobs: int | None = None,
     scheduler: str | None = None,
     progress: Stage | None = None,
 ) -> dict[str, list[Row]]:
     """Simulate the teams, do the sweeps, and return the rows of each plan by its name.
 
-    ``folder`` gets ``teams/<label>`` for each simulation, a folder and ``<plan>.csv`` for each plan. Teams and runs
-    that it already holds are used again. Teams with equal simulation settings share the logs of the first of them.
+    ``folder`` gets a folder and ``<plan>.csv`` for each plan. ``teams_folder`` (default: ``folder / "teams"``) gets a
+    folder for each simulation; several experiments can share it. Teams and runs that they already hold are used again.
     ``num_jobs`` and ``scheduler`` are those of ``run_sweep`` for plans that do not measure time.
 
     Raises InputError if a run failed, and the errors of ``simulated_team`` and ``run_sweep``.
     """
     check_workers(num_jobs, 1, scheduler)
     show = progress or _ignore_progress
-    teams = _team_files(experiment, folder / "teams", show)
+    teams = _team_files(experiment, teams_folder or folder / "teams", show)
     tables: dict[str, list[Row]] = {}
     for plan in experiment.plans:
 
@@ -122,36 +152,48 @@ def run_experiment(
 
 
 def _rows(experiment: Experiment, plan: Plan, sweep: Sweep) -> list[Row]:
-    """Rows of a sweep with the experiment's team labels and the plan's extra columns."""
+    """Rows of a sweep with the experiment's team labels, the teams' seeds and the plan's extra columns."""
     # The team is the outermost variation of a sweep.
     num_runs = len(sweep.rows) // len(plan.teams)
-    labels = [label for label in plan.teams for _ in range(num_runs)]
-    return [
-        {**row, "team": label, **plan.extra_columns(experiment.teams[label], row, sweep)}
-        for label, row in zip(labels, sweep.rows, strict=True)
-    ]
+    teams = [(label, experiment.teams[label]) for label in plan.teams for _ in range(num_runs)]
+    rows = (
+        {**row, "team": label, TEAM: team.simulation.seed, **plan.extra_columns(team, row, sweep)}
+        for (label, team), row in zip(teams, sweep.rows, strict=True)
+    )
+    return [{name: _rounded(value) for name, value in row.items()} for row in rows]
+
+
+def _rounded(value: Any) -> Any:
+    """Number with seven significant digits, which keeps the tables of many runs small."""
+    return float(f"{value:.7g}") if isinstance(value, float) else value
 
 
 def _team_files(experiment: Experiment, folder: Path, show: Stage) -> dict[str, Path]:
     """Team files by label; each distinct simulation is done once."""
-    folders: dict[SimulationConfig, Path] = {}
-    for label, team in experiment.teams.items():
-        folders.setdefault(team.simulation, folder / label)
+    folders = {team.simulation: folder / _folder_name(team.simulation) for team in experiment.teams.values()}
     for index, (simulation, team_folder) in enumerate(folders.items()):
         stage = f"simulating team {index + 1} of {len(folders)}"
         simulated_team(team_folder, simulation, functools.partial(show, stage))
     return {label: _team_file(label, team, folders[team.simulation]) for label, team in experiment.teams.items()}
 
 
+def _folder_name(simulation: SimulationConfig) -> str:
+    """Name of a simulation's folder: its seed, and a digest of all settings."""
+    digest = hashlib.sha256(json_text(simulation).encode()).hexdigest()[:10]
+    return f"seed_{simulation.seed}_{digest}"
+
+
 def _team_file(label: str, team: SimulatedTeam, folder: Path) -> Path:
-    """Team file of one team whose logs are in ``folder``; written beside them if it merges classes."""
+    """Team file of one team whose logs are in ``folder``; written beside them if it differs from the simulated one."""
     path = folder / "team.yaml"
-    if not team.merge_classes:
+    if not team.merge_classes and not team.schedule:
         return path
-    config = dataclasses.replace(load_team_file(path), merge_classes=team.merge_classes)
-    merged = folder / f"{label}.yaml"
-    write_whole(merged, dump_team(config, folder.resolve()))
-    return merged
+    base = load_team_file(path)
+    network = dataclasses.replace(base.network, schedule=team.schedule)
+    config = dataclasses.replace(base, merge_classes=team.merge_classes, network=network)
+    changed = folder / f"{label}.yaml"
+    write_whole(changed, dump_team(config, folder.resolve()))
+    return changed
 
 
 def _compile(team: Path) -> None:

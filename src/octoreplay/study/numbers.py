@@ -21,6 +21,7 @@ RUN_COLUMNS = (
     "label_disagreement", "label_disagreement_log_end", "label_disagreement_mean",
     "agreement", "agreement_log_end", "agreement_mean",
     "agreement_occupied", "agreement_occupied_log_end", "agreement_occupied_mean",
+    "agreement_connected", "agreement_occupied_connected",
     "contraction", "entropy_bits", "packet_bytes", "octree_bytes", "grid_bytes", "sent_bytes_per_second",
     "delivered_share", "num_leaves", "memory_bytes",
 )  # fmt: skip
@@ -54,11 +55,13 @@ def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str
             f"{name}_mean": _mean(getattr(tick, name) for tick in seen),
         }
     agreements: dict[str, float] = {}
+    connected = [tick for tick in seen if is_connected(tick)]
     for name in ("agreement", "agreement_occupied"):
         agreements |= {
             name: _worst(last, name),
             f"{name}_log_end": _worst(log_ticks[-1], name),
             f"{name}_mean": _mean(_worst(tick, name) for tick in seen),
+            f"{name}_connected": _worst(connected[-1], name) if connected else math.nan,
         }
     values = {
         "stop_reason": summary.stop_reason,
@@ -93,6 +96,19 @@ def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
         "mean_iou_least": final.least("mean_iou"),
         **{f"central_{name}": math.nan if central is None else central.score(name) for name in _SCORES},
     }
+
+
+def is_connected(tick: TickMetrics) -> bool:
+    """Return True where links that work both ways connect all active robots at a tick."""
+    links = {(link.sender, link.receiver) for link in tick.links}
+    robots = [robot.robot_id for robot in tick.counted_robots]
+    reached, waiting = {robots[0]}, [robots[0]]
+    while waiting:
+        sender = waiting.pop()
+        found = {other for other in robots if {(sender, other), (other, sender)} <= links} - reached
+        reached |= found
+        waiting.extend(found)
+    return len(reached) == len(robots)
 
 
 def contraction(distances: Sequence[float]) -> float:

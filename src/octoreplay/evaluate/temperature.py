@@ -1,0 +1,70 @@
+"""Temperature that calibrates a map: log-odds divided by it fit the truth best."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from octoreplay.evaluate.truth import Truth
+from octoreplay.log_odds import class_probabilities
+from octoreplay.records import Float64Array
+from octoreplay.stored_map import StoredMap
+
+_LARGEST = 100.0
+"""Largest temperature, and inverse of the smallest, that is tried."""
+
+
+class Calibration(NamedTuple):
+    """Fit of a map's probabilities to the truth over its known cells.
+
+    Attributes
+    ----------
+    log_loss : float
+        Mean negative logarithm of the probability of the true class [nat].
+    temperature : float
+        Divisor of the log-odds with the least log loss, between 0.01 and 100: above 1 for a map that is too certain.
+    calibrated_log_loss : float
+        Log loss with this divisor.
+    """
+
+    log_loss: float
+    temperature: float
+    calibrated_log_loss: float
+
+
+def calibrating_temperature(stored: StoredMap, truth: Truth) -> Calibration:
+    """Return the fit of a map's probabilities to the truth, and the temperature that fits best.
+
+    Cells of a true class that the map does not have are not counted; cells without surface are free. The method is
+    temperature scaling (Guo, Pleiss, Sun and Weinberger, "On Calibration of Modern Neural Networks", ICML 2017).
+    """
+    from scipy.optimize import minimize_scalar
+
+    log_odds, counts = _distinct_cells(stored, truth)
+
+    def loss(log_temperature: float) -> float:
+        """Mean log loss of the scaled map."""
+        chances = class_probabilities(log_odds / np.exp(log_temperature))
+        total: float = -(counts * np.log(np.maximum(chances, np.finfo(np.float64).tiny))).sum() / counts.sum()
+        return total
+
+    limit = float(np.log(_LARGEST))
+    best = minimize_scalar(loss, bounds=(-limit, limit), method="bounded", options={"xatol": 1e-4})
+    return Calibration(loss(0.0), float(np.exp(best.x)), float(best.fun))
+
+
+def _distinct_cells(stored: StoredMap, truth: Truth) -> tuple[Float64Array, Float64Array]:
+    """Distinct rows of log-odds (P, C) in a map, and the number of their cells by true class (P, C + 1)."""
+    spans = stored.octree.spans()
+    num_classes = spans.deviations.shape[1]
+    rows, row_of_leaf = np.unique(spans.deviations, axis=0, return_inverse=True)
+    leaves = spans.leaves_at(truth.codes)
+    is_known = leaves >= 0
+    num_free = spans.num_cells.astype(np.float64)
+    np.subtract.at(num_free, leaves[is_known], 1.0)
+    counts = np.zeros((len(rows), num_classes + 1))
+    np.add.at(counts[:, 0], row_of_leaf, num_free)
+    counted = is_known & truth.is_class
+    np.add.at(counts, (row_of_leaf[leaves[counted]], truth.class_ids[counted]), 1.0)
+    return rows.astype(np.float64) + stored.prior, counts

@@ -1,0 +1,32 @@
+"""Questions of docs/experiments.md: each module has the runs of one, and the tables and figures that answer it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from octoreplay.study.experiments import Question
+from octoreplay.study.questions import (
+    confidence,
+    forgetting,
+    noise,
+    packets,
+    radio,
+    rules,
+    scale,
+    steps,
+)
+
+QUESTIONS: Mapping[str, Question] = MappingProxyType(
+    {
+        "rules": rules.QUESTION,
+        "forgetting": forgetting.QUESTION,
+        "packets": packets.QUESTION,
+        "radio": radio.QUESTION,
+        "noise": noise.QUESTION,
+        "confidence": confidence.QUESTION,
+        "steps": steps.QUESTION,
+        "scale": scale.QUESTION,
+    }
+)
+"""Questions by name, in the order of the page."""

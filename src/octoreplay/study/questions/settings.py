@@ -1,0 +1,41 @@
+"""Settings, numbers and names that several questions share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from octoreplay.config.rules import RULES
+from octoreplay.report.comparisons import KILOBYTES, Measure, Row
+from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.study.experiments import SimulatedTeam
+
+RADIO_RANGE = 25.0
+"""Radio range [m] with which six robots in the village, a square of 70 m, separate into groups and reconnect."""
+SHORT_SETTLING: Mapping[str, Any] = MappingProxyType({"settle_max": 60})
+"""Settings that end settling after a minute; slow links and sparse graphs would need hundreds of ticks."""
+LAST_MAPS: Mapping[str, Any] = MappingProxyType({"state_every": 1e6, "view_every": 1e6})
+"""Settings that store only the last maps, the only ones that are read."""
+
+DURING = Measure("agreement during the logs, occupied", "agreement_occupied_mean")
+SETTLED = Measure("agreement settled, occupied", "agreement_occupied")
+MEAN_IOU = Measure("mean IoU", "mean_iou")
+AGREEMENTS = (DURING, SETTLED, MEAN_IOU, KILOBYTES)
+
+_SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("1", "1"): "γ 1/k"}
+
+
+def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, SimulatedTeam]:
+    """Teams of six robots by label, each in a village of its own, with these settings of the simulation."""
+    return {
+        f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **settings))
+        for seed in range(num_villages)
+    }
+
+
+def rule_name(row: Row) -> str:
+    """Name of a run's rule, with gamma where the rule has a gradient step and the run varies it."""
+    name = str(row["rule"])
+    steps = (str(row.get("gamma", "-")), str(row.get("gamma_power", "-")))
+    return f"{name}, {_SCHEDULES[steps]}" if RULES[name].has_gamma and steps in _SCHEDULES else name

@@ -1,0 +1,96 @@
+"""How do the steps epsilon and gamma act, and does the bound on epsilon hold?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from octoreplay.evaluate import mixing
+from octoreplay.records import Float64Array
+from octoreplay.report.comparisons import Comparison, Measure, Row
+from octoreplay.report.experiment_plots import Curves, Squares
+from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
+from octoreplay.study.questions.settings import DURING, LAST_MAPS, SETTLED, SHORT_SETTLING, villages
+from octoreplay.study.sweep import Sweep
+
+_NUM_ROBOTS = 6
+_TOPOLOGIES = ("complete", "ring", "line", "star")
+_SHARES = (0.1, 0.25, 0.5, 0.67, 0.8, 0.9, 0.95, 0.99)
+
+
+def experiment(duration: float, num_villages: int) -> Experiment:
+    """Epsilon and gamma against each other, and mixing alone with epsilon near its bound."""
+    teams = villages(duration, num_villages)
+    bounds = ",".join(
+        f"{topology}+{share * mixing.epsilon_bound(topology, _NUM_ROBOTS):.6g}"
+        for topology in _TOPOLOGIES
+        for share in _SHARES
+    )
+    return Experiment(
+        teams,
+        (
+            Plan(
+                "steps",
+                tuple(teams),
+                ("rule=gradient,natural", "epsilon=0.1,0.2,0.35,0.5,0.7", "gamma=0.05,0.1,0.25,0.5,1,1.5"),
+                {"topology": "ring", "packets": "full", **SHORT_SETTLING, **LAST_MAPS},
+                has_truth=False,
+            ),
+            Plan(
+                "bound",
+                tuple(teams)[:1],
+                (f"topology+epsilon={bounds}",),
+                {"rule": "bayes", "flow_bits": 0, "duration": min(duration, 20.0), "settle_max": 200, **LAST_MAPS},
+                has_truth=False,
+                extra_columns=_theory,
+            ),
+        ),
+    )
+
+
+def _theory(_: SimulatedTeam, row: Row, __: Sweep) -> dict[str, float]:
+    """Epsilon as a share of its bound, and the factor per tick by which Phi shrinks in theory."""
+    graph, epsilon = (row["topology"], _NUM_ROBOTS), float(row["epsilon"])
+    bound = mixing.epsilon_bound(*graph)
+    return {"epsilon_share": epsilon / bound, "contraction_theory": mixing.contraction(*graph, epsilon)}
+
+
+def _topology(row: Row) -> str:
+    """Name of a run's graph."""
+    return str(row["topology"])
+
+
+def _curve(topology: str) -> tuple[Float64Array, Float64Array]:
+    """Factor per tick in theory over epsilon as a share of its bound."""
+    shares = np.linspace(0.0, 1.1, 400)
+    bound = mixing.epsilon_bound(topology, _NUM_ROBOTS)
+    return shares, np.array([mixing.contraction(topology, _NUM_ROBOTS, share * bound) for share in shares])
+
+
+def _point(row: Row) -> str:
+    """Name of a graph and a step size."""
+    return f"{row['topology']}, {float(row['epsilon']):g}"
+
+
+_FACTOR = Measure("factor of Φ per tick", "contraction")
+_PHI = Measure("Φ over all pairs, end of the logs", "total_distance_all_log_end", None, is_ratio=True)
+
+QUESTION = Question(
+    experiment,
+    (
+        Comparison(
+            "bound",
+            "graph, epsilon",
+            _point,
+            (
+                Measure("epsilon / bound", "epsilon_share", 2),
+                _FACTOR,
+                Measure("factor in theory", "contraction_theory"),
+                Measure("ticks to consensus", "ticks_to_consensus", None),
+            ),
+        ),
+    ),
+    {
+        "steps.png": Squares("steps", "gamma", "epsilon", (_PHI, DURING, SETTLED), "rule"),
+        "bound.png": Curves("bound", "epsilon_share", "epsilon / bound", (_FACTOR,), _topology, theory=_curve),
+    },
+)
