@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 import pytest
+from octoreplay.report.experiment_tables import answer_tables
 
 import octoreplay
 from octoreplay import cli
@@ -17,7 +18,6 @@ from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.evaluate.records import EvaluatedTick, MapScores, TruthScores
 from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.map_views import VIEW_DTYPE
-from octoreplay.report.experiment_tables import answer_tables
 from octoreplay.run_metrics import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from octoreplay.errors import InputError
 from octoreplay.records import CameraModel
 from octoreplay.simulate.camera import (
+    LabelPatches,
     MeshCamera,
     add_depth_noise,
     add_label_noise,
@@ -19,7 +20,19 @@ from octoreplay.simulate.camera import (
     depth_to_millimetres,
 )
 from octoreplay.simulate.scene import NO_LABEL
-from octoreplay.simulate.world import BUILDING, CAR, Terrain, World
+from octoreplay.simulate.world import (
+    BUILDING,
+    CAR,
+    DIRT_ROAD,
+    FENCE,
+    FOLIAGE,
+    GRASS,
+    ROOF,
+    TRUNK,
+    Terrain,
+    World,
+    similar_classes,
+)
 
 CAMERA = CameraModel(width=9, height=7, fx=6.0, fy=5.0, cx=4.0, cy=3.0)
 
@@ -118,6 +131,35 @@ def test_wrong_labels_are_uniform_over_the_other_classes():
     counts = np.bincount(add_label_noise(labels, 1.0, 5, np.random.default_rng(0)).ravel(), minlength=6)
     assert counts[3] == 0
     np.testing.assert_allclose(counts[[1, 2, 4, 5]], 10_000, rtol=0.05)
+
+
+def test_similar_errors_are_those_of_the_pairs_of_classes():
+    similar = similar_classes()
+    assert [(similar[other], other) for other in (DIRT_ROAD, ROOF, FOLIAGE, CAR)] == [
+        (GRASS, DIRT_ROAD),
+        (BUILDING, ROOF),
+        (TRUNK, FOLIAGE),
+        (FENCE, CAR),
+    ]
+    labels = np.random.default_rng(0).integers(1, 9, (300, 300)).astype(np.uint8)
+    labels[:9] = NO_LABEL
+    noisy = add_label_noise(labels, 0.2, 8, np.random.default_rng(1), similar)
+    changed = noisy != labels
+    assert not changed[:9].any()
+    assert abs(changed[9:].mean() - 0.2) < 0.01
+    np.testing.assert_array_equal(noisy[changed], similar[labels[changed]])
+    # Kinds of a class resemble the same kind of the other class.
+    assert similar_classes(3)[1:7].tolist() == [4, 5, 6, 1, 2, 3]
+
+
+def test_patches_with_similar_errors_have_the_similar_class_everywhere():
+    similar = similar_classes()
+    points = np.random.default_rng(0).uniform(-50.0, 50.0, (200, 200, 3))
+    labels = np.full((200, 200), BUILDING, np.uint8)
+    labels[0] = NO_LABEL
+    patchy = LabelPatches(0.3, 8, np.random.default_rng(0), similar).apply(labels, points)
+    assert set(np.unique(patchy)) == {NO_LABEL, BUILDING, ROOF}
+    assert abs((patchy == ROOF).mean() - 0.3) < 0.02
 
 
 def test_a_missing_open3d_is_reported_with_the_remedy(monkeypatch):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from pathlib import Path
 
 import pytest
 
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.simulate.settings import SimulationConfig
@@ -20,17 +22,20 @@ pytestmark = pytest.mark.long
 
 
 NUM_RUNS = {
-    "rules": {"rules": 16 * 4 * 2},
+    "rules": {"rules": 7 * 2 * 2},
+    "forgetting": {"cut": 9 * 3 * 2, "halves": 9 * 2},
+    "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
+    "radio": {"radio": 4 * 6 * 2},
+    "noise": {"noise": 14 * 3 * 2},
+    "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
-    "scale": {"robots": 5 * 4, "resolution": 5 * 2, "classes": 4 * 2},
-    "noise": {"noise": 12 * 3 * 2},
-    "choose": {"good_radio": 13 * 2, "poor_radio": 13 * 2, "many_robots": 13},
+    "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
 }
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_every_experiment_consists_of_valid_distinct_runs(name: str) -> None:
-    experiment = QUESTIONS[name](30.0, 2)
+    experiment = QUESTIONS[name].experiment(30.0, 2)
     base = load_team_file(PAIR_TEAM)
     counts = {}
     for plan in experiment.plans:
@@ -69,14 +74,15 @@ def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
     assert [(row["team"], row["rule"]) for row in rows] == [
         ("village_0", "local"), ("village_0", "bayes"), ("village_1", "local"), ("village_1", "bayes"),
     ]  # fmt: skip
-    assert [row["seed_of_team"] for row in rows] == [0, 0, 1, 1]
+    assert [row["seed_of_team"] for row in rows] == [row["village"] for row in rows] == [0, 0, 1, 1]
     assert all(row["is_kept"] for row in rows)
     assert all(0 < row["central_mean_iou"] <= 1 for row in rows)
     # Rule local exchanges nothing.
     assert [row["sent_bytes_per_second"] > 0 for row in rows] == [False, True, False, True]
     assert "simulating team 2 of 2" in stages
     assert stages[-1] == "first: run 4 of 4"
-    merged = load_team_file(tmp_path / "teams" / "village_1" / "village_1.yaml")
+    (merged_file,) = (tmp_path / "teams").glob("seed_1_*/village_1.yaml")
+    merged = load_team_file(merged_file)
     assert merged.classes is not None
     assert merged.classes.names[0] == "plant"
     assert merged.classes.num_classes == 7
@@ -90,11 +96,21 @@ def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
 def test_teams_of_equal_simulations_share_their_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders: list[Path] = []
     monkeypatch.setattr(experiments, "simulated_team", lambda folder, *_: folders.append(folder))
-    first, second = SimulationConfig(seed=1), SimulationConfig(seed=2)
+    first, second = SimulationConfig(seed=1), SimulationConfig(seed=1, rate=2.0)
     teams = {"a": SimulatedTeam(first), "b": SimulatedTeam(second), "c": SimulatedTeam(SimulationConfig(seed=1))}
     files = experiments._team_files(Experiment(teams, ()), tmp_path, lambda *_: None)
-    assert folders == [tmp_path / "a", tmp_path / "b"]
-    assert files == {label: tmp_path / folder / "team.yaml" for label, folder in zip("abc", "aba", strict=True)}
+    assert len(set(folders)) == len(folders) == 2
+    assert all(folder.parent == tmp_path and folder.name.startswith("seed_1_") for folder in folders)
+    assert files == {"a": folders[0] / "team.yaml", "b": folders[1] / "team.yaml", "c": folders[0] / "team.yaml"}
+
+
+def test_a_team_file_gets_the_schedule(tmp_path: Path) -> None:
+    experiment = small()
+    cut = ScheduleEntry(start=1.0, groups=(("husky_1",), ("husky_2",)))
+    team = dataclasses.replace(experiment.teams["village_0"], schedule=(cut,))
+    files = experiments._team_files(Experiment({"cut": team}, ()), tmp_path, lambda *_: None)
+    assert load_team_file(files["cut"]).network.schedule == (cut,)
+    assert load_team_file(files["cut"].parent / "team.yaml").network.schedule == ()
 
 
 def test_a_failed_run_fails_the_experiment(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.records import SCORES, EvaluatedTick, Evaluation, MapScores, TruthScores
 from octoreplay.replay.run import replay_team
@@ -18,6 +19,7 @@ from octoreplay.study.numbers import (
     RUN_COLUMNS,
     TRUTH_COLUMNS,
     contraction,
+    is_connected,
     run_numbers,
     truth_numbers,
 )
@@ -108,3 +110,34 @@ def test_the_truth_numbers_are_means_over_robots() -> None:
         Evaluation("r", "t", "central", "posterior", ("x",), (dataclasses.replace(tick, maps=maps[:2]),))
     )
     assert math.isnan(alone["central_mean_iou"])
+
+
+def test_a_team_is_connected_where_links_work_both_ways() -> None:
+    tick = tick_metrics(0)
+    tick = dataclasses.replace(tick, robots=tuple(dataclasses.replace(robot, active=True) for robot in tick.robots))
+    first, second, *others = (robot.robot_id for robot in tick.robots)
+    assert not others
+    (link, *_) = tick.links
+    both = tuple(
+        dataclasses.replace(link, sender=sender, receiver=receiver)
+        for sender, receiver in ((first, second), (second, first))
+    )
+    assert is_connected(dataclasses.replace(tick, links=both))
+    assert not is_connected(dataclasses.replace(tick, links=both[:1]))
+    assert not is_connected(dataclasses.replace(tick, links=()))
+    # A robot that is off needs no link.
+    off = dataclasses.replace(tick.robots[1], active=False)
+    assert is_connected(dataclasses.replace(tick, links=(), robots=(tick.robots[0], off)))
+
+
+def test_agreement_while_connected_is_that_of_the_last_such_tick(tmp_path) -> None:
+    cut = ScheduleEntry(start=1.0, groups=(("husky_1",), ("husky_2",)))
+    config = load_team_file(PAIR_TEAM).with_parameters({"publish_period": 0.5})
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, schedule=(cut,)))
+    summary = replay_team(config, tmp_path / "cut.mcap")
+    with open_result(tmp_path / "cut.mcap") as result:
+        before = [tick for tick in result.metrics if tick.links and not tick.settling]
+        row = run_numbers(summary, result.metrics)
+    assert 0 < len(before) < summary.num_ticks - summary.num_settling_ticks
+    worst = min(robot.agreement_occupied for robot in before[-1].robots)
+    assert row["agreement_occupied_connected"] == worst > row["agreement_occupied"]

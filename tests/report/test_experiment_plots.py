@@ -1,0 +1,75 @@
+"""Figures of experiments: what they draw, from rows made by hand."""
+
+import itertools
+
+import numpy as np
+
+from octoreplay.report.comparisons import Comparison, Measure
+from octoreplay.report.experiment_plots import Curves, Dots, Squares
+
+SCORE = Measure("score", "score", 2)
+BYTES = Measure("kB", "bytes", None, 1e-3, is_ratio=True)
+
+
+def rows(num_villages: int = 6) -> list[dict]:
+    """Runs of two rules on two graphs with two steps; the score grows with the step and the village."""
+    return [
+        {"rule": rule, "graph": graph, "step": step, "gain": gain, "village": village,
+         "score": float(step) + 0.01 * village, "bytes": 1e3 * (1 + village)}
+        for rule, graph, step, gain, village in itertools.product(
+            ("bayes", "flood"), ("ring", "line"), ("0.1", "0.5"), ("1", "2"), range(num_villages)
+        )
+    ]  # fmt: skip
+
+
+def rule(row: dict) -> str:
+    """Name of a run's rule."""
+    return row["rule"]
+
+
+def test_dots_have_a_marker_and_bars_for_every_label_and_section() -> None:
+    comparison = Comparison("runs", "rule", rule, (SCORE, BYTES), "bayes", "graph")
+    figure = Dots(comparison).draw({"runs": rows()})
+    score, num_bytes = figure.axes
+    assert [text.get_text() for text in score.get_yticklabels()] == ["bayes", "flood"]
+    assert len(score.containers) == 2
+    means, _, (bars,) = score.containers[0].lines
+    np.testing.assert_allclose(means.get_xdata(orig=False), [0.325, 0.325])
+    assert len(bars.get_segments()) == 2
+    # Markers of two sections do not cover each other.
+    places = [container.lines[0].get_ydata(orig=False)[0] for container in score.containers]
+    assert abs(places[0] - places[1]) > 0.2
+    assert num_bytes.get_xscale() == "log"
+    figure.canvas.draw()
+
+
+def test_curves_have_bands_and_theory_as_a_curve() -> None:
+    def theory(label: str) -> tuple[np.ndarray, np.ndarray]:
+        """A line for each label."""
+        x = np.linspace(0.0, 1.0, 100)
+        return x, x + (label == "flood")
+
+    plain = Curves("runs", "step", "step", (SCORE,), rule, "graph").draw({"runs": rows()})
+    assert len(plain.axes) == 2
+    for axes in plain.axes:
+        assert len(axes.lines) == 2
+        assert len(axes.collections) == 2
+        np.testing.assert_allclose(axes.lines[0].get_xdata(), [0.1, 0.5])
+    with_theory = Curves("runs", "step", "step", (SCORE,), rule, theory=theory).draw({"runs": rows(2)})
+    (axes,) = with_theory.axes
+    assert [len(line.get_xdata()) for line in axes.lines] == [2, 100, 2, 100]
+    # Measurements are markers without lines between them; two villages have no band.
+    assert axes.lines[0].get_linestyle() == "None"
+    assert not axes.collections
+    plain.canvas.draw()
+    with_theory.canvas.draw()
+
+
+def test_squares_have_a_colour_bar_and_the_number_of_every_pair() -> None:
+    figure = Squares("runs", "gain", "step", (SCORE, BYTES), "rule").draw({"runs": rows()})
+    # Two rules with two measures, each with a colour bar.
+    assert len(figure.axes) == 8
+    panel = figure.axes[0]
+    assert [text.get_text() for text in panel.texts] == ["0.13", "0.13", "0.53", "0.53"]
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["0.1", "0.5"]
+    figure.canvas.draw()
