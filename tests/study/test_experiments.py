@@ -25,7 +25,7 @@ NUM_RUNS = {
     "rules": {"rules": 7 * 2 * 2},
     "forgetting": {"cut": 9 * 3 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
-    "radio": {"radio": 4 * 6 * 2},
+    "radio": {"radio": 4 * 6 * 2, "delay": 4 * 4 * 2},
     "noise": {"noise": 14 * 3 * 2},
     "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
@@ -104,12 +104,14 @@ def test_teams_of_equal_simulations_share_their_logs(tmp_path: Path, monkeypatch
     assert files == {"a": folders[0] / "team.yaml", "b": folders[1] / "team.yaml", "c": folders[0] / "team.yaml"}
 
 
-def test_a_team_file_gets_the_schedule(tmp_path: Path) -> None:
+def test_a_team_file_gets_the_schedule_and_the_period(tmp_path: Path) -> None:
     experiment = small()
     cut = ScheduleEntry(start=1.0, groups=(("husky_1",), ("husky_2",)))
-    team = dataclasses.replace(experiment.teams["village_0"], schedule=(cut,))
+    team = dataclasses.replace(experiment.teams["village_0"], schedule=(cut,), publish_period=2.0)
     files = experiments._team_files(Experiment({"cut": team}, ()), tmp_path, lambda *_: None)
-    assert load_team_file(files["cut"]).network.schedule == (cut,)
+    config = load_team_file(files["cut"])
+    assert config.network.schedule == (cut,)
+    assert {robot.publish_period for robot in config.robots} == {2.0}
     assert load_team_file(files["cut"].parent / "team.yaml").network.schedule == ()
 
 

@@ -31,11 +31,24 @@ TRUTH = "world.npz"
 
 @dataclass(frozen=True)
 class SimulatedTeam:
-    """Settings of a simulated team, and the merged classes and the network's schedule of its team file."""
+    """Settings of a simulated team, and what its team file changes.
+
+    Attributes
+    ----------
+    simulation : SimulationConfig
+        Settings of the simulation.
+    merge_classes : Merges
+        Merged classes.
+    schedule : tuple of ScheduleEntry
+        Schedule of the network.
+    publish_period : float or None
+        Period between the published maps of every robot [s], a multiple of the length of a tick; None for one tick.
+    """
 
     simulation: SimulationConfig
     merge_classes: Merges = ()
     schedule: tuple[ScheduleEntry, ...] = ()
+    publish_period: float | None = None
 
 
 @dataclass(frozen=True)
@@ -186,11 +199,15 @@ def _folder_name(simulation: SimulationConfig) -> str:
 def _team_file(label: str, team: SimulatedTeam, folder: Path) -> Path:
     """Team file of one team whose logs are in ``folder``; written beside them if it differs from the simulated one."""
     path = folder / "team.yaml"
-    if not team.merge_classes and not team.schedule:
+    if team == SimulatedTeam(team.simulation):
         return path
     base = load_team_file(path)
-    network = dataclasses.replace(base.network, schedule=team.schedule)
-    config = dataclasses.replace(base, merge_classes=team.merge_classes, network=network)
+    config = dataclasses.replace(
+        base,
+        robots=tuple(dataclasses.replace(robot, publish_period=team.publish_period) for robot in base.robots),
+        merge_classes=team.merge_classes,
+        network=dataclasses.replace(base.network, schedule=team.schedule),
+    )
     changed = folder / f"{label}.yaml"
     write_whole(changed, dump_team(config, folder.resolve()))
     return changed
