@@ -1,15 +1,14 @@
 """The documentation names what there is."""
 
-import csv
 import dataclasses
 import importlib.util
 import math
 import re
 from pathlib import Path
+from types import ModuleType
 
 import click
 import pytest
-from octoreplay.report.experiment_tables import answer_tables
 
 import octoreplay
 from octoreplay import cli
@@ -20,6 +19,7 @@ from octoreplay.io.messages.ros_types import OCTOREPLAY_MSGS
 from octoreplay.io.results.map_views import VIEW_DTYPE
 from octoreplay.run_metrics import PAIR_SHARES, LinkMetrics, PairMetrics, RobotMetrics, TickMetrics
 from octoreplay.study.numbers import RUN_COLUMNS, TIMING_COLUMNS, TRUTH_COLUMNS
+from octoreplay.study.questions import QUESTIONS
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -101,14 +101,30 @@ def test_the_page_on_extension_names_files_that_exist() -> None:
         assert (DOCS.parent / path).exists() or (DOCS.parent / "src" / "octoreplay" / path).exists(), path
 
 
-@pytest.mark.parametrize("name", ["rules", "steps", "scale", "noise", "choose"])
-def test_the_page_on_experiments_has_the_tables_of_the_stored_runs(name: str) -> None:
-    tables = {}
-    for path in sorted((DOCS / "experiments" / name).glob("*.csv")):
-        tables[path.stem] = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-    page = (DOCS / "experiments.md").read_text(encoding="utf-8")
-    stored = page.partition(f"<!-- {name} -->\n")[2].partition("<!-- end -->")[0]
-    assert stored == answer_tables(name, tables)
+def tool(name: str) -> ModuleType:
+    """Module of a script in docs/tools."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / "tools" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_on_experiments_has_the_tables_of_the_stored_runs() -> None:
+    script = tool("experiment_tables")
+    page = script.PAGE.read_text(encoding="utf-8")
+    folders = sorted({path.parent.name for path in (DOCS / "experiments").glob("*/*.csv")})
+    assert folders
+    for name in folders:
+        stored = page.partition(f"<!-- {name} -->\n")[2].partition(script.END)[0]
+        made = script.page_tables(QUESTIONS[name], script.stored_runs(DOCS / "experiments" / name))
+        assert stored == made, "run python docs/tools/experiment_tables.py"
+
+
+def test_the_runs_of_the_experiments_are_small() -> None:
+    sizes = [path.stat().st_size for path in (DOCS / "experiments").glob("*/*.csv")]
+    assert sum(sizes) < 5e6
 
 
 def traits_table() -> str:
@@ -137,11 +153,7 @@ def test_the_page_on_the_algorithm_has_the_traits_of_every_rule() -> None:
 
 
 def test_the_page_of_data_sets_has_the_descriptions_of_the_source() -> None:
-    spec = importlib.util.spec_from_file_location("data_sets", DOCS / "tools" / "data_sets.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = tool("data_sets")
     text = module.PAGE.read_text(encoding="utf-8")
     assert text == module.page(text), "run python docs/tools/data_sets.py"
     assert all(f"| `{name}` |" in text for name in module.DATA_SETS)
