@@ -22,7 +22,7 @@ pytestmark = pytest.mark.long
 
 
 NUM_RUNS = {
-    "rules": {"rules": 7 * 2 * 2},
+    "rules": {"rules": 8 * 2 * 2},
     "forgetting": {"cut": 9 * 3 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
     "radio": {"radio": 4 * 6 * 2, "delay": 4 * 4 * 2},

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from octoreplay.config.rules import RULES
-from octoreplay.report.comparisons import KILOBYTES, Measure, Row
+from octoreplay.report.comparisons import KILOBYTES, Measure
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.experiments import SimulatedTeam
 
@@ -23,8 +22,6 @@ SETTLED = Measure("agreement settled, occupied", "agreement_occupied")
 MEAN_IOU = Measure("mean IoU", "mean_iou")
 AGREEMENTS = (DURING, SETTLED, MEAN_IOU, KILOBYTES)
 
-_SCHEDULES = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("1", "1"): "γ 1/k"}
-
 
 def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, SimulatedTeam]:
     """Teams of six robots by label, each in a village of its own, with these settings of the simulation."""
@@ -32,10 +29,3 @@ def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, S
         f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **settings))
         for seed in range(num_villages)
     }
-
-
-def rule_name(row: Row) -> str:
-    """Name of a run's rule, with gamma where the rule has a gradient step and the run varies it."""
-    name = str(row["rule"])
-    steps = (str(row.get("gamma", "-")), str(row.get("gamma_power", "-")))
-    return f"{name}, {_SCHEDULES[steps]}" if RULES[name].has_gamma and steps in _SCHEDULES else name
