@@ -108,16 +108,16 @@ def test_small_limits_leave_no_room_for_tiles(config) -> None:
 @long
 def test_tiles_that_take_more_than_forecast_become_smaller(tmp_path: Path, monkeypatch) -> None:
     config, tried = load_team_file(TRIO_TEAM), []
-    replay_logs = run._replay_logs
+    replay_all = run._replay_all
 
-    def replay(tiles, workers, folder, progress):
-        tried.append(tiles[0].num_cells)
-        stages = replay_logs(tiles, workers, folder, progress)
+    def replay(setup, workers, tiles, memory, progress):
+        tried.append(next(iter(tiles)).num_cells)
+        stages = replay_all(setup, workers, tiles, memory, progress)
         if len(tried) == 1:
             raise MemoryLimitError("tile_0_0: takes more")
         return stages
 
-    monkeypatch.setattr(run, "_replay_logs", replay)
+    monkeypatch.setattr(run, "_replay_all", replay)
     # Smaller tiles of a small map take less where the forecast is that of their bricks alone.
     monkeypatch.setattr(run, "_RETRY_SHARE", 0.99)
     for module in (run, forecast):

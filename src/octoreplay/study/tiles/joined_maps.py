@@ -19,7 +19,7 @@ from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL, TEAM
 from octoreplay.replay.map_recorder import MAP_WRITES, MapRecorder, MapSink, MapTick, NumAveraged
 from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.tile_run import TileFiles
+from octoreplay.study.tiles.stage import TileFiles
 from octoreplay.study.tiles.work import StoredMap, read_maps, read_ticks
 
 

@@ -20,7 +20,7 @@ from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
-from octoreplay.study.tiles.tile_run import Stage
+from octoreplay.study.tiles.stage import Stage
 from octoreplay.study.tiles.worker import Request, Setup, Workers
 
 
