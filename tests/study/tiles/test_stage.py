@@ -12,43 +12,18 @@ from octoreplay.study.tiles import run, tile_run
 from octoreplay.study.tiles.scans import scan_bytes
 from octoreplay.study.tiles.stage import Agreement, Stage, load_stage
 from support.fixture_paths import TRIO_TEAM
+from support.here_workers import requests
 from support.long_suite import long
+
+__all__ = ["requests"]
 
 EDGE = 9.6
 """Least edge of tiles of the fixture, 32 cells [m]."""
 
 
-class HereWorkers:
-    """Workers that answer in this process, where a test can change functions; notes the requests."""
-
-    requests: list[tuple[str, str]]
-
-    def __init__(self, setup, num_jobs) -> None:
-        self.setup = setup
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error) -> None:
-        pass
-
-    def answers(self, requests):
-        for request in requests:
-            self.requests.append((request.function.__name__, request.name))
-            yield request.function(self.setup, *request.arguments)
-
-
 @pytest.fixture(scope="module")
 def config():
     return resolve(load_team_file(TRIO_TEAM))
-
-
-@pytest.fixture
-def requests(monkeypatch) -> list[tuple[str, str]]:
-    """Requests to workers in this process."""
-    monkeypatch.setattr(HereWorkers, "requests", [], raising=False)
-    monkeypatch.setattr(run, "LocalWorkers", HereWorkers)
-    return HereWorkers.requests
 
 
 def stage(largest, num_finer, num_settling) -> Stage:

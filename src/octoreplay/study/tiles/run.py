@@ -29,7 +29,15 @@ from octoreplay.replay.run import check_num_ticks, frame_causes
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
 from octoreplay.study.tiles.cluster_workers import ClusterWorkers, check_cluster
-from octoreplay.study.tiles.forecast import BLOCK_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
+from octoreplay.study.tiles.forecast import (
+    BLOCK_CELLS,
+    available_memory,
+    check_joining,
+    chosen_cells,
+    join_memory,
+    tile_memory,
+    worker_memory,
+)
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index, scan_bytes
@@ -49,7 +57,7 @@ _OTHER_FILES = 64
 StartWorkers = Callable[[Setup], Workers]
 """Function that starts the workers of a run."""
 Progress = Callable[[str, int, int], None]
-"""Function that is called with a stage, and the numbers of finished robots, tiles or ticks and of all."""
+"""Function that is called with a stage, and the numbers of finished robots, tiles, maps or ticks and of all."""
 
 
 def replay_tiles(
@@ -92,8 +100,8 @@ def replay_tiles(
         Largest memory of all processes together [byte], by default 80 % of what is free. On a cluster, that of one
         process; tiles of a given edge then need none.
     progress : function, optional
-        Called with the stage ('cast', 'replay', 'settle', 'write tiles' or 'write'), and the numbers of finished
-        robots, tiles or ticks and of all.
+        Called with the stage ('cast', 'replay', 'settle', 'join', 'write tiles' or 'write'), and the numbers of
+        finished robots, tiles, maps or ticks and of all.
     result_per_tile : bool
         True to write the maps of each tile into a result of its own in the folder ``OUT.maps`` beside the output, which
         is then the index of them: ``open_result`` reads both as one result. Cubes above each other share a result.
@@ -136,16 +144,19 @@ def replay_tiles(
         folder = stack.enter_context(work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         setup = Setup(dataclasses.replace(config, robots=robots), folder.absolute(), num_threads, room)
-        replayed = _replayed(setup, start_workers, given_cells, num_axes, progress)
+        replayed = _replayed(setup, start_workers, given_cells, num_axes, progress, joins=not result_per_tile)
         workers, scans, stages = stack.enter_context(replayed)
         tiles = tuple(stages)
+        maps: JoinedMaps | OtherMaps
         outcome = Outcome.of(stages, _counts(config, scans, next(iter(stages.values())).num_frames_off))
         show = progress or (lambda *_: None)
-        maps: JoinedMaps | OtherMaps = JoinedMaps(config, tiles, folder)
         if result_per_tile:
             show_tiles = functools.partial(show, "write tiles")
             files, maps = write_tiles(output, tiles, workers, outcome, writer.inputs, show_tiles)
             writer.write_tiles(files)
+        else:
+            maps = JoinedMaps(config, tiles, folder)
+            maps.encode_in(workers, join_memory(scans), functools.partial(show, "join"))
         with interrupts.deferred() as deliver_interrupts:
 
             def show_ticks(done: int) -> None:
@@ -192,16 +203,25 @@ def _allow_open_files(num_tiles: int) -> None:
 
 @contextmanager
 def _replayed(
-    setup: Setup, start_workers: StartWorkers, given_cells: int | None, num_axes: int, progress: Progress | None
+    setup: Setup,
+    start_workers: StartWorkers,
+    given_cells: int | None,
+    num_axes: int,
+    progress: Progress | None,
+    *,
+    joins: bool,
 ) -> Iterator[tuple[Workers, list[ScanIndex], dict[Tile, Stage]]]:
     """Replay all tiles up to their last tick, with a given edge or with the largest one that fits into the memory.
 
-    Yields the workers, the index of the scans of each robot, and the tiles in ascending order.
+    Yields the workers, the index of the scans of each robot, and the tiles in ascending order. ``joins`` is True where
+    each robot's map is joined.
     """
     room: float = setup.memory_limit or math.inf
     while True:
         with start_workers(setup) as workers:
             scans = _cast_scans(setup, workers, given_cells or BLOCK_CELLS, num_axes, progress)
+            if joins:
+                check_joining(scans, room)
             num_cells = given_cells or chosen_cells(setup.config, scans, room)
             tiles = _tiles(setup.config, scans, num_cells)
             _allow_open_files(len(tiles))
