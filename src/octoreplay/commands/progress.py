@@ -31,7 +31,7 @@ def replay_tiles_with_bar(config: RunConfig, output: Path, edge: float | None, *
     with progress_bar("replay") as update:
 
         def show(stage: str, num_done: int, num_all: int) -> None:
-            unit = {"cast": "robots", "write": "ticks"}.get(stage, "tiles")
+            unit = {"cast": "robots", "join": "maps", "write": "ticks"}.get(stage, "tiles")
             update(num_done / num_all, None, f"{stage}: {num_done} of {num_all} {unit}")
 
         return replay_tiles(config, output, edge, progress=show, **options)

@@ -181,10 +181,16 @@ class _StateSeries:
 
 
 class MapRecorder:
-    """Recorder of maps; gives what a tick writes to a ``sink``. Maps are encoded in parallel ``threads``."""
+    """Recorder of maps; gives what a tick writes to a ``sink``. Maps are encoded in parallel ``threads``.
 
-    def __init__(self, config: ResolvedRun, sink: MapSink, threads: Executor) -> None:
+    ``warn`` is called with a sentence for each form of a map that cannot be stored.
+    """
+
+    def __init__(
+        self, config: ResolvedRun, sink: MapSink, threads: Executor, warn: Callable[[str], None] = _log.warning
+    ) -> None:
         self._config = config
+        self._warn = warn
         self._sink = sink
         self._threads = threads
         self._maps = _StateSeries(threads)
@@ -243,7 +249,7 @@ class MapRecorder:
                 return form.encode(tick.maps[robot_id], tick.num_robots[robot_id], self._config)
             except ValueError as error:
                 # A map that cannot be encoded must not end a long run.
-                _log.warning("warning: robot '%s': no %s is stored: %s", robot_id, name, error)
+                self._warn(f"warning: robot '{robot_id}': no {name} is stored: {error}")
                 return None
 
         robots = [robot_id for robot_id in tick.maps if robot_id != CENTRAL]

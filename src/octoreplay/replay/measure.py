@@ -155,8 +155,13 @@ class TickMeasurer:
         """Counts of the team after a tick. ``max_change`` is the largest change of a log-odds by the iterations."""
         compared = [component.compare(team, graph) for component in self._components]
         links = self._link_metrics(graph, traffic)
+        sent_bytes = dict.fromkeys(self._robot_ids, 0)
+        for link in links:
+            sent_bytes[link.sender] += link.sent_bytes
         robots = tuple(
-            self._robot_counts(robot, robot.index in graph.active, traffic.published[robot.index], links)
+            self._robot_counts(
+                robot, robot.index in graph.active, traffic.published[robot.index], sent_bytes[robot.robot_id]
+            )
             for robot in team.robots
         )
         return TickCounts(
@@ -181,10 +186,9 @@ class TickMeasurer:
         )
 
     def _robot_counts(
-        self, robot: Robot, is_active: bool, published: Publication | None, links: Sequence[LinkMetrics]
+        self, robot: Robot, is_active: bool, published: Publication | None, sent_bytes: int
     ) -> RobotCounts:
-        """One robot's part of the counts."""
-        sent_bytes = sum(link.sent_bytes for link in links if link.sender == robot.robot_id)
+        """One robot's part of the counts; ``sent_bytes`` are those of its links."""
         if published and self._config.effective_packet.cast == "broadcast":
             # One packet reaches all its receivers.
             sent_bytes -= sum((len(receivers) - 1) * message.num_bytes for receivers, message in published.messages)
@@ -202,16 +206,15 @@ class TickMeasurer:
 
     def _link_metrics(self, graph: CommunicationGraph, traffic: Traffic) -> tuple[LinkMetrics, ...]:
         """Metrics of each directed link of the graph, and of every other link with packets in this tick."""
-        used = {link for link, count in traffic.counts.items() if count != LinkCounts()}
+        no_counts, no_receipt, ids = LinkCounts(), Receipt(), self._robot_ids
         entries = []
-        for sender, receiver in sorted(used.union(graph.links)):
-            count = traffic.counts.get((sender, receiver), LinkCounts())
-            receipt = traffic.receipts.get((sender, receiver), Receipt())
+        for link in sorted(traffic.counts.keys() | graph.links):
+            count, receipt = traffic.counts.get(link, no_counts), traffic.receipts.get(link, no_receipt)
             entries.append(
                 LinkMetrics(
-                    sender=self._robot_ids[sender], receiver=self._robot_ids[receiver],
-                    **vars(count), num_stale=receipt.num_stale, num_gaps=receipt.num_gaps,
-                    num_damaged=receipt.num_damaged, bytes_per_second=count.sent_bytes / self._period_ns * 1e9,
+                    sender=ids[link[0]], receiver=ids[link[1]], **vars(count), num_stale=receipt.num_stale,
+                    num_gaps=receipt.num_gaps, num_damaged=receipt.num_damaged,
+                    bytes_per_second=count.sent_bytes / self._period_ns * 1e9,
                 )
             )  # fmt: skip
         return tuple(entries)

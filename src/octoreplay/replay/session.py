@@ -344,7 +344,10 @@ class Session:
                     end.acknowledged(sender, content)
                     continue
                 receipt, answer = end.receive(sender, content)
-                receipts.setdefault((sender, receiver), Receipt()).add(receipt)
+                if (sender, receiver) in receipts:
+                    receipts[sender, receiver].add(receipt)
+                else:
+                    receipts[sender, receiver] = receipt
                 if answer is not None and (receiver, sender) in radio_links:
                     self._links.send(receiver, sender, answer, stamp_ns)
         return receipts

@@ -116,7 +116,7 @@ def _run(config, *, seed, num_robots, links, decodes, forwards, num_ticks=40, nu
 
 
 def _acknowledgement(source, version):
-    return Acknowledgement(encode_acknowledgement([Possession(*source, version)]))
+    return Acknowledgement(encode_acknowledgement((Possession(*source, version),)))
 
 
 TRIANGLE = [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)]

@@ -21,7 +21,10 @@ from octoreplay.result import open_result
 from octoreplay.study.tiles import forecast, run
 from octoreplay.study.tiles.scans import SAMPLE, ScanIndex
 from support.fixture_paths import TRIO_TEAM
+from support.here_workers import requests
 from support.long_suite import long
+
+__all__ = ["requests"]
 
 EMPTY = np.zeros(0, np.int64)
 
@@ -79,6 +82,17 @@ def test_the_largest_tiles_that_fit_are_chosen(config) -> None:
         forecast.chosen_cells(config, scans, sizes[64] - 1)
 
 
+def test_bricks_of_several_robots_are_joined_once() -> None:
+    one, other = scans_of([[4 * n, 0, 0] for n in range(10)]), scans_of([[4 * n, 0, 0] for n in range(5, 20)])
+    expected = forecast.PROCESS_BYTES + 20 * SAMPLE * forecast.JOIN_BYTES
+    assert forecast.join_memory([one, other]) == expected
+    forecast.check_joining([one, other], expected)
+    with pytest.raises(
+        ConfigError, match=r"^memory_limit: joining one robot's map .* give --tiles with --result-per-tile"
+    ):
+        forecast.check_joining([one, other], expected - 1)
+
+
 def test_rules_that_exchange_nothing_take_less(config) -> None:
     local = dataclasses.replace(config, consensus=dataclasses.replace(config.consensus, rule="local"))
     bricks = forecast.Bricks(1e6, 1e6)
@@ -108,16 +122,16 @@ def test_small_limits_leave_no_room_for_tiles(config) -> None:
 @long
 def test_tiles_that_take_more_than_forecast_become_smaller(tmp_path: Path, monkeypatch) -> None:
     config, tried = load_team_file(TRIO_TEAM), []
-    replay_logs = run._replay_logs
+    replay_all = run._replay_all
 
-    def replay(tiles, *arguments):
-        tried.append(tiles[0].num_cells)
-        stages = replay_logs(tiles, *arguments)
+    def replay(setup, workers, tiles, memory, progress):
+        tried.append(next(iter(tiles)).num_cells)
+        stages = replay_all(setup, workers, tiles, memory, progress)
         if len(tried) == 1:
             raise MemoryLimitError("tile_0_0: takes more")
         return stages
 
-    monkeypatch.setattr(run, "_replay_logs", replay)
+    monkeypatch.setattr(run, "_replay_all", replay)
     # Smaller tiles of a small map take less where the forecast is that of their bricks alone.
     monkeypatch.setattr(run, "_RETRY_SHARE", 0.99)
     for module in (run, forecast):
@@ -132,8 +146,23 @@ def test_tiles_that_take_more_than_forecast_become_smaller(tmp_path: Path, monke
 
 
 @long
+def test_maps_that_cannot_be_joined_within_the_limit_are_refused_before_any_tile(
+    tmp_path: Path, monkeypatch, requests
+) -> None:
+    config, output = load_team_file(TRIO_TEAM), tmp_path / "tiled.mcap"
+    monkeypatch.setattr(forecast, "JOIN_BYTES", 10**7)
+    with pytest.raises(ConfigError, match="joining one robot's map"):
+        run.replay_tiles(config, output, 40.0, memory_limit=10**9)
+    assert {kind for kind, _ in requests} == {"cast_scans"}
+    run.replay_tiles(config, output, 40.0, memory_limit=4 * 10**9, result_per_tile=True, resume=True)
+    assert "encode_map" not in {kind for kind, _ in requests}
+
+
+@long
 def test_a_tile_above_the_limit_of_its_process_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(MemoryLimitError, match=r"^tile_.*: takes .* GB, more than .* smaller --tiles"):
-        run.replay_tiles(load_team_file(TRIO_TEAM), tmp_path / "tiled.mcap", 40.0, memory_limit=300_000_000)
+        run.replay_tiles(
+            load_team_file(TRIO_TEAM), tmp_path / "tiled.mcap", 40.0, memory_limit=300_000_000, result_per_tile=True
+        )
     run.replay_tiles(load_team_file(TRIO_TEAM), tmp_path / "tiled.mcap", 40.0, resume=True)
     assert (tmp_path / "tiled.mcap").exists()

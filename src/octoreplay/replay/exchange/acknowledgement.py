@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import struct
 import zlib
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from octoreplay.errors import PacketError
@@ -17,6 +17,8 @@ _HEADER = struct.Struct("<4sBBH")
 _ENTRY = struct.Struct("<HIBI")
 """origin, epoch, 1 for a map and 0 for none, version."""
 _CHECKSUM = struct.Struct("<I")
+_NUM_KEPT = 1024
+"""Number of acknowledgements that are kept: the neighbours of a robot send the same bytes in most ticks."""
 
 
 class Possession(NamedTuple):
@@ -27,7 +29,8 @@ class Possession(NamedTuple):
     version: int | None
 
 
-def encode_acknowledgement(entries: Sequence[Possession]) -> bytes:
+@functools.lru_cache(_NUM_KEPT)
+def encode_acknowledgement(entries: tuple[Possession, ...]) -> bytes:
     """Encode an acknowledgement."""
     data = _HEADER.pack(MAGIC, VERSION, 0, len(entries)) + b"".join(
         _ENTRY.pack(origin, epoch, version is not None, version or 0) for origin, epoch, version in entries
@@ -35,6 +38,7 @@ def encode_acknowledgement(entries: Sequence[Possession]) -> bytes:
     return data + _CHECKSUM.pack(zlib.crc32(data))
 
 
+@functools.lru_cache(_NUM_KEPT)
 def decode_acknowledgement(data: bytes) -> tuple[Possession, ...]:
     """Decode an acknowledgement. Raises PacketError where it is damaged or of an unknown format."""
     end = len(data) - _CHECKSUM.size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 from octoreplay.mapping.octree import SemanticOctree
@@ -62,7 +63,7 @@ class MapMessage:
 
     waits = True
 
-    @property
+    @cached_property
     def num_bytes(self) -> int:
         """Length of the packets [bytes]."""
         return sum(len(part.data) for part in self.parts)

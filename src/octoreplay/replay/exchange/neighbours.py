@@ -122,7 +122,7 @@ class Exchange:
             answers[source] = Possession(*source, held.version if held else None)
         if not answers or self._config.packets != "delta" or not self._config.acknowledge:
             return receipt, None
-        return receipt, Acknowledgement(encode_acknowledgement(list(answers.values())))
+        return receipt, Acknowledgement(encode_acknowledgement(tuple(answers.values())))
 
     def epoch_of(self, robot: int) -> int:
         """Newest restart epoch that a robot has sent itself."""

@@ -2,7 +2,7 @@
 
 Losses, delays and damage are drawn independently per direction: each direction of a link has its own random generator,
 seeded by the run's seed and the two robots, and draws the same number of values for every packet. A change on one link
-therefore leaves all others as they are.
+therefore leaves all others as they are. A link on which nothing is random draws nothing.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import heapq
 from collections import deque
 from collections.abc import Collection, Iterable, Set
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -40,8 +40,7 @@ class Transmission(Protocol):
 T = TypeVar("T", bound=Transmission)
 
 
-@dataclass(frozen=True)
-class Delivery(Generic[T]):
+class Delivery(NamedTuple, Generic[T]):
     """Content that arrived from one robot at another."""
 
     sender: int
@@ -64,12 +63,15 @@ class LinkCounts:
     num_late: int = 0
 
 
+_NO_COUNTS = LinkCounts()
+
+
 @dataclass
 class _Link(Generic[T]):
-    """One direction of a link."""
+    """One direction of a link; ``random`` is None where nothing is drawn."""
 
     config: LinkConfig
-    random: np.random.Generator
+    random: np.random.Generator | None
     in_burst: bool = False
     busy_until_ns: int = 0
     waiting: deque[tuple[int, T]] = field(default_factory=deque)
@@ -95,7 +97,8 @@ class Links(Generic[T]):
         link = self._link(sender, receiver)
         link.counts.num_sent += content.waits
         link.counts.sent_bytes += content.num_bytes
-        self._start_waiting(sender, receiver, link, now_ns)
+        if link.waiting:
+            self._start_waiting(sender, receiver, link, now_ns)
         if not content.waits or (link.busy_until_ns <= now_ns and not link.waiting):
             self._start(sender, receiver, link, now_ns, now_ns, content)
             return
@@ -113,18 +116,20 @@ class Links(Generic[T]):
         Content that arrives at other robots is lost.
         """
         for (sender, receiver), link in self._links.items():
-            self._start_waiting(sender, receiver, link, now_ns)
+            if link.waiting:
+                self._start_waiting(sender, receiver, link, now_ns)
         arrived = []
         while self._on_air and self._on_air[0][0] <= now_ns:
             delivery = heapq.heappop(self._on_air)[-1]
-            counts = self._link(delivery.sender, delivery.receiver).counts
-            if delivery.receiver not in listening:
-                counts.num_lost += delivery.content.waits
+            sender, receiver, sent_ns, _, content = delivery
+            counts = self._links[sender, receiver].counts
+            if receiver not in listening:
+                counts.num_lost += content.waits
                 continue
-            counts.delivered_bytes += delivery.content.num_bytes
-            if delivery.content.waits:
+            counts.delivered_bytes += content.num_bytes
+            if content.waits:
                 counts.num_delivered += 1
-                counts.num_late += delivery.sent_ns < now_ns
+                counts.num_late += sent_ns < now_ns
             arrived.append(delivery)
         return arrived
 
@@ -132,7 +137,7 @@ class Links(Generic[T]):
         """Drop the queues of all links (sender, receiver) that are not in ``links``."""
         standing = set(links)
         for ends, link in self._links.items():
-            if ends not in standing:
+            if link.waiting and ends not in standing:
                 link.counts.num_dropped += len(link.waiting)
                 link.waiting.clear()
 
@@ -150,19 +155,22 @@ class Links(Generic[T]):
         self.cut(ends for ends in self._links if not robots & set(ends))
 
     def take_counts(self) -> dict[tuple[int, int], LinkCounts]:
-        """Counts of each direction of each link since the last call."""
-        counts = {ends: link.counts for ends, link in self._links.items()}
-        for link in self._links.values():
-            link.counts = LinkCounts()
+        """Counts since the last call of each direction of a link on which anything happened."""
+        counts = {}
+        for ends, link in self._links.items():
+            if link.counts != _NO_COUNTS:
+                counts[ends], link.counts = link.counts, LinkCounts()
         return counts
 
     def _link(self, sender: int, receiver: int) -> _Link[T]:
         """One direction of a link, made at its first use."""
-        if (sender, receiver) not in self._links:
+        link = self._links.get((sender, receiver))
+        if link is None:
             config = self._config.link_config(self._ids[sender], self._ids[receiver])
-            random = np.random.default_rng([self._config.network.network_seed, sender, receiver])
-            self._links[sender, receiver] = _Link(config, random)
-        return self._links[sender, receiver]
+            seed = [self._config.network.network_seed, sender, receiver]
+            link = _Link(config, np.random.default_rng(seed) if config.is_random else None)
+            self._links[sender, receiver] = link
+        return link
 
     def _start_waiting(self, sender: int, receiver: int, link: _Link[T], now_ns: int) -> None:
         """Transmit queued content for as long as the link has become free by now."""
@@ -172,20 +180,22 @@ class Links(Generic[T]):
 
     def _start(self, sender: int, receiver: int, link: _Link[T], sent_ns: int, start_ns: int, content: T) -> None:
         """Transmit content: draw its loss, delay and damage."""
-        config = link.config
-        turn, loss, delay, corruption, place = link.random.random(5)
+        config, delay = link.config, link.config.latency
         if config.rate is not None and content.waits:
             seconds = content.num_bytes / config.rate
             self.longest_transmission = max(self.longest_transmission, seconds)
             link.busy_until_ns = start_ns + round(seconds * 1e9)
             start_ns = link.busy_until_ns
-        link.in_burst = turn >= config.burst_end if link.in_burst else turn < config.burst_start
-        if loss < (config.burst_loss if link.in_burst else config.loss):
-            link.counts.num_lost += content.waits
-            return
-        arrival_ns = start_ns + round((config.latency + config.jitter * (2.0 * delay - 1.0)) * 1e9)
-        if corruption < config.corruption:
-            content = content.damaged(place)
-        delivery = Delivery(sender, receiver, sent_ns, arrival_ns, content)
+        if link.random is not None:
+            turn, loss, deviation, corruption, place = link.random.random(5).tolist()
+            link.in_burst = turn >= config.burst_end if link.in_burst else turn < config.burst_start
+            if loss < (config.burst_loss if link.in_burst else config.loss):
+                link.counts.num_lost += content.waits
+                return
+            delay += config.jitter * (2.0 * deviation - 1.0)
+            if corruption < config.corruption:
+                content = content.damaged(place)
+        arrival_ns = start_ns + round(delay * 1e9)
         self._num_started += 1
+        delivery = Delivery(sender, receiver, sent_ns, arrival_ns, content)
         heapq.heappush(self._on_air, (arrival_ns, sender, receiver, self._num_started, delivery))

@@ -270,7 +270,9 @@ class Robot(ABC):
     def receive(self, sender: int, message: MapMessage) -> tuple[Receipt, Acknowledgement | None]:
         """Store the maps of a message; its receipt, and the acknowledgement to send (None: none)."""
         receipt, answer = self.exchange.receive(sender, message)
-        self._arrived += [Arrival(source, self.exchange.held[source]) for source in receipt.fresh]
+        if receipt.fresh:
+            held = self.exchange.held
+            self._arrived += [Arrival(source, held[source]) for source in receipt.fresh]
         return receipt, answer
 
     def acknowledged(self, sender: int, answer: Acknowledgement) -> None:

@@ -34,6 +34,8 @@ MAP_BYTES = {Exchanged.MAP: 1200, Exchanged.RUNNING_SUMS: 2200, Exchanged.EVIDEN
 """Memory of a brick of one robot's map, with the versions that it and its neighbours hold, by what robots exchange."""
 MARGIN = 1.2
 """Factor on the forecast for a tile, which also holds what joins it to the others."""
+JOIN_BYTES = 1400
+"""Memory of a brick of the team's map while one robot's map and evidence are joined and encoded."""
 FREE_SHARE = 0.8
 """Share of the free memory that a run without a limit may take."""
 BLOCK_CELLS = 2 * LEAST_CELLS
@@ -108,6 +110,22 @@ def tile_memory(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int)
     num_own, num_union = (_counts(brick_keys(codes)[:, :num_axes] // num_cells) for codes in (own, np.unique(own)))
     found = (Bricks(SAMPLE * own, SAMPLE * num_union[tile]).memory(config) for tile, own in num_own.items())
     return round(MARGIN * max(found, default=PROCESS_BYTES))
+
+
+def join_memory(scans: Sequence[ScanIndex]) -> int:
+    """Return the memory of the process that joins one robot's map and evidence of all tiles [byte]."""
+    num_union = SAMPLE * np.unique(np.concatenate([index.sample for index in scans])).size
+    return PROCESS_BYTES + JOIN_BYTES * num_union
+
+
+def check_joining(scans: Sequence[ScanIndex], room: float) -> None:
+    """Raise ConfigError where a map that is joined takes more than ``room`` [byte]."""
+    memory = join_memory(scans)
+    if memory > room:
+        raise ConfigError(
+            f"memory_limit: joining one robot's map takes about {memory / 1e9:.2g} GB, more than {room / 1e9:.2g} GB;"
+            " give --tiles with --result-per-tile, which joins no map, a larger limit, or fewer --jobs"
+        )
 
 
 def _counts(places: Int64Array) -> dict[tuple[int, ...], int]:

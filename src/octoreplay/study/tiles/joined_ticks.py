@@ -18,7 +18,7 @@ from octoreplay.replay.robots.robot import MapSizes
 from octoreplay.replay.tick_counts import RobotCounts, TickCounts, TileParts, tick_metrics
 from octoreplay.run_metrics import LinkMetrics, TickMetrics
 from octoreplay.study.tiles.geometry import Tile
-from octoreplay.study.tiles.tile_run import TileFiles
+from octoreplay.study.tiles.stage import TileFiles
 from octoreplay.study.tiles.work import read_ticks
 
 

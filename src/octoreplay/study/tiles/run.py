@@ -9,8 +9,8 @@ import math
 import os
 import resource
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,21 @@ from octoreplay.replay.run import check_num_ticks, frame_causes
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.casting import cast_groups, cast_scans, team_start_ns
 from octoreplay.study.tiles.cluster_workers import ClusterWorkers, check_cluster
-from octoreplay.study.tiles.forecast import BLOCK_CELLS, available_memory, chosen_cells, tile_memory, worker_memory
+from octoreplay.study.tiles.forecast import (
+    BLOCK_CELLS,
+    available_memory,
+    check_joining,
+    chosen_cells,
+    join_memory,
+    tile_memory,
+    worker_memory,
+)
 from octoreplay.study.tiles.geometry import Tile, tile_cells, tiles_of
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
-from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index
-from octoreplay.study.tiles.tile_run import Stage, TileFiles, replay_logs, settle
-from octoreplay.study.tiles.work_folder import keep_tiles_of, work_folder
+from octoreplay.study.tiles.scans import ScanFiles, ScanIndex, load_index, scan_bytes
+from octoreplay.study.tiles.stage import Agreement, Stage, TileFiles
+from octoreplay.study.tiles.tile_run import replay, settle
+from octoreplay.study.tiles.work_folder import AGREEMENT, keep_tiles_of, work_folder
 from octoreplay.study.tiles.worker import LocalWorkers, Request, Setup, Workers
 from octoreplay.study.tiles.written import Outcome, write_result, write_tiles
 
@@ -48,7 +57,7 @@ _OTHER_FILES = 64
 StartWorkers = Callable[[Setup], Workers]
 """Function that starts the workers of a run."""
 Progress = Callable[[str, int, int], None]
-"""Function that is called with a stage, and the numbers of finished robots, tiles or ticks and of all."""
+"""Function that is called with a stage, and the numbers of finished robots, tiles, maps or ticks and of all."""
 
 
 def replay_tiles(
@@ -91,8 +100,8 @@ def replay_tiles(
         Largest memory of all processes together [byte], by default 80 % of what is free. On a cluster, that of one
         process; tiles of a given edge then need none.
     progress : function, optional
-        Called with the stage ('cast', 'replay', 'settle', 'write tiles' or 'write'), and the numbers of finished
-        robots, tiles or ticks and of all.
+        Called with the stage ('cast', 'replay', 'settle', 'join', 'write tiles' or 'write'), and the numbers of
+        finished robots, tiles, maps or ticks and of all.
     result_per_tile : bool
         True to write the maps of each tile into a result of its own in the folder ``OUT.maps`` beside the output, which
         is then the index of them: ``open_result`` reads both as one result. Cubes above each other share a result.
@@ -135,17 +144,19 @@ def replay_tiles(
         folder = stack.enter_context(work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         setup = Setup(dataclasses.replace(config, robots=robots), folder.absolute(), num_threads, room)
-        scans = _cast_scans(setup, start_workers, given_cells or BLOCK_CELLS, num_axes, progress)
-        stages = _replay_all(setup, start_workers, scans, given_cells, progress)
+        replayed = _replayed(setup, start_workers, given_cells, num_axes, progress, joins=not result_per_tile)
+        workers, scans, stages = stack.enter_context(replayed)
         tiles = tuple(stages)
+        maps: JoinedMaps | OtherMaps
         outcome = Outcome.of(stages, _counts(config, scans, next(iter(stages.values())).num_frames_off))
         show = progress or (lambda *_: None)
-        maps: JoinedMaps | OtherMaps = JoinedMaps(config, tiles, folder)
         if result_per_tile:
-            with start_workers(setup) as workers:
-                show_tiles = functools.partial(show, "write tiles")
-                files, maps = write_tiles(output, tiles, workers, outcome, writer.inputs, show_tiles)
+            show_tiles = functools.partial(show, "write tiles")
+            files, maps = write_tiles(output, tiles, workers, outcome, writer.inputs, show_tiles)
             writer.write_tiles(files)
+        else:
+            maps = JoinedMaps(config, tiles, folder)
+            maps.encode_in(workers, join_memory(scans), functools.partial(show, "join"))
         with interrupts.deferred() as deliver_interrupts:
 
             def show_ticks(done: int) -> None:
@@ -190,8 +201,46 @@ def _allow_open_files(num_tiles: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+@contextmanager
+def _replayed(
+    setup: Setup,
+    start_workers: StartWorkers,
+    given_cells: int | None,
+    num_axes: int,
+    progress: Progress | None,
+    *,
+    joins: bool,
+) -> Iterator[tuple[Workers, list[ScanIndex], dict[Tile, Stage]]]:
+    """Replay all tiles up to their last tick, with a given edge or with the largest one that fits into the memory.
+
+    Yields the workers, the index of the scans of each robot, and the tiles in ascending order. ``joins`` is True where
+    each robot's map is joined.
+    """
+    room: float = setup.memory_limit or math.inf
+    while True:
+        with start_workers(setup) as workers:
+            scans = _cast_scans(setup, workers, given_cells or BLOCK_CELLS, num_axes, progress)
+            if joins:
+                check_joining(scans, room)
+            num_cells = given_cells or chosen_cells(setup.config, scans, room)
+            tiles = _tiles(setup.config, scans, num_cells)
+            _allow_open_files(len(tiles))
+            keep_tiles_of(setup.folder, num_cells)
+            memory = tile_memory(setup.config, scans, num_cells)
+            try:
+                stages = _replay_all(setup, workers, tiles, memory, progress)
+            except MemoryLimitError as error:
+                if given_cells is not None:
+                    raise
+                _log.info("%s; the run goes on with smaller tiles", str(error).partition(";")[0])
+                room = _RETRY_SHARE * memory
+                continue
+            yield workers, scans, stages
+            return
+
+
 def _cast_scans(
-    setup: Setup, start_workers: StartWorkers, block_cells: int, num_axes: int, progress: Progress | None
+    setup: Setup, workers: Workers, block_cells: int, num_axes: int, progress: Progress | None
 ) -> list[ScanIndex]:
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
     config, folder = setup.config, setup.folder
@@ -202,11 +251,10 @@ def _cast_scans(
         for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
-    with start_workers(setup) as workers:
-        for num_robots in workers.answers(requests):
-            num_done += num_robots
-            if progress is not None:
-                progress("cast", num_done, len(config.robots))
+    for num_robots in workers.answers(requests):
+        num_done += num_robots
+        if progress is not None:
+            progress("cast", num_done, len(config.robots))
     paths = [ScanFiles(folder, index).index for index in range(len(config.robots))]
     scans = [load_index(path) for path in paths]
     if not sum(index.frames.size for index in scans):
@@ -217,31 +265,8 @@ def _cast_scans(
     return scans
 
 
-def _replay_all(
-    setup: Setup, start_workers: StartWorkers, scans: Sequence[ScanIndex], given_cells: int | None,
-    progress: Progress | None,
-) -> dict[Tile, Stage]:  # fmt: skip
-    """Replay all tiles up to their last tick, with a given edge or with the largest one that fits into the memory."""
-    room: float = setup.memory_limit or math.inf
-    while True:
-        num_cells = given_cells or chosen_cells(setup.config, scans, room)
-        tiles = _tiles(setup.config, scans, num_cells)
-        _allow_open_files(len(tiles))
-        keep_tiles_of(setup.folder, num_cells)
-        try:
-            memory = tile_memory(setup.config, scans, num_cells)
-            with start_workers(setup) as workers:
-                stages = _replay_logs(tiles, workers, setup.folder, memory, progress)
-                return _settle(tiles, stages, workers, memory, progress)
-        except MemoryLimitError as error:
-            if given_cells is not None:
-                raise
-            _log.info("%s; the run goes on with smaller tiles", str(error).partition(";")[0])
-            room = _RETRY_SHARE * memory
-
-
-def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> tuple[Tile, ...]:
-    """Tiles that the scans touch. Raises InputError without any."""
+def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> dict[Tile, int]:
+    """Tiles that the scans touch, in ascending order, with the bytes of their scans. Raises InputError without any."""
     if not sum(index.stamps.size for index in scans):
         causes = frame_causes(_counts(config, scans, [{}] * len(scans)), config.time)
         raise InputError(f"no robot has a frame that can be used: {causes}")
@@ -249,7 +274,7 @@ def _tiles(config: ResolvedRun, scans: Sequence[ScanIndex], num_cells: int) -> t
     tiles = tiles_of(blocks, num_cells // scans[0].block_cells, num_cells)
     if not tiles:
         raise InputError("bounds: no ray of any frame passes them; check bounds and the robots' poses")
-    return tiles
+    return dict(zip(tiles, scan_bytes(scans, num_cells), strict=True))
 
 
 def _counts(
@@ -262,38 +287,46 @@ def _counts(
     }
 
 
-def _replay_logs(
-    tiles: Sequence[Tile], workers: Workers, folder: Path, memory: int, progress: Progress | None
+def _replay_all(
+    setup: Setup, workers: Workers, tiles: Mapping[Tile, int], memory: int, progress: Progress | None
 ) -> dict[Tile, Stage]:
-    """Replay the logs of all tiles that an earlier run has not finished."""
+    """Replay all tiles, those with the most scans first, until all have settled with the same number of ticks.
+
+    A tile settles at once with the values of the tiles that are finished. They are right for all tiles unless a later
+    tile has larger log-odds or takes longer; settling then goes on in rounds.
+    """
+    config, folder = setup.config, setup.folder
     stages = {tile: stage for tile in tiles if (stage := TileFiles(folder, tile).read_stage()) is not None}
     if stages:
         _log.info("%d of %d tiles were finished before", len(stages), len(tiles))
-    requests = [Request(tile.name, replay_logs, (tile,), memory) for tile in tiles if tile not in stages]
-    for tile, stage in workers.answers(requests):
-        stages[tile] = stage
-        if progress is not None:
-            progress("replay", len(stages), len(tiles))
-    return stages
-
-
-def _settle(
-    tiles: Sequence[Tile], stages: dict[Tile, Stage], workers: Workers, memory: int, progress: Progress | None
-) -> dict[Tile, Stage]:
-    """Let all tiles settle, in rounds, until all have the same number of ticks.
-
-    A team has settled where all its tiles have, so every tile goes on until the last one has settled.
-    """
-    largest = max(stage.largest for stage in stages.values())
+    else:
+        with writing(folder):
+            (folder / AGREEMENT).unlink(missing_ok=True)
+    left = sorted((tile for tile in tiles if tile not in stages), key=lambda tile: -tiles[tile])
+    requests = [Request(tile.name, replay, (tile,), memory) for tile in left]
+    agreement = _agreement(config, folder, stages, None)
+    kind, num_done = "replay", len(stages)
     while True:
-        least = max(stage.num_settling for stage in stages.values())
-        left = [tile for tile in tiles if not stages[tile].stop_reason or stages[tile].num_settling < least]
-        if not left:
-            return stages
-        num_done = len(tiles) - len(left)
-        requests = [Request(tile.name, settle, (tile, largest, least), memory) for tile in left]
         for tile, stage in workers.answers(requests):
             stages[tile] = stage
-            num_done += 1
+            agreement, num_done = _agreement(config, folder, stages, agreement), num_done + 1
             if progress is not None:
-                progress("settle", num_done, len(tiles))
+                progress(kind, num_done, len(tiles))
+        assert agreement is not None
+        left = [tile for tile in tiles if not stages[tile].is_complete(config, agreement)]
+        if not left:
+            return {tile: stages[tile] for tile in tiles}
+        requests = [Request(tile.name, settle, (tile, agreement), memory) for tile in left]
+        kind, num_done = "settle", len(tiles) - len(left)
+
+
+def _agreement(
+    config: ResolvedRun, folder: Path, stages: Mapping[Tile, Stage], known: Agreement | None
+) -> Agreement | None:
+    """Agreement of the finished tiles, stored for the workers where it is not the ``known`` one; None without tiles."""
+    if not stages:
+        return None
+    agreement = Agreement.of(config, stages.values())
+    if agreement != known:
+        agreement.save(folder)
+    return agreement

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,6 +220,14 @@ def is_within(index: ScanIndex, tile: Tile) -> BoolArray:
     """Return True (P,) for the parts of scans that are in a tile, which consists of whole blocks."""
     place = [axis for axis in (tile.x, tile.y, tile.z) if axis is not None]
     return np.asarray((index.blocks // (tile.num_cells // index.block_cells) == place).all(axis=1))
+
+
+def scan_bytes(scans: Sequence[ScanIndex], num_cells: int) -> list[int]:
+    """Return the bytes of all scans in each tile with an edge of ``num_cells``, in the order of ``tiles_of``."""
+    blocks = np.concatenate([index.blocks for index in scans]) // (num_cells // scans[0].block_cells)
+    _, tiles = np.unique(blocks, axis=0, return_inverse=True)
+    lengths = np.concatenate([index.places[:, 1] for index in scans])
+    return [int(total) for total in np.bincount(tiles.ravel(), lengths)]
 
 
 class _Distinct:

@@ -1,20 +1,16 @@
-"""Replay of one tile of a run, in stages: its logs, and settling up to a tick on which all tiles agree."""
+"""Replay of one tile of a run: its logs, and settling up to a tick on which all tiles agree."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.errors import InputError, MemoryLimitError
-from octoreplay.io.output_file import write_whole
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL
@@ -25,64 +21,12 @@ from octoreplay.replay.session import Session
 from octoreplay.replay.tick import Tick, falls_due
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.scans import ScanFile, ScanFiles
+from octoreplay.study.tiles.stage import Agreement, Stage, TileFiles
 from octoreplay.study.tiles.work import StoredMap, TileTick, WorkFile
 from octoreplay.study.tiles.worker import Setup
 
 MAPS, EVIDENCE = "maps", "evidence"
 """Kinds of stored maps."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Progress of a tile.
-
-    Attributes
-    ----------
-    num_ticks, num_settling : int
-        Ticks, and those of them in which the tile settled.
-    lengths : (int, int)
-        Lengths of the files of ticks and of maps [byte].
-    largest : float
-        Largest |log-odds| of any map at the end of the logs.
-    stop_reason : str
-        Reason for the end; empty before settling.
-    is_symmetric : bool
-        True where all links carried both ways with the same weight.
-    num_frames_off : list of dict
-        Frames that were left out because the schedule had the robot off, by robot and sensor.
-    """
-
-    num_ticks: int
-    num_settling: int
-    lengths: tuple[int, int]
-    largest: float
-    stop_reason: str
-    is_symmetric: bool
-    num_frames_off: list[dict[int, int]]
-
-
-class TileFiles:
-    """Paths of the work files of a tile in a folder."""
-
-    def __init__(self, folder: Path, tile: Tile) -> None:
-        self.ticks = folder / f"{tile.name}.ticks"
-        self.maps = folder / f"{tile.name}.maps"
-        self.last_maps = folder / f"{tile.name}.last"
-        self.state = folder / f"{tile.name}.state"
-        self.stage = folder / f"{tile.name}.json"
-
-    def read_stage(self) -> Stage | None:
-        """Return the progress of the tile; None where it has not finished its logs."""
-        try:
-            values = json.loads(self.stage.read_text(encoding="utf-8"))
-            values["num_frames_off"] = [{int(k): n for k, n in off.items()} for off in values["num_frames_off"]]
-            values["lengths"] = tuple(values["lengths"])
-            stage = Stage(**values)
-            sizes = self.ticks.stat().st_size, self.maps.stat().st_size
-        except (OSError, ValueError, TypeError, KeyError):
-            return None
-        is_whole = self.state.exists() and all(size >= n for size, n in zip(sizes, stage.lengths, strict=True))
-        return stage if is_whole else None
 
 
 class TileRun:
@@ -97,8 +41,8 @@ class TileRun:
         self._tile = tile
         self._files = TileFiles(setup.folder, tile)
 
-    def replay_logs(self) -> Stage:
-        """Replay all scans."""
+    def replay(self, agreement: Agreement | None = None) -> Stage:
+        """Replay all scans, and settle where an ``agreement`` is given or in the work folder, or none is needed."""
         config = self._config
         with ExitStack() as stack:
             sources = [
@@ -111,24 +55,37 @@ class TileRun:
                 for tick in session.log_ticks():
                     recorder.record(tick)
                     self._check_memory()
-                return self._pause(session, recorder, 0, session.largest_log_odds)
+                largest = session.largest_log_odds
+                agreement = agreement or Agreement.load(self._setup.folder)
+                if agreement is None and config.effective_flow_bits:
+                    # Flows of all tiles get finer alike, and no other tile is finished.
+                    return self._pause(session, recorder, 0, largest, None)
+                agreement = (agreement or Agreement(largest, 0)).with_tile(config, largest)
+                return self._settle(session, recorder, 0, largest, agreement)
 
-    def settle(self, largest: float, least_ticks: int) -> Stage:
-        """Settle until the tile has settled, for at least ``least_ticks`` in all; ``largest`` is that of all tiles."""
+    def settle(self, agreement: Agreement) -> Stage:
+        """Settle until the tile has settled as the ``agreement`` says; goes on from the last stage where it can."""
         stage = self._files.read_stage()
         if stage is None:
             raise InputError(f"{self._files.stage}: is missing, as after a kill while it was saved; give --resume")
+        if stage.num_finer not in (None, agreement.num_finer(self._config)):
+            return self.replay(agreement)
         with ThreadPoolExecutor(self._setup.num_threads) as threads:
             session = Session(self._config, (), threads, tile_cells=self._tile.num_cells)
             content = load_state(self._files.state, session.shared)
             session.restore(content["session"])
-            num_settling = stage.num_settling
             with _TileRecorder(self._config, self._files, stage.lengths, content["stored"]) as recorder:
-                for tick in session.settling_ticks(largest, least_ticks):
-                    num_settling += 1
-                    recorder.record(tick)
-                    self._check_memory()
-                return self._pause(session, recorder, num_settling, stage.largest)
+                return self._settle(session, recorder, stage.num_settling, stage.largest, agreement)
+
+    def _settle(
+        self, session: Session, recorder: _TileRecorder, num_settling: int, largest: float, agreement: Agreement
+    ) -> Stage:
+        """Settle; ``largest`` is the largest |log-odds| of this tile at the end of the logs."""
+        for tick in session.settling_ticks(agreement.largest, agreement.least_ticks):
+            num_settling += 1
+            recorder.record(tick)
+            self._check_memory()
+        return self._pause(session, recorder, num_settling, largest, agreement.num_finer(self._config))
 
     def _check_memory(self) -> None:
         """Raise MemoryLimitError above the limit of a worker."""
@@ -139,21 +96,24 @@ class TileRun:
                 " continue with --resume and a larger --memory-limit, or give a smaller --tiles"
             )
 
-    def _pause(self, session: Session, recorder: _TileRecorder, num_settling: int, largest: float) -> Stage:
-        """Save the state, from which the next stage continues, and the maps, in case that it is the last one."""
+    def _pause(
+        self, session: Session, recorder: _TileRecorder, num_settling: int, largest: float, num_finer: int | None
+    ) -> Stage:
+        """Save the state, from which the next stage continues, and the maps of a tile that has settled."""
         lengths = recorder.flush()
         # The stage describes the other files only once they are complete.
         self._files.stage.unlink(missing_ok=True)
-        with WorkFile(self._files.last_maps, 0) as file:
-            for stored in recorder.last_maps(session):
-                file.write_map(stored)
-            file.flush()
+        if num_finer is not None:
+            with WorkFile(self._files.last_maps, 0) as file:
+                for stored in recorder.last_maps(session):
+                    file.write_map(stored)
+                file.flush()
         save_state(self._files.state, {"session": session.state(), "stored": recorder.stored}, session.shared)
         stage = Stage(
-            session.num_ticks, num_settling, lengths, largest, session.stop_reason,
+            session.num_ticks, num_settling, lengths, largest, num_finer, session.stop_reason,
             session.is_symmetric, session.num_frames_off,
         )  # fmt: skip
-        write_whole(self._files.stage, json.dumps(asdict(stage)))
+        stage.save(self._files.stage)
         return stage
 
 
@@ -226,11 +186,11 @@ class _TileRecorder:
         return any(falls_due(elapsed_ns, self._period_ns, every) for every in periods)
 
 
-def replay_logs(setup: Setup, tile: Tile) -> tuple[Tile, Stage]:
-    """Replay the logs in one tile, as a request to a worker."""
-    return tile, TileRun(setup, tile).replay_logs()
+def replay(setup: Setup, tile: Tile) -> tuple[Tile, Stage]:
+    """Replay the logs in one tile, and let it settle where that is possible, as a request to a worker."""
+    return tile, TileRun(setup, tile).replay()
 
 
-def settle(setup: Setup, tile: Tile, largest: float, least_ticks: int) -> tuple[Tile, Stage]:
+def settle(setup: Setup, tile: Tile, agreement: Agreement) -> tuple[Tile, Stage]:
     """Let one tile settle, as a request to a worker."""
-    return tile, TileRun(setup, tile).settle(largest, least_ticks)
+    return tile, TileRun(setup, tile).settle(agreement)

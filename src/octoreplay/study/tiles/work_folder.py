@@ -15,6 +15,8 @@ from octoreplay.io.results.result_writer import ResultWriter
 _DESCRIPTION = "run.json"
 _EDGE = "edge"
 """File with the edge of the tiles in a work folder [cell]."""
+AGREEMENT = "agreement.json"
+"""File with the values with which the tiles in a work folder settle."""
 
 
 def can_resume_tiles(output: Path) -> bool:
@@ -86,4 +88,5 @@ def keep_tiles_of(folder: Path, num_cells: int) -> None:
         with writing(folder):
             for tile in folder.glob("tile_*"):
                 tile.unlink()
+            (folder / AGREEMENT).unlink(missing_ok=True)
         write_whole(path, text)

@@ -20,7 +20,7 @@ from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
 from octoreplay.study.tiles.joined_ticks import joined_ticks
-from octoreplay.study.tiles.tile_run import Stage
+from octoreplay.study.tiles.stage import Stage
 from octoreplay.study.tiles.worker import Request, Setup, Workers
 
 
@@ -48,10 +48,10 @@ def write_result(
 ) -> RunSummary:  # fmt: skip
     """Write all ticks and maps of a run, or of one of its tiles, and return its summary without the wall time.
 
+    The maps are encoded.
     ``show`` is called with the number of ticks that are written.
     """
     with ThreadPoolExecutor(num_threads) as threads, TeamRecorder(config, writer, threads) as recorder:
-        maps.encode(threads)
         show(0)
         written_maps = maps.write(recorder.queue)
         for tick in joined_ticks(config, tiles, folder):
@@ -103,6 +103,7 @@ def write_column(
     """
     config, path = column.config(setup.config), setup.folder / f"{column.name}.mcap"
     maps = JoinedMaps(config, tiles, setup.folder)
+    maps.encode(setup.num_threads)
     with ResultWriter(path, config, restart=True, inputs=inputs) as writer:
         writer.complete(write_result(config, writer, maps, tiles, setup.folder, outcome, setup.num_threads))
     return column, path, maps.num_evidence_cells
