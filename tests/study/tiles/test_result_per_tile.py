@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -20,13 +21,15 @@ from octoreplay.records import CENTRAL
 from octoreplay.replay.run import replay_team
 from octoreplay.report.cell_colors import COLORS
 from octoreplay.report.export import export_map
+from octoreplay.report.page.page import write_page
 from octoreplay.report.queries import answer_query
-from octoreplay.result import open_result
+from octoreplay.result import Result, open_result
 from octoreplay.study.tiles import run as tiled_run
 from octoreplay.study.tiles.run import replay_tiles
 from support.command_line import octoreplay
 from support.fixture_paths import TRIO_TEAM
 from support.long_suite import long
+from support.page_reader import Page
 
 EDGE = 9.6
 """Least edge of tiles of the fixture, 32 cells [m]."""
@@ -140,6 +143,56 @@ def test_other_files_are_those_of_the_whole_run(results, tmp_path: Path, name: s
         files = export_map(path, tmp_path / name, heights=(0.2, 2.0), **options)
         contents.append({file.name: file.read_bytes() for file in files})
     assert contents[0] == contents[1]
+
+
+def page_parts(path: Path, page: Path, **options) -> tuple[dict, list[str], list[str]]:
+    """Header of a page with the bytes of its arrays but those of sent bytes, its pictures, and its last line."""
+    write_page(path, page, **options)
+    found = Page(page)
+
+    def arrays(value):
+        if isinstance(value, dict) and value.keys() == {"type", "offset", "count"}:
+            return found.array(value).tobytes()
+        if isinstance(value, dict) and value.get("id") in ("sent_bytes", "link_bytes"):
+            return value["id"]
+        if isinstance(value, dict):
+            return {name: arrays(part) for name, part in value.items()}
+        return [arrays(part) for part in value] if isinstance(value, list) else value
+
+    pictures = re.findall(r'<img alt="Maps[^>]*>', found.text)
+    assert pictures
+    return arrays(found.header), pictures, re.findall(r"The finest cells[^<]*", found.text)
+
+
+@long
+@pytest.mark.parametrize("options", [{}, {"max_depth": 16}, {"max_depth": 12}, {"max_bytes": 400_000}])
+def test_pages_have_the_data_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path, options) -> None:
+    whole, tiled = (page_parts(path, tmp_path / f"{path.stem}.html", **options) for path in results)
+    assert whole == tiled
+    header = whole[0]
+    kinds = [layer["kind"] for layer in header["layers"]]
+    assert kinds == ["team", *["map"] * 3, *["evidence"] * 3, "central"]
+    assert header["hasFirst"]
+    contradictions = np.frombuffer(header["pools"]["team"]["contradiction"], np.uint8)
+    assert len(np.unique(contradictions)) > (1 if options else 3)
+
+
+@long
+def test_a_page_reads_the_maps_of_one_tile_at_a_time(results, tmp_path: Path, monkeypatch) -> None:
+    largest = []
+
+    def counted(result, **options):
+        for maps in history(result, **options):
+            largest.append(max(stored.octree.num_cells for stored in maps.values()))
+            yield maps
+
+    history = Result.history
+    with monkeypatch.context() as patch:
+        patch.setattr(Result, "history", counted)
+        write_page(results[1], tmp_path / "page.html")
+    with open_result(results[1]) as tiled:
+        cells = [tiled.map(CENTRAL, bounds=box).octree.num_cells for box in tiled.boxes()]
+    assert max(largest) == max(cells) < sum(cells) / 2
 
 
 @long
