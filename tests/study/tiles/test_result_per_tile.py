@@ -7,6 +7,9 @@ import json
 import math
 import re
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +29,7 @@ from octoreplay.report.queries import answer_query
 from octoreplay.result import Result, open_result
 from octoreplay.study.tiles import run as tiled_run
 from octoreplay.study.tiles.run import replay_tiles
-from support.command_line import octoreplay
+from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import TRIO_TEAM
 from support.long_suite import long
 from support.page_reader import Page
@@ -269,6 +272,86 @@ def test_an_interrupted_run_keeps_the_earlier_result_and_a_finished_one_replaces
         assert {path.name for path in maps_folder(moved).iterdir()} == listed
     replay_team(config, moved)
     assert not maps_folder(moved).exists()
+
+
+SHORT_RUN = ("--tiles", EDGE, "--result-per-tile", "--duration", 4, "--quiet")
+
+
+@pytest.fixture(scope="module")
+def short_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Result of SHORT_RUN, in a folder beside those of the tests."""
+    output = tmp_path_factory.mktemp("short") / "tiled.mcap"
+    assert octoreplay("run", TRIO_TEAM, "-o", output, *SHORT_RUN).returncode == 0
+    return output
+
+
+KILLED_AT = """
+import os, pkgutil, signal, sys
+from unittest import mock
+from octoreplay import cli
+
+process, name = os.getpid(), sys.argv.pop(1)
+function = pkgutil.resolve_name(name)
+
+def killed(*arguments, **options):
+    if os.getpid() == process:
+        os.kill(process, signal.SIGKILL)
+    return function(*arguments, **options)
+
+with mock.patch(name, killed):
+    cli.main()
+"""
+"""Program of the command line whose process, not those of its workers, is killed where it calls a function."""
+
+
+@long
+@pytest.mark.parametrize(
+    "name",
+    [
+        "octoreplay.io.results.result_writer.ResultWriter.write_tiles",
+        "octoreplay.io.results.result_writer.ResultWriter.write_metrics",
+        "octoreplay.io.results.result_writer.publish",
+    ],
+)
+def test_a_run_that_is_killed_before_its_index_is_in_place_keeps_the_earlier_result(
+    moved: Path, short_result: Path, name: str
+) -> None:
+    earlier = {path: path.read_bytes() for path in (moved, *maps_folder(moved).iterdir())}
+    words = [str(word) for word in ("run", TRIO_TEAM, "-o", moved, *SHORT_RUN)]
+    done = subprocess.run([sys.executable, "-c", KILLED_AT, name, *words, "--force"], check=False, timeout=300)
+    assert done.returncode == -signal.SIGKILL
+    assert {path: path.read_bytes() for path in earlier} == earlier
+    new = {path.name for path in maps_folder(short_result).iterdir()}
+    assert new < {path.name for path in maps_folder(moved).iterdir()}
+    assert octoreplay("check", moved, "--min-agreement", 0).returncode == 0
+    with open_result(moved) as result:
+        *_, last = result.history()
+        assert last[CENTRAL].octree.num_cells
+
+    assert octoreplay(*words, "--resume", "--force").returncode == 0
+    assert moved.read_bytes() == short_result.read_bytes()
+    assert {path.name: path.read_bytes() for path in maps_folder(moved).iterdir()} == {
+        path.name: path.read_bytes() for path in maps_folder(short_result).iterdir()
+    }
+    assert {path.name for path in moved.parent.iterdir() if path.name[0] != "."} == {"tiled.mcap", "tiled.maps"}
+
+
+@long
+def test_an_unfinished_index_is_recovered_beside_its_files_only(moved: Path) -> None:
+    partial = moved.with_name("tiled.partial.mcap")
+    data = moved.read_bytes()
+    partial.write_bytes(data[: data.rindex(b"summary") - 20])
+    elsewhere = moved.parent / "elsewhere"
+    elsewhere.mkdir()
+    assert_fails(
+        2, r"other\.mcap: .*tiled\.maps.*; name an output in", "recover", partial, "-o", elsewhere / "other.mcap"
+    )
+    assert not list(elsewhere.iterdir())
+    link = moved.parent / "link"
+    link.symlink_to(moved.parent)
+    assert octoreplay("recover", partial, "-o", link / "other.mcap").returncode == 0
+    with open_result(moved) as whole, open_result(moved.with_name("other.mcap")) as result:
+        assert leaves(result.map(CENTRAL)) == leaves(whole.map(CENTRAL))
 
 
 @long
