@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from octoreplay.errors import OutputError
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys, keys_to_codes
 from octoreplay.report.page.tile_pool import TilePool
 from octoreplay.report.page.tile_store import NOTHING, TileStore, changes, most_tiles, update
@@ -170,6 +173,20 @@ def test_equal_contents_are_stored_once() -> None:
         assert columns["b"].tolist() == [3, 3, 4]
         pool.replace("b", np.array([0, 0, 0, 8, 9]))
         assert pool.column("b", [first]).tolist() == [8, 9]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
+def test_a_full_disk_is_an_error_of_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda: Path("/dev/full").open("w+b"))  # noqa: SIM115 - the pool closes it.
+    with TilePool({"a": "<u2"}) as pool:
+        first = pool.add({"a": np.arange(9)})
+        with pytest.raises(OutputError, match="No space left"):
+            pool.column("a", [first])
+        with pytest.raises(OutputError, match="No space left"):
+            pool.add({"a": np.arange(99_999)})
+    monkeypatch.setattr("tempfile.TemporaryFile", mock.Mock(side_effect=OSError(30, "Read-only file system")))
+    with pytest.raises(OutputError, match="Read-only"):
+        TilePool({"a": "<u2"})
 
 
 def test_columns_of_a_tile_hold_steps_of_codes() -> None:

@@ -20,12 +20,14 @@ from octoreplay.errors import InputError, OutputError
 from octoreplay.evaluate.comparison import compare_results
 from octoreplay.evaluate.evaluation import evaluate_result
 from octoreplay.io.results.tile_files import maps_folder
+from octoreplay.log_odds import best_labels
 from octoreplay.records import CENTRAL
 from octoreplay.replay.run import replay_team
 from octoreplay.report.cell_colors import COLORS
 from octoreplay.report.export import export_map
 from octoreplay.report.page.page import write_page
 from octoreplay.report.queries import answer_query
+from octoreplay.report.viewers.rerun_recording import write_rerun
 from octoreplay.result import Result, open_result
 from octoreplay.study.tiles import run as tiled_run
 from octoreplay.study.tiles.run import replay_tiles
@@ -196,6 +198,44 @@ def test_a_page_reads_the_maps_of_one_tile_at_a_time(results, tmp_path: Path, mo
     with open_result(results[1]) as tiled:
         cells = [tiled.map(CENTRAL, bounds=box).octree.num_cells for box in tiled.boxes()]
     assert max(largest) == max(cells) < sum(cells) / 2
+
+
+@long
+@pytest.mark.parametrize("options", [*({"color": color} for color in COLORS), {"color": "height", "max_depth": 17}])
+def test_pictures_of_maps_are_those_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path, options) -> None:
+    drawn = []
+    for path in results:
+        with open_result(path) as result:
+            result.plot("map", label="map", **options).savefig(tmp_path / "map.png", metadata={"Software": None})
+        drawn.append((tmp_path / "map.png").read_bytes())
+    assert drawn[0] == drawn[1]
+
+
+def last_boxes(path: Path, recording: Path, tick: int) -> list[tuple[str, bytes]]:
+    """Robot, and centre and size, of the boxes that a recording adds at a tick."""
+    from rerun.chunk import RrdReader
+
+    write_rerun(path, recording)
+    found = []
+    for chunk in RrdReader(recording).stream().to_chunks():
+        for row in chunk.to_record_batch().to_pylist():
+            if row.get("tick") == tick and row.get("Boxes3D:centers"):
+                rows = np.column_stack([row["Boxes3D:centers"], row["Boxes3D:half_sizes"]])
+                found += [(str(chunk.entity_path).split("/")[2], boxes.tobytes()) for boxes in rows]
+    return sorted(found)
+
+
+@long
+def test_recordings_of_rerun_have_the_leaves_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    with open_result(results[0]) as result:
+        tick = result.stored_ticks(CENTRAL)[-1]
+        num_leaves = sum(
+            int((best_labels(result.map(name).leaves().log_odds) > 0).sum()) for name in (*result.robots, CENTRAL)
+        )
+    whole, tiled = (last_boxes(path, tmp_path / f"{path.stem}.rrd", tick) for path in results)
+    assert whole == tiled
+    assert len(whole) == num_leaves
 
 
 @long

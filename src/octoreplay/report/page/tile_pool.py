@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -42,7 +43,9 @@ class TilePool:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._file.close()
+        # After a failed write the rest of the data cannot be written either.
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def __len__(self) -> int:
         return len(self._counts)
