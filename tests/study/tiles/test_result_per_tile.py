@@ -19,6 +19,8 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError, OutputError
 from octoreplay.evaluate.comparison import compare_results
 from octoreplay.evaluate.evaluation import evaluate_result
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.tile_files import maps_folder
 from octoreplay.log_odds import best_labels
 from octoreplay.records import CENTRAL
@@ -392,6 +394,40 @@ def test_an_unfinished_index_is_recovered_beside_its_files_only(moved: Path) -> 
     assert octoreplay("recover", partial, "-o", link / "other.mcap").returncode == 0
     with open_result(moved) as whole, open_result(moved.with_name("other.mcap")) as result:
         assert leaves(result.map(CENTRAL)) == leaves(whole.map(CENTRAL))
+
+
+@long
+def test_an_unfinished_index_ends_the_maps_at_its_last_tick(moved: Path) -> None:
+    with open_result(moved) as whole:
+        early, late = (whole.stored_ticks(CENTRAL)[place] for place in (1, -1))
+        end_ns = whole.map(CENTRAL, tick=late).stamp_ns - 1
+        expected = leaves(whole.map(CENTRAL, at_ns=end_ns))
+        evidence = [tick for tick in whole.evidence_ticks("husky_1") if tick < late]
+    partial = moved.with_name("tiled.partial.mcap")
+    with ResultReader(moved) as reader, RosMcapWriter(partial) as writer:
+        for name, values in reader._metadata.items():
+            if name != "summary":
+                writer.write_metadata(name, values)
+        for schema, channel, record in reader._reader.iter_messages(log_time_order=False):
+            if record.log_time <= end_ns:
+                writer.copy(schema, channel, record)
+        writer.write_metadata("summary", {"complete": "false", "stop_reason": "killed"})
+    with open_result(partial) as result:
+        last = result.stored_ticks(CENTRAL)[-1]
+        assert early <= last <= result.metrics[-1].tick < late
+        assert leaves(result.map(CENTRAL)) == leaves(result.map(CENTRAL, at_ns=2 * end_ns)) == expected
+        assert [max(stored.tick for stored in maps.values()) for maps in result.history()][-1] == last
+        assert result.evidence_ticks("husky_1") == evidence
+        with pytest.raises(InputError, match=f"no map of robot 'central' is stored at tick {late}; stored nearby: "):
+            result.map(CENTRAL, tick=late)
+    for words in (
+        ["evaluate", partial],
+        ["report", partial, "-o", moved.with_name("a.html")],
+        ["compare", partial, moved],
+    ):
+        done = octoreplay(*words)
+        assert "the run did not finish" in done.stderr
+        assert "error" not in done.stderr
 
 
 @long
