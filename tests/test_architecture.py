@@ -140,6 +140,13 @@ def test_a_new_import_changes_the_drawing() -> None:
     assert rooms._essential({**imports, "middle": set()}) == [("top", "bottom"), ("top", "middle")]
 
 
+def test_circular_imports_are_named() -> None:
+    rooms = tool("rooms")
+    imports = {"top": {"middle"}, "middle": {"bottom", "low"}, "low": set(), "bottom": {"middle"}}
+    with pytest.raises(ValueError, match=r"circular imports: (middle -> bottom -> middle|bottom -> middle -> bottom)"):
+        rooms.text(imports)
+
+
 def test_the_page_names_files_that_exist() -> None:
     rooms = tool("rooms")
     steps = [step.partition("\n")[2] for step in rooms.TICK]

@@ -54,7 +54,10 @@ def rooms() -> dict[str, set[str]]:
 
 
 def text(imports: Mapping[str, set[str]]) -> str:
-    """Return one line per room: its name and the rooms that it imports, uppermost room first."""
+    """Return one line per room: its name and the rooms that it imports, uppermost room first.
+
+    Raises ValueError for circular imports.
+    """
     order = [room for row in _rows(imports) for room in row]
     lines = (f"{room:<12}-> {', '.join(sorted(imports[room], key=order.index)) or '(none)'}" for room in order)
     return "\n".join(["```text", *lines, "```", ""])
@@ -113,9 +116,11 @@ def _rows(imports: Mapping[str, set[str]]) -> list[list[str]]:
     """Rooms from top to bottom; every import leads to a lower row."""
     levels: dict[str, int] = {}
 
-    def level(room: str) -> int:
+    def level(room: str, *above: str) -> int:
+        if room in above:
+            raise ValueError(f"circular imports: {' -> '.join((*above[above.index(room) :], room))}")
         if room not in levels:
-            levels[room] = 1 + max((level(other) for other in imports[room]), default=-1)
+            levels[room] = 1 + max((level(other, *above, room) for other in imports[room]), default=-1)
         return levels[room]
 
     highest = max(level(room) for room in imports)
@@ -160,11 +165,15 @@ def _box(name: str, x: int, y: int) -> str:
 
 
 def main() -> None:
-    """Write the drawings, and the text into the page."""
+    """Write the drawings, and the text into the page; exit with a sentence on circular imports."""
+    try:
+        list_of_rooms = text(rooms())
+    except ValueError as error:
+        raise SystemExit(str(error)) from error
     for name, drawing in drawings().items():
         (DRAWINGS / name).write_text(drawing, encoding="utf-8")
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(START)
-    PAGE.write_text(before + START + text(rooms()) + END + rest.partition(END)[2], encoding="utf-8")
+    PAGE.write_text(before + START + list_of_rooms + END + rest.partition(END)[2], encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -59,7 +59,10 @@ class Result:
         self.path = path
         self._reader = ResultReader(path)
         tiles = self._reader.tiles
-        self.tiles: ResultTiles[Result] | None = None if tiles is None else ResultTiles(path, tiles, Result)
+        self.tiles: ResultTiles[Result] | None = None
+        if tiles is not None:
+            last = None if self.is_complete else self._reader.last_tick()
+            self.tiles = ResultTiles(path, tiles, Result, None if last is None else last[1])
         self._most_bytes = max_memory(path.stat().st_size if self.tiles is None else self.tiles.num_bytes)
         self._octrees: WeakSet[SemanticOctree] = WeakSet()
 
@@ -194,11 +197,11 @@ class Result:
 
     def stored_ticks(self, robot_id: str) -> list[int]:
         """Return the ticks at which a robot's map is stored. Raises InputError for an unknown robot."""
-        return [tick for tick, _ in self._states_reader(robot_id).state_times(robot_id)]
+        return [tick for tick, _ in self._state_times(robot_id)]
 
     def evidence_ticks(self, robot_id: str) -> list[int]:
         """Return the ticks at which a robot's evidence is stored. Raises InputError for an unknown robot."""
-        return [tick for tick, _ in self._states_reader(robot_id, evidence=True).state_times(robot_id, evidence=True)]
+        return [tick for tick, _ in self._state_times(robot_id, evidence=True)]
 
     def poses(self, robot_id: str) -> tuple[list[int], Float64Array]:
         """Return the poses of a robot's sensor at the ticks: stamps [ns], and (P, 7) x, y, z [m], qx, qy, qz, qw.
@@ -267,6 +270,8 @@ class Result:
     ) -> StoredMap:  # fmt: skip
         """Map or evidence in a box from the files of the tiles in it."""
         self._reader.state_topic(robot_id, evidence)
+        if until_ns is None or not tiles.has(until_ns):
+            until_ns = tiles.end_ns
 
         def part(file: TileFile) -> StoredMap:
             result, whole = tiles.opened(file), box is None or tiles.is_inside(file, box)
@@ -327,6 +332,8 @@ class Result:
                 result = stack.enter_context(tiles.open_new(file))
                 histories.append(result.history(bounds=() if whole else bounds))
             for parts in zip(*histories, strict=True):
+                if not tiles.has(max(stored.stamp_ns for stored in parts[0].values())):
+                    return
                 yield {name: joined_map((maps[name] for maps in parts), self._most_bytes) for name in parts[0]}
 
     def _updated(self, octree: SemanticOctree | None, state: MapState, box: KeyBox | None = None) -> SemanticOctree:
@@ -385,6 +392,11 @@ class Result:
         """Frames of all robots by tick."""
         return self._reader.places()
 
+    def _state_times(self, robot_id: str, *, evidence: bool = False) -> list[tuple[int, int]]:
+        """Tick and stamp of each stored map or evidence of a robot."""
+        times = self._states_reader(robot_id, evidence=evidence).state_times(robot_id, evidence=evidence)
+        return [(tick, stamp_ns) for tick, stamp_ns in times if self.tiles is None or self.tiles.has(stamp_ns)]
+
     def _states_reader(self, robot_id: str, *, evidence: bool = False) -> ResultReader:
         """Reader of a file with stored states of a robot; all tiles store them at the same ticks."""
         self._reader.state_topic(robot_id, evidence)
@@ -393,7 +405,7 @@ class Result:
     def _stamp_of(self, robot_id: str, tick: int, *, evidence: bool) -> int:
         """Stamp of a robot's map or evidence stored at a tick."""
         stamp_ns = self._states_reader(robot_id, evidence=evidence).state_stamp(robot_id, tick, evidence=evidence)
-        if stamp_ns is None:
+        if stamp_ns is None or not (self.tiles is None or self.tiles.has(stamp_ns)):
             ticks = self.evidence_ticks(robot_id) if evidence else self.stored_ticks(robot_id)
             near = sorted(sorted(ticks, key=lambda stored: abs(stored - tick))[:6])
             raise InputError(

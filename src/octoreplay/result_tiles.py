@@ -29,9 +29,15 @@ ResultT = TypeVar("ResultT", bound=_Closing)
 
 
 class ResultTiles(Generic[ResultT]):
-    """Results of the tiles of the result ``path``; ``open_file`` opens one."""
+    """Results of the tiles of the result ``path``; ``open_file`` opens one.
 
-    def __init__(self, path: Path, tiles: TileList, open_file: Callable[[Path], ResultT]) -> None:
+    ``end_ns`` is the stamp of the last tick of an unfinished result, whose tiles hold later ones too; None for all.
+    """
+
+    def __init__(
+        self, path: Path, tiles: TileList, open_file: Callable[[Path], ResultT], end_ns: int | None = None
+    ) -> None:
+        self.end_ns = end_ns
         self.num_cells = tiles.num_cells
         self.files = tiles.files
         self.num_bytes = sum(file.size for file in tiles.files)
@@ -53,6 +59,10 @@ class ResultTiles(Generic[ResultT]):
             self._reader.close()
         while self._opened:
             self._opened.popitem()[1].close()
+
+    def has(self, stamp_ns: int) -> bool:
+        """Return True for the stamp of a tick that the result has."""
+        return self.end_ns is None or stamp_ns <= self.end_ns
 
     def touching(self, box: KeyBox | None) -> tuple[TileFile, ...]:
         """Return the files of the tiles that touch a box, all for None; of one tile at least."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +106,12 @@ def leaf_colors(
     return LeafColors(
         ramp(values / largest if largest > 0 else values), f"dark 0, yellow {largest:.6g}", (0.0, largest)
     )
+
+
+def common_limits(limits: Iterable[tuple[float, float] | None]) -> tuple[float, float] | None:
+    """Return the ends of one scale for all parts of a map, or for several maps; None where no colour is a scale."""
+    ends = [pair for pair in limits if pair is not None]
+    return (min(low for low, _ in ends), max(high for _, high in ends)) if ends else None
 
 
 def ramp(values: FloatArray) -> UInt8Array:

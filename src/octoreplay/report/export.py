@@ -17,7 +17,7 @@ from octoreplay.io.output_file import mark_written
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.regions import leaf_tiles
 from octoreplay.records import MAP_KINDS, POSTERIOR, FilePath, Int64Array, LeafTable
-from octoreplay.report.cell_colors import COLORS, SCALED, LeafColors, default_color, leaf_colors
+from octoreplay.report.cell_colors import COLORS, SCALED, LeafColors, common_limits, default_color, leaf_colors
 from octoreplay.report.export_files import FORMATS, SPLITS, FileFormat, MapContent, MapFiles, warn_of_ground
 from octoreplay.report.map_part import MapPart, finest_edge
 from octoreplay.result import Result, open_result
@@ -166,8 +166,7 @@ def _contents(
     limits = None
     if len(parts) > 1 and shown.color in SCALED:
         # The scale of the colours is that of all parts.
-        ranges = [_content(result, robot_ids, shown, part).limits or (0.0, 0.0) for part in parts]
-        limits = min(low for low, _ in ranges), max(high for _, high in ranges)
+        limits = common_limits(_content(result, robot_ids, shown, part).limits for part in parts)
     contents = (_content(result, robot_ids, shown, part, limits) for part in parts)
     yield from contents if in_parts else [MapContent.joined(list(contents))]
 

@@ -10,20 +10,23 @@ import numpy as np
 
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.log_odds import best_labels
-from octoreplay.mapping.merged_faces import finest_cells
+from octoreplay.mapping.merged_faces import finest_cells, first_cells
+from octoreplay.mapping.octree import keys_to_codes
 from octoreplay.records import POSTERIOR, Color, LeafTable, UInt8Array
 from octoreplay.report import map_view
 from octoreplay.report.cell_colors import (
     COLORS,
     CONTRADICTION_COLORS,
+    SCALED,
     LeafColors,
+    common_limits,
     default_color,
     leaf_colors,
     ramp,
     robot_color,
 )
 from octoreplay.report.figures import SCREEN, FigureStyle, plain
-from octoreplay.report.map_part import MapPart
+from octoreplay.report.map_part import MapPart, finest_edge
 from octoreplay.result import Result
 
 if TYPE_CHECKING:
@@ -58,9 +61,8 @@ def map_figure(
         raise ConfigError(f"color: '{color}' is not one of {', '.join(COLORS)}")
     shown = color or default_color(next(iter(results.values())).class_table)
     maps = {label: _occupied(result, robot, at, max_depth, shown) for label, result in results.items()}
-    ranges = [colors.limits for _, colors, _ in maps.values() if colors.limits is not None]
-    if len(ranges) > 1:
-        common = min(low for low, _ in ranges), max(high for _, high in ranges)
+    common = common_limits(colors.limits for _, colors, _ in maps.values())
+    if len(maps) > 1 and common is not None:
         maps = {label: _occupied(result, robot, at, max_depth, shown, common) for label, result in results.items()}
     columns = min(len(maps), _MAX_COLUMNS)
     pictures = _pictures(list(maps.values()), round(look.width / columns * _DPI))
@@ -88,14 +90,31 @@ def _occupied(
     result: Result, robot: str | None, at: float | None, max_depth: int | None, color: str,
     limits: tuple[float, float] | None = None,
 ) -> tuple[LeafTable, LeafColors, float]:  # fmt: skip
-    """Occupied leaves of a map, their colours, and the resolution [m]."""
-    part = MapPart(None if at is None else result.time_ns(at), max_depth=max_depth)
-    stored = part.map(result, robot or result.robots[0])
+    """Occupied leaves of a map in Morton order, their colours, and the resolution [m]; read part by part."""
+    whole = MapPart(None if at is None else result.time_ns(at), max_depth=max_depth)
+    robot_id = robot or result.robots[0]
+    parts = list(whole.parts(result))
+    if limits is None and len(parts) > 1 and color in SCALED:
+        # The scale of the colours is that of all parts.
+        limits = common_limits(_part(result, robot_id, part, color, None)[1].limits for part in parts)
+    found = [_part(result, robot_id, part, color, limits) for part in parts]
+    leaves = LeafTable.joined([table for table, _ in found])
+    if not len(leaves):
+        raise InputError(f"{result.path}: the map of {robot_id} holds no occupied leaf; use a later time")
+    resolution = finest_edge(result, max_depth)
+    order = np.argsort(keys_to_codes(first_cells(leaves, resolution)[0]), kind="stable")
+    colors = found[0][1]._replace(colors=np.concatenate([colors.colors for _, colors in found])[order])
+    return leaves.taken(order), colors, resolution
+
+
+def _part(
+    result: Result, robot_id: str, part: MapPart, color: str, limits: tuple[float, float] | None
+) -> tuple[LeafTable, LeafColors]:
+    """Occupied leaves of a part of a map, and their colours."""
+    stored = part.map(result, robot_id)
     leaves = stored.leaves(map_kind=POSTERIOR)
     leaves = leaves.taken(best_labels(leaves.log_odds) > 0)
-    if not len(leaves):
-        raise InputError(f"{result.path}: the map of {stored.robot_id} holds no occupied leaf; use a later time")
-    return leaves, leaf_colors(result, [stored], leaves, color, part, limits), stored.resolution
+    return leaves, leaf_colors(result, [stored], leaves, color, part, limits)
 
 
 def _pictures(maps: Sequence[tuple[LeafTable, LeafColors, float]], width: int) -> list[UInt8Array]:

@@ -37,14 +37,15 @@ class MapPart(NamedTuple):
             for part in self.parts(result)
         )
 
-    def evidence(self, result: Result, robot_id: str) -> StoredMap:
-        """Return this part of a robot's evidence. Raises as ``Result.evidence`` and ``StoredMap.coarsened``.
+    def evidence(self, result: Result, robot_id: str, *, tick: int | None = None) -> StoredMap:
+        """Return this part of a robot's evidence, at a tick if one is given in place of the time.
 
-        It has two more cells on every side, because the relation of two robots' evidence depends on neighbours.
+        It has two more cells on every side, because the relation of two robots' evidence depends on neighbours. Raises
+        as ``Result.evidence`` and ``StoredMap.coarsened``.
         """
         half, margin = len(self.bounds) // 2, 2 * finest_edge(result, self.max_depth)
         wider = [number - margin if index < half else number + margin for index, number in enumerate(self.bounds)]
-        return result.evidence(robot_id, at_ns=self.at_ns, bounds=wider).coarsened(self.max_depth)
+        return result.evidence(robot_id, at_ns=self.at_ns, tick=tick, bounds=wider).coarsened(self.max_depth)
 
     def check_one_frame(self, result: Result) -> None:
         """Raise InputError where the robots' maps are in several frames."""

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay.log_odds import best_labels
-from octoreplay.mapping.octree import codes_to_keys
+from octoreplay.mapping.octree import codes_to_keys, keys_to_codes
 from octoreplay.records import Float64Array, Int64Array, UInt8Array, UInt64Array
 from octoreplay.stored_map import StoredMap
 
@@ -147,6 +147,16 @@ class Overlay(NamedTuple):
     labels: UInt8Array
     deviations: Float64Array
     resolution: float
+
+    @classmethod
+    def joined(cls, parts: Sequence[Overlay]) -> Overlay:
+        """Return the overlay of maps, at least one, from those of parts without common cells."""
+        centers = np.concatenate([part.centers for part in parts])
+        resolution = parts[0].resolution
+        order = np.argsort(keys_to_codes(np.floor(centers / resolution).astype(np.int64)), kind="stable")
+        labels = np.concatenate([part.labels for part in parts])
+        deviations = np.concatenate([part.deviations for part in parts])
+        return cls(centers[order], labels[order], deviations[order], resolution)
 
 
 def overlay(maps: Sequence[StoredMap]) -> Overlay:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from octoreplay.io.results.result_writer import FORMAT_VERSION, READABLE_VERSIONS
+from octoreplay.io.results.result_metadata import FORMAT_VERSION, READABLE_VERSIONS
 from octoreplay.result import Result, open_result
 from support.fixture_paths import FIXTURES
 

@@ -14,7 +14,7 @@ from octoreplay.errors import InputError
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages import ros_types
 from octoreplay.io.messages.ros_types import message, time_message
-from octoreplay.io.results import result_writer
+from octoreplay.io.results import result_metadata, result_writer
 from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.mapping.codec import encode_packet
@@ -154,7 +154,7 @@ def test_a_result_names_every_parameter_and_older_ones_had_other_defaults(
             if not with_defaults:
                 older = dataclasses.replace(config, consensus=ConsensusConfig(), packet=PacketConfig())
                 text = dump_team(older, tmp_path)
-                patch.setattr(result_writer, "dump_team", lambda *_, text=text, **__: text)
+                patch.setattr(result_metadata, "dump_team", lambda *_, text=text, **__: text)
             with ResultWriter(path, config) as writer:
                 writer.complete(summary(METRICS))
         with ResultReader(path) as reader:
@@ -332,7 +332,7 @@ def test_files_that_are_not_results_are_input_errors(tmp_path: Path) -> None:
 
 
 def test_a_later_format_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("octoreplay.io.results.result_writer.FORMAT_VERSION", "4")
+    monkeypatch.setattr("octoreplay.io.results.result_metadata.FORMAT_VERSION", "4")
     path = write_result(tmp_path)
     with pytest.raises(InputError, match="result format 4, this version reads 2 and 3"):
         ResultReader(path)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from octoreplay.errors import OutputError
 from octoreplay.mapping.octree import LeafSpans, codes_to_keys, keys_to_codes
+from octoreplay.report.page.tile_pool import TilePool
+from octoreplay.report.page.tile_store import NOTHING, TileStore, changes, most_tiles, update
 from octoreplay.report.page.tiles import (
     PLAIN,
     TEAM_FIELDS,
-    TilePool,
     coarser,
     coarser_runs,
     cube_columns,
@@ -157,15 +161,32 @@ def test_places_of_tiles(keys: list[tuple[int, int, int]], level: int) -> None:
 
 
 def test_equal_contents_are_stored_once() -> None:
-    pool = TilePool({"a": "<u2", "b": "u1"})
-    first = pool.add({"a": np.array([1, 2]), "b": np.array([3, 4])})
-    second = pool.add({"a": np.array([1]), "b": np.array([3])})
-    assert pool.add({"a": np.array([1, 2]), "b": np.array([3, 4])}) == first
-    assert first != second
-    columns = pool.columns([second, first])
-    assert columns["starts"].tolist() == [0, 1, 3]
-    assert columns["a"].tolist() == [1, 1, 2]
-    assert columns["b"].tolist() == [3, 3, 4]
+    with TilePool({"a": "<u2", "b": "u1"}) as pool:
+        first = pool.add({"a": np.array([1, 2]), "b": np.array([3, 4])})
+        second = pool.add({"a": np.array([1]), "b": np.array([3])})
+        assert pool.add({"a": np.array([1, 2]), "b": np.array([3, 4])}) == first
+        assert first != second
+        assert len(pool) == 2
+        columns = pool.columns([second, first])
+        assert columns["starts"].tolist() == [0, 1, 3]
+        assert columns["a"].tolist() == [1, 1, 2]
+        assert columns["b"].tolist() == [3, 3, 4]
+        pool.replace("b", np.array([0, 0, 0, 8, 9]))
+        assert pool.column("b", [first]).tolist() == [8, 9]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
+def test_a_full_disk_is_an_error_of_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda: Path("/dev/full").open("w+b"))  # noqa: SIM115 - the pool closes it.
+    with TilePool({"a": "<u2"}) as pool:
+        first = pool.add({"a": np.arange(9)})
+        with pytest.raises(OutputError, match="No space left"):
+            pool.column("a", [first])
+        with pytest.raises(OutputError, match="No space left"):
+            pool.add({"a": np.arange(99_999)})
+    monkeypatch.setattr("tempfile.TemporaryFile", mock.Mock(side_effect=OSError(30, "Read-only file system")))
+    with pytest.raises(OutputError, match="Read-only"):
+        TilePool({"a": "<u2"})
 
 
 def test_columns_of_a_tile_hold_steps_of_codes() -> None:
@@ -179,3 +200,31 @@ def test_columns_of_a_tile_hold_steps_of_codes() -> None:
 def test_no_cubes(empty: np.ndarray) -> None:
     assert len(merged(empty)) == len(coarser(empty)) == 0
     assert list(tiles_of(empty["code"])) == []
+
+
+@examples(60)
+@given(st.lists(st.tuples(st.one_of(some_cells, full_blocks), code_sets), min_size=1, max_size=4), st.booleans())
+def test_coarser_tiles_are_those_of_the_coarser_map(ticks: list[tuple[Cells, set[int]]], is_spread: bool) -> None:
+    with TileStore() as store:
+        rows = []
+        latest: dict = {}
+        maps = []
+        for index, (cells, free) in enumerate(ticks):
+            # Cells of several tiles, or of one.
+            spread = {code * 4096: cell for code, cell in cells.items()} if is_spread else cells
+            cubes, runs = cubes_of(spread), runs_of({code * 999 for code in free})
+            maps.append((merged(cubes), runs))
+            present = store.put(*maps[-1])
+            gone = dict.fromkeys(latest.keys() - present.keys(), NOTHING)
+            changed = {tile: new for tile, new in {**present, **gone}.items() if latest.get(tile) != new}
+            update(latest, changed)
+            rows.extend((index, tile, *changed[tile]) for tile in sorted(changed))
+        table = np.array(rows, np.int64).reshape(-1, 5)
+        found = dict(changes(store.coarser_rows(table)))
+        coarse: dict = {}
+        largest = 0
+        for index, (cubes, runs) in enumerate(maps):
+            update(coarse, found.get(index, {}))
+            assert coarse == store.put(coarser(cubes), coarser_runs(runs))
+            largest = max(largest, len(store.put(cubes, runs)))
+        assert most_tiles(table) == largest

@@ -5,7 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +19,24 @@ from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError, OutputError
 from octoreplay.evaluate.comparison import compare_results
 from octoreplay.evaluate.evaluation import evaluate_result
+from octoreplay.io.containers.mcap_writer import RosMcapWriter
+from octoreplay.io.results.result_reader import ResultReader
 from octoreplay.io.results.tile_files import maps_folder
+from octoreplay.log_odds import best_labels
 from octoreplay.records import CENTRAL
 from octoreplay.replay.run import replay_team
 from octoreplay.report.cell_colors import COLORS
 from octoreplay.report.export import export_map
+from octoreplay.report.page.page import write_page
 from octoreplay.report.queries import answer_query
-from octoreplay.result import open_result
+from octoreplay.report.viewers.rerun_recording import write_rerun
+from octoreplay.result import Result, open_result
 from octoreplay.study.tiles import run as tiled_run
 from octoreplay.study.tiles.run import replay_tiles
-from support.command_line import octoreplay
+from support.command_line import assert_fails, octoreplay
 from support.fixture_paths import TRIO_TEAM
 from support.long_suite import long
+from support.page_reader import Page
 
 EDGE = 9.6
 """Least edge of tiles of the fixture, 32 cells [m]."""
@@ -142,6 +152,94 @@ def test_other_files_are_those_of_the_whole_run(results, tmp_path: Path, name: s
     assert contents[0] == contents[1]
 
 
+def page_parts(path: Path, page: Path, **options) -> tuple[dict, list[str], list[str]]:
+    """Header of a page with the bytes of its arrays but those of sent bytes, its pictures, and its last line."""
+    write_page(path, page, **options)
+    found = Page(page)
+
+    def arrays(value):
+        if isinstance(value, dict) and value.keys() == {"type", "offset", "count"}:
+            return found.array(value).tobytes()
+        if isinstance(value, dict) and value.get("id") in ("sent_bytes", "link_bytes"):
+            return value["id"]
+        if isinstance(value, dict):
+            return {name: arrays(part) for name, part in value.items()}
+        return [arrays(part) for part in value] if isinstance(value, list) else value
+
+    pictures = re.findall(r'<img alt="Maps[^>]*>', found.text)
+    assert pictures
+    return arrays(found.header), pictures, re.findall(r"The finest cells[^<]*", found.text)
+
+
+@long
+@pytest.mark.parametrize("options", [{}, {"max_depth": 16}, {"max_depth": 12}, {"max_bytes": 400_000}])
+def test_pages_have_the_data_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path, options) -> None:
+    whole, tiled = (page_parts(path, tmp_path / f"{path.stem}.html", **options) for path in results)
+    assert whole == tiled
+    header = whole[0]
+    kinds = [layer["kind"] for layer in header["layers"]]
+    assert kinds == ["team", *["map"] * 3, *["evidence"] * 3, "central"]
+    assert header["hasFirst"]
+    contradictions = np.frombuffer(header["pools"]["team"]["contradiction"], np.uint8)
+    assert len(np.unique(contradictions)) > (1 if options else 3)
+
+
+@long
+def test_a_page_reads_the_maps_of_one_tile_at_a_time(results, tmp_path: Path, monkeypatch) -> None:
+    largest = []
+
+    def counted(result, **options):
+        for maps in history(result, **options):
+            largest.append(max(stored.octree.num_cells for stored in maps.values()))
+            yield maps
+
+    history = Result.history
+    with monkeypatch.context() as patch:
+        patch.setattr(Result, "history", counted)
+        write_page(results[1], tmp_path / "page.html")
+    with open_result(results[1]) as tiled:
+        cells = [tiled.map(CENTRAL, bounds=box).octree.num_cells for box in tiled.boxes()]
+    assert max(largest) == max(cells) < sum(cells) / 2
+
+
+@long
+@pytest.mark.parametrize("options", [*({"color": color} for color in COLORS), {"color": "height", "max_depth": 17}])
+def test_pictures_of_maps_are_those_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path, options) -> None:
+    drawn = []
+    for path in results:
+        with open_result(path) as result:
+            result.plot("map", label="map", **options).savefig(tmp_path / "map.png", metadata={"Software": None})
+        drawn.append((tmp_path / "map.png").read_bytes())
+    assert drawn[0] == drawn[1]
+
+
+def last_boxes(path: Path, recording: Path, tick: int) -> list[tuple[str, bytes]]:
+    """Robot, and centre and size, of the boxes that a recording adds at a tick."""
+    from rerun.chunk import RrdReader
+
+    write_rerun(path, recording)
+    found = []
+    for chunk in RrdReader(recording).stream().to_chunks():
+        for row in chunk.to_record_batch().to_pylist():
+            if row.get("tick") == tick and row.get("Boxes3D:centers"):
+                rows = np.column_stack([row["Boxes3D:centers"], row["Boxes3D:half_sizes"]])
+                found += [(str(chunk.entity_path).split("/")[2], boxes.tobytes()) for boxes in rows]
+    return sorted(found)
+
+
+@long
+def test_recordings_of_rerun_have_the_leaves_of_the_whole_run(results: tuple[Path, Path], tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    with open_result(results[0]) as result:
+        tick = result.stored_ticks(CENTRAL)[-1]
+        num_leaves = sum(
+            int((best_labels(result.map(name).leaves().log_odds) > 0).sum()) for name in (*result.robots, CENTRAL)
+        )
+    whole, tiled = (last_boxes(path, tmp_path / f"{path.stem}.rrd", tick) for path in results)
+    assert whole == tiled
+    assert len(whole) == num_leaves
+
+
 @long
 def test_queries_are_those_of_the_whole_run(results: tuple[Path, Path]) -> None:
     inside = np.random.default_rng(0).uniform((-12, -12, -0.5), (15, 12, 3), (200, 3))
@@ -216,6 +314,120 @@ def test_an_interrupted_run_keeps_the_earlier_result_and_a_finished_one_replaces
         assert {path.name for path in maps_folder(moved).iterdir()} == listed
     replay_team(config, moved)
     assert not maps_folder(moved).exists()
+
+
+SHORT_RUN = ("--tiles", EDGE, "--result-per-tile", "--duration", 4, "--quiet")
+
+
+@pytest.fixture(scope="module")
+def short_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Result of SHORT_RUN, in a folder beside those of the tests."""
+    output = tmp_path_factory.mktemp("short") / "tiled.mcap"
+    assert octoreplay("run", TRIO_TEAM, "-o", output, *SHORT_RUN).returncode == 0
+    return output
+
+
+KILLED_AT = """
+import os, pkgutil, signal, sys
+from unittest import mock
+from octoreplay import cli
+
+process, name = os.getpid(), sys.argv.pop(1)
+function = pkgutil.resolve_name(name)
+
+def killed(*arguments, **options):
+    if os.getpid() == process:
+        os.kill(process, signal.SIGKILL)
+    return function(*arguments, **options)
+
+with mock.patch(name, killed):
+    cli.main()
+"""
+"""Program of the command line whose process, not those of its workers, is killed where it calls a function."""
+
+
+@long
+@pytest.mark.parametrize(
+    "name",
+    [
+        "octoreplay.io.results.result_writer.ResultWriter.write_tiles",
+        "octoreplay.io.results.result_writer.ResultWriter.write_metrics",
+        "octoreplay.io.results.result_writer.publish",
+    ],
+)
+def test_a_run_that_is_killed_before_its_index_is_in_place_keeps_the_earlier_result(
+    moved: Path, short_result: Path, name: str
+) -> None:
+    earlier = {path: path.read_bytes() for path in (moved, *maps_folder(moved).iterdir())}
+    words = [str(word) for word in ("run", TRIO_TEAM, "-o", moved, *SHORT_RUN)]
+    done = subprocess.run([sys.executable, "-c", KILLED_AT, name, *words, "--force"], check=False, timeout=300)
+    assert done.returncode == -signal.SIGKILL
+    assert {path: path.read_bytes() for path in earlier} == earlier
+    new = {path.name for path in maps_folder(short_result).iterdir()}
+    assert new < {path.name for path in maps_folder(moved).iterdir()}
+    assert octoreplay("check", moved, "--min-agreement", 0).returncode == 0
+    with open_result(moved) as result:
+        *_, last = result.history()
+        assert last[CENTRAL].octree.num_cells
+
+    assert octoreplay(*words, "--resume", "--force").returncode == 0
+    assert moved.read_bytes() == short_result.read_bytes()
+    assert {path.name: path.read_bytes() for path in maps_folder(moved).iterdir()} == {
+        path.name: path.read_bytes() for path in maps_folder(short_result).iterdir()
+    }
+    assert {path.name for path in moved.parent.iterdir() if path.name[0] != "."} == {"tiled.mcap", "tiled.maps"}
+
+
+@long
+def test_an_unfinished_index_is_recovered_beside_its_files_only(moved: Path) -> None:
+    partial = moved.with_name("tiled.partial.mcap")
+    data = moved.read_bytes()
+    partial.write_bytes(data[: data.rindex(b"summary") - 20])
+    elsewhere = moved.parent / "elsewhere"
+    elsewhere.mkdir()
+    assert_fails(
+        2, r"other\.mcap: .*tiled\.maps.*; name an output in", "recover", partial, "-o", elsewhere / "other.mcap"
+    )
+    assert not list(elsewhere.iterdir())
+    link = moved.parent / "link"
+    link.symlink_to(moved.parent)
+    assert octoreplay("recover", partial, "-o", link / "other.mcap").returncode == 0
+    with open_result(moved) as whole, open_result(moved.with_name("other.mcap")) as result:
+        assert leaves(result.map(CENTRAL)) == leaves(whole.map(CENTRAL))
+
+
+@long
+def test_an_unfinished_index_ends_the_maps_at_its_last_tick(moved: Path) -> None:
+    with open_result(moved) as whole:
+        early, late = (whole.stored_ticks(CENTRAL)[place] for place in (1, -1))
+        end_ns = whole.map(CENTRAL, tick=late).stamp_ns - 1
+        expected = leaves(whole.map(CENTRAL, at_ns=end_ns))
+        evidence = [tick for tick in whole.evidence_ticks("husky_1") if tick < late]
+    partial = moved.with_name("tiled.partial.mcap")
+    with ResultReader(moved) as reader, RosMcapWriter(partial) as writer:
+        for name, values in reader._metadata.items():
+            if name != "summary":
+                writer.write_metadata(name, values)
+        for schema, channel, record in reader._reader.iter_messages(log_time_order=False):
+            if record.log_time <= end_ns:
+                writer.copy(schema, channel, record)
+        writer.write_metadata("summary", {"complete": "false", "stop_reason": "killed"})
+    with open_result(partial) as result:
+        last = result.stored_ticks(CENTRAL)[-1]
+        assert early <= last <= result.metrics[-1].tick < late
+        assert leaves(result.map(CENTRAL)) == leaves(result.map(CENTRAL, at_ns=2 * end_ns)) == expected
+        assert [max(stored.tick for stored in maps.values()) for maps in result.history()][-1] == last
+        assert result.evidence_ticks("husky_1") == evidence
+        with pytest.raises(InputError, match=f"no map of robot 'central' is stored at tick {late}; stored nearby: "):
+            result.map(CENTRAL, tick=late)
+    for words in (
+        ["evaluate", partial],
+        ["report", partial, "-o", moved.with_name("a.html")],
+        ["compare", partial, moved],
+    ):
+        done = octoreplay(*words)
+        assert "the run did not finish" in done.stderr
+        assert "error" not in done.stderr
 
 
 @long

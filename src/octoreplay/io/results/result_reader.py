@@ -27,7 +27,7 @@ from octoreplay.io.containers.mcap_records import CRC_KEY, metadata_crc
 from octoreplay.io.containers.mcap_writer import RosMcapWriter
 from octoreplay.io.messages.ros_types import stamp_to_ns, typestore_of
 from octoreplay.io.results.json_records import value_of
-from octoreplay.io.results.result_writer import READABLE_VERSIONS
+from octoreplay.io.results.result_metadata import READABLE_VERSIONS
 from octoreplay.io.results.stored_records import fields_of, frame_place, map_state, summary_from_metrics, tick_metrics
 from octoreplay.io.results.tile_files import RECORD, TileList
 from octoreplay.io.results.topics import (

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
-import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -16,10 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay import interrupts
-from octoreplay._version import __version__
 from octoreplay.config.fields import path_problem
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
 from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.containers.mcap_writer import RosMcapWriter, Written
@@ -36,6 +31,7 @@ from octoreplay.io.results.geometry_messages import (
 from octoreplay.io.results.map_messages import CLOUD, GRID, OCTOMAP, cloud_message, grid_message, octomap_message
 from octoreplay.io.results.markers import graph_markers, map_markers
 from octoreplay.io.results.occupancy_grid import Grid
+from octoreplay.io.results.result_metadata import description_of, difference, summary_values
 from octoreplay.io.results.tile_files import TileFile, TileList
 from octoreplay.io.results.topics import (
     CONTRADICTION_TOPIC,
@@ -57,11 +53,6 @@ from octoreplay.io.results.unfinished import PARTIAL_SUFFIX, has_messages
 from octoreplay.records import TEAM, MapState, RobotPose
 from octoreplay.run_metrics import PAIR_SHARES, RunSummary, TickMetrics
 from octoreplay.transforms import transform_of
-
-FORMAT_VERSION = "3"
-"""Version of the result format; it increases with each incompatible change."""
-READABLE_VERSIONS = ("2", FORMAT_VERSION)
-"""Versions of the result format that ``ResultReader`` reads."""
 
 
 def partial_path(path: Path) -> Path:
@@ -125,7 +116,8 @@ class ResultWriter:
                     self._work_path.unlink(missing_ok=True)
                 self._writer = RosMcapWriter(self._work_path, data_crc=True)
                 stack.callback(self._discard)
-                self._write_description(self.inputs)
+                for name, values in description_of(config, self.inputs, path.parent.resolve()).items():
+                    self._writer.write_metadata(name, values)
                 # All that a reader needs besides chunks is safe before the first of them.
                 self._writer.sync()
                 with writing(path):
@@ -169,7 +161,7 @@ class ResultWriter:
         """Raise ConfigError where an ``earlier`` run, by its description, had other settings or inputs."""
         for name, values in self.description.items():
             if values != earlier[name]:
-                raise ConfigError(f"{self.path}: cannot be continued: {_difference(name, values, earlier[name])}")
+                raise ConfigError(f"{self.path}: cannot be continued: {difference(name, values, earlier[name])}")
 
     def write_tiles(self, tiles: TileList) -> None:
         """Write the list of the files that hold the maps, before the first tick."""
@@ -299,7 +291,7 @@ class ResultWriter:
         """
         interrupts.check()
         with interrupts.deferred():
-            self._writer.write_metadata("summary", _summary_values(self._with_relative_paths(summary)))
+            self._writer.write_metadata("summary", summary_values(summary, self._config, self.path.parent.resolve()))
             self._writer.finish()
             if not self._writer.is_at(self.partial_path):
                 raise OutputError(
@@ -329,28 +321,6 @@ class ResultWriter:
             with contextlib.suppress(OSError):
                 self._work_path.unlink()
 
-    def _with_relative_paths(self, summary: RunSummary) -> RunSummary:
-        """Return the summary with the paths of inputs in its sentences relative to the result's folder."""
-        folder = self.path.parent.resolve()
-        files = {str(path): os.path.relpath(path, folder) for robot in self._config.robots for path in robot.files}
-        # Longest first, because a path may begin with another one.
-        names = sorted((name for name in files if Path(name).is_absolute()), key=len, reverse=True)
-
-        def relative(text: str) -> str:
-            for name in names:
-                text = text.replace(name, files[name])
-            return text
-
-        counts = {
-            robot_id: dataclasses.replace(
-                count,
-                first_missing={cause: relative(text) for cause, text in count.first_missing.items()},
-                truncated_files=[relative(text) for text in count.truncated_files],
-            )
-            for robot_id, count in summary.frame_counts.items()
-        }
-        return dataclasses.replace(summary, frame_counts=counts, warnings=tuple(map(relative, summary.warnings)))
-
     def _check_path(self) -> None:
         """Raise OutputError for a path that cannot be written, or that is an input of the run."""
         if self.path.name.endswith(PARTIAL_SUFFIX):
@@ -371,37 +341,6 @@ class ResultWriter:
         files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
 
-    def _write_description(self, inputs: Mapping[str, Fingerprint]) -> None:
-        """Write the metadata: format, configuration, classes and fingerprints of the inputs."""
-        config, folder = self._config, self.path.parent.resolve()
-        robots = tuple(robot.with_paths_from(folder) for robot in config.robots)
-        self._writer.write_metadata(
-            "octoreplay",
-            {
-                "version": __version__,
-                "format_version": FORMAT_VERSION,
-                "frame": TEAM,
-                "robots": json.dumps([robot.robot_id for robot in robots]),
-                "resolution": repr(config.map.resolution),
-                "prior": repr(config.map.prior(self._class_table.num_classes)),
-                "rule": config.consensus.rule,
-            },
-        )
-        used = dataclasses.replace(config, robots=robots, sensor=config.effective_sensor)
-        self._writer.write_metadata("config", {"team_file": dump_team(used, with_defaults=True)})
-        classes = [{"id": 0, "name": "free", "color": None}]
-        classes += [{"id": c.class_id, "name": c.name, "color": list(c.color)} for c in self._class_table.classes]
-        self._writer.write_metadata("classes", {"classes": json.dumps(classes)})
-        self._writer.write_metadata(
-            "inputs",
-            {
-                os.path.relpath(path, folder): json.dumps(
-                    {"size": entry.size, "method": entry.method, "fingerprint": entry.value}
-                )
-                for path, entry in inputs.items()
-            },
-        )
-
     def _start(self, stamp_ns: int) -> None:
         """Before the first message, write the robots' map frames, which viewers need at or before other messages."""
         if self._started:
@@ -421,32 +360,3 @@ def _stop_reason(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     return "out of memory" if isinstance(error, MemoryError) else f"error: {error}"
-
-
-def _difference(name: str, values: Mapping[str, str], earlier: Mapping[str, str]) -> str:
-    """Phrase on the first difference between two metadata records."""
-    key = next(key for key in [*values, *earlier] if values.get(key) != earlier.get(key))
-    if name == "inputs":
-        return f"the log '{key}' is not as it was; run with --restart to start from the beginning"
-    now, then = (record.get(key, "").splitlines() for record in (values, earlier))
-    lines = next(((a, b) for a, b in itertools.zip_longest(now, then, fillvalue="") if a != b), ("", ""))
-    return (
-        f"'{lines[0].strip()}' was '{lines[1].strip()}'; use the same settings, or run with --restart to start from the"
-        " beginning"
-    )
-
-
-def _summary_values(summary: RunSummary) -> dict[str, str]:
-    """Return a summary as metadata, with numbers and lists as JSON; without the wall time, which differs by run."""
-    values = {"complete": "true"}
-    for item in dataclasses.fields(summary):
-        if item.name in ("wall_seconds", "log_sent_bytes", "last", "links", "frame_counts", "joins"):
-            continue
-        value = getattr(summary, item.name)
-        values[item.name] = value if isinstance(value, str) else json.dumps(value)
-    if summary.joins:
-        values["joins"] = json.dumps([dataclasses.asdict(join) for join in summary.joins])
-    values["links"] = json.dumps([dataclasses.asdict(link) for link in summary.links])
-    counts = {robot_id: dataclasses.asdict(count) for robot_id, count in summary.frame_counts.items()}
-    values["frame_counts"] = json.dumps(counts)
-    return values

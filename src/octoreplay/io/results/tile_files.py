@@ -62,6 +62,11 @@ class TileList:
     num_cells: int
     files: tuple[TileFile, ...]
 
+    @property
+    def folder(self) -> str:
+        """Name of the folder of the files, beside the result."""
+        return self.files[0].file.partition("/")[0]
+
     def values(self) -> dict[str, str]:
         """Return the list as a metadata record."""
         return {"cells": str(self.num_cells), "files": json.dumps([asdict(file) for file in self.files])}

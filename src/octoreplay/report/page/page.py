@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,8 @@ from octoreplay.report.cell_colors import CONTRADICTION_COLORS, robot_color
 from octoreplay.report.page import page_tables, pictures, series
 from octoreplay.report.page.columns import Columns
 from octoreplay.report.page.layers import Layers
-from octoreplay.report.page.tiles import NO_TILE, TilePool
+from octoreplay.report.page.tile_pool import TilePool
+from octoreplay.report.page.tiles import NO_TILE
 from octoreplay.result import Result, open_result
 
 DEFAULT_MAX_BYTES = 25_000_000
@@ -58,7 +59,7 @@ def write_page(
     InputError
         The result cannot be read, or holds no tick.
     OutputError
-        The file cannot be written.
+        The file cannot be written, or the temporary file of the maps' tiles.
     """
     with open_result(result_path) as result:
         text = page_of(result, max_bytes, max_depth)
@@ -69,22 +70,23 @@ def write_page(
 
 def page_of(result: Result, max_bytes: int = DEFAULT_MAX_BYTES, max_depth: int | None = None) -> str:
     """Return the page of a result as HTML. Raises as ``write_page``."""
-    contents = PageContents(result, max_depth)
-    fixed = len(contents.html(b"").encode())
-    for team_level, robot_level in _LEVELS:
-        contents.layers.keep_levels(team_level, robot_level)
-        columns = Columns()
-        header = contents.header(columns)
-        block = columns.compressed()
-        if fixed + len(header) + 4 * len(block) / 3 <= max_bytes:
-            break
-    return contents.html(block, header)
+    with PageContents(result, max_depth) as contents:
+        room = max_bytes - len(contents.html(b"").encode())
+        for team_level, robot_level in _LEVELS:
+            contents.layers.keep_levels(team_level, robot_level)
+            columns = Columns(None if (team_level, robot_level) == _LEVELS[-1] else max(room, 0) * 3 // 4)
+            header = contents.header(columns)
+            block = columns.compressed()
+            if not columns.is_full and len(header) + 4 * len(block) / 3 <= room:
+                break
+        return contents.html(block, header)
 
 
 class PageContents:
-    """Everything that a page shows of a result.
+    """Everything that a page shows of a result; a context manager.
 
-    ``max_depth`` is as in ``StoredMap.coarsened``. Raises InputError where the result holds no tick.
+    Of a result in tiles it reads one tile after the other. ``max_depth`` is as in ``StoredMap.coarsened``. Raises
+    InputError where the result holds no tick, and OutputError where the temporary file of the tiles cannot be written.
     """
 
     def __init__(self, result: Result, max_depth: int | None = None) -> None:
@@ -93,22 +95,28 @@ class PageContents:
         self.result = result
         self.times = series.times(result)
         stored = stored_ticks(result)
-        self.layers = Layers(result, chosen_ticks(result, stored), max_depth)
         self.num_stored = len(stored)
         self.pictures = pictures.pictures(result, max_depth)
+        self.layers = Layers(result, chosen_ticks(result, stored), max_depth)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.layers.__exit__(*error)
 
     def header(self, columns: Columns) -> str:
         """Return the header of a page that holds all tiles as JSON, and add its arrays to ``columns``."""
-        used = {}
-        pools = {}
-        for name, pool in self.layers.pools.items():
-            used[name] = self.layers.contents_in_use(name)
-            pools[name] = columns.add_all(pool.columns(used[name]))
+        used = {name: self.layers.contents_in_use(name) for name in self.layers.store.pools}
+        pools = {
+            name: {column: columns.add(pool.column(column, used[name])) for column in pool.names}
+            for name, pool in self.layers.store.pools.items()
+        }
         return self._header(columns, pools, used)
 
     def served_header(self, columns: Columns) -> tuple[str, Mapping[str, TilePool]]:
         """Return the header of a page whose tiles a server sends, and the pools of these tiles by name."""
-        return self._header(columns, None, {}), self.layers.pools
+        return self._header(columns, None, {}), self.layers.store.pools
 
     def _header(
         self, columns: Columns, pools: Mapping[str, Any] | None, used: Mapping[str, npt.NDArray[np.uint32]]
@@ -138,7 +146,7 @@ class PageContents:
             "contradictions": [
                 {"name": name, "color": list(color)} for _, (name, color) in sorted(CONTRADICTION_COLORS.items())
             ],
-            "masks": [_robots_in(mask, len(result.robots)) for mask in layers.masks.values],
+            "masks": [_robots_in(mask, len(result.robots)) for mask in layers.store.masks.values],
             "leastProbability": 1.0 / (result.class_table.num_classes + 1),
             "largestDisagreement": layers.largest_disagreement,
             "hasFirst": layers.evidence.has_history,
@@ -147,7 +155,7 @@ class PageContents:
             "layers": [
                 {"name": escaped(layer.name), "robot": escaped(layer.robot_id), "kind": layer.kind,
                  "title": layer.title, "tiles": columns.add_all(_renumbered(layer.columns(), used))}
-                for layer in sorted(layers.layers.values(), key=lambda layer: _order(layer.kind))
+                for layer in layers.layers
             ],
             "pools": {} if pools is None else pools,
             "charts": series.charts(result, columns),
@@ -215,18 +223,14 @@ def chosen_ticks(result: Result, stored: Sequence[int]) -> list[int]:
 def _renumbered(
     columns: Mapping[str, npt.NDArray[Any]], used: Mapping[str, npt.NDArray[np.uint32]]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Columns of a layer with the new indices of contents."""
+    """Columns of a layer with the new indices of contents: their places in ``used``."""
     changed = dict(columns)
     for name, wanted in used.items():
-        changed[name] = np.where(
-            columns[name] == NO_TILE, np.uint32(NO_TILE), np.searchsorted(wanted, columns[name]).astype(np.uint32)
-        )
+        is_named = columns[name] != NO_TILE
+        order = np.argsort(wanted)
+        changed[name] = np.full(len(is_named), NO_TILE, np.uint32)
+        changed[name][is_named] = order[np.searchsorted(wanted, columns[name][is_named], sorter=order)]
     return changed
-
-
-def _order(kind: str) -> int:
-    """Place of a kind of layer in lists."""
-    return ("team", "map", "evidence", "central").index(kind)
 
 
 def _robots_in(mask: int, num_robots: int) -> list[int]:

@@ -28,29 +28,31 @@ def served(result: Result, port: int = 0, max_depth: int | None = None) -> Itera
     only requests that name this machine as their host, so that pages of other sites cannot read the map through a name
     that resolves to it.
 
-    Raises InputError where the result holds no tick, and OutputError where the port cannot be used.
+    Raises InputError where the result holds no tick, and OutputError where the port cannot be used, or where the
+    temporary file of the tiles cannot be written.
     """
-    answers = _Answers(PageContents(result, max_depth))
+    with PageContents(result, max_depth) as contents:
+        answers = _Answers(contents)
 
-    class Handler(_Handler):
-        answer = answers
+        class Handler(_Handler):
+            answer = answers
 
-    try:
-        server = ThreadingHTTPServer((ADDRESS, port), Handler)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise OutputError(
-            f"port {port} of {ADDRESS} cannot be used: {reason}; choose another one with --port"
-        ) from error
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://{ADDRESS}:{server.server_port}/"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+        try:
+            server = ThreadingHTTPServer((ADDRESS, port), Handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise OutputError(
+                f"port {port} of {ADDRESS} cannot be used: {reason}; choose another one with --port"
+            ) from error
+        server.daemon_threads = True
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"http://{ADDRESS}:{server.server_port}/"
+        finally:
+            server.shutdown()
+            server.server_close()
+            thread.join()
 
 
 class _Answers:

@@ -11,8 +11,9 @@ import numpy as np
 
 from octoreplay.log_odds import best_labels
 from octoreplay.mapping.contradiction import CellContradiction, StateLimits, cell_contradictions, state_limits
-from octoreplay.mapping.octree import LeafSpans, codes_to_keys
+from octoreplay.mapping.octree import LeafSpans, SemanticOctree, codes_to_keys
 from octoreplay.records import Float32Array, Float64Array, Int64Array, UInt8Array
+from octoreplay.report.map_part import MapPart
 from octoreplay.report.page.tiles import (
     DISAGREEMENT_STEPS,
     PLAIN,
@@ -39,11 +40,20 @@ _MASK_BITS = 63
 
 @dataclass(frozen=True, eq=False)
 class RobotMap:
-    """Map of one robot: index of the robot, the stored map, and the leaves of its posterior."""
+    """Part of a map of one robot: index of the robot, the stored map, and the leaves of its posterior.
+
+    ``octree`` holds the map with some cells around the part.
+    """
 
     index: int
     stored: StoredMap
     spans: LeafSpans
+    octree: SemanticOctree
+
+    @classmethod
+    def of(cls, index: int, stored: StoredMap) -> RobotMap:
+        """Return a map with its leaves."""
+        return cls(index, stored, stored.shown_octree().spans(), stored.octree)
 
     @cached_property
     def log_odds(self) -> Float32Array:
@@ -67,38 +77,50 @@ class RobotMap:
 
 
 class Evidence:
-    """Robots' evidence at some ticks of a result: the last one up to a tick, or the first one that is stored.
+    """Ticks, out of some of a result, at which robots' evidence is stored.
 
-    ``has_history`` is True where the evidence of several ticks is stored. ``max_depth`` is as in
-    ``StoredMap.coarsened``.
+    ``has_history`` is True where the evidence of several ticks is stored. ``limits`` are those of its states.
     """
 
-    def __init__(self, result: Result, ticks: Sequence[int], max_depth: int | None = None) -> None:
-        self._result = result
-        self._max_depth = max_depth
-        self._stored = {name: set(result.evidence_ticks(name)) for name in result.robots}
-        self.ticks = [tick for tick in ticks if any(tick in stored for stored in self._stored.values())]
+    def __init__(self, result: Result, ticks: Sequence[int]) -> None:
+        self.result = result
+        self.stored = {name: set(result.evidence_ticks(name)) for name in result.robots}
+        self.ticks = [tick for tick in ticks if any(tick in stored for stored in self.stored.values())]
         self.has_history = len(self.ticks) > 1
         self.limits: StateLimits = state_limits(result.config.effective_sensor)
+
+
+class EvidencePart:
+    """Part of the robots' evidence at one tick after the other: the last one up to a tick, or the first one."""
+
+    def __init__(self, evidence: Evidence, part: MapPart) -> None:
+        self.of_result = evidence
+        self._part = part
         self._tick = -1
         self._maps: list[RobotMap] = []
 
     def at(self, tick: int) -> tuple[int, list[RobotMap]]:
         """Return the tick of the evidence that belongs to a tick, and the evidence; -1 and nothing without any."""
-        wanted = max((t for t in self.ticks if t <= tick), default=self.ticks[0] if self.ticks else -1)
+        ticks = self.of_result.ticks
+        wanted = max((t for t in ticks if t <= tick), default=ticks[0] if ticks else -1)
         if wanted != self._tick:
             self._tick, self._maps = wanted, []
-            for index, name in enumerate(self._result.robots):
-                if wanted in self._stored[name]:
-                    stored = self._result.evidence(name, tick=wanted).coarsened(self._max_depth)
-                    self._maps.append(RobotMap(index, stored, stored.octree.spans()))
+            for index, name in enumerate(self.of_result.result.robots):
+                if wanted in self.of_result.stored[name]:
+                    self._maps.append(self._map(index, name, wanted))
         return self._tick, self._maps
+
+    def _map(self, index: int, robot_id: str, tick: int) -> RobotMap:
+        """Evidence of a robot."""
+        wider = self._part.evidence(self.of_result.result, robot_id, tick=tick)
+        stored = wider.cut(self._part.bounds) if len(self._part.bounds) else wider
+        return RobotMap(index, stored, stored.octree.spans(), wider.octree)
 
 
 class TeamMap:
-    """Team's map at one tick after the other."""
+    """Part of a team's map at one tick after the other."""
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: EvidencePart) -> None:
         self._evidence = evidence
         self._first = _FirstRobots()
         self._contradiction_tick = -1
@@ -113,11 +135,11 @@ class TeamMap:
         evidence_tick, evidence = self._evidence.at(tick)
         frame = maps[0].stored.frame_id if maps else ""
         evidence = [own for own in evidence if own.stored.frame_id == frame]
-        if self._evidence.has_history and evidence_tick <= tick:
+        if self._evidence.of_result.has_history and evidence_tick <= tick:
             self._first.advance(evidence_tick, evidence)
         if evidence_tick != self._contradiction_tick:
             self._contradiction_tick = evidence_tick
-            self._contradictions = _contradictions(evidence, self._evidence.limits)
+            self._contradictions = _contradictions(evidence, self._evidence.of_result.limits)
         codes = _occupied_codes(maps)
         if evidence_tick <= tick:
             contradicted = self._contradictions.values >= CellContradiction.CONTRADICTION
@@ -129,7 +151,7 @@ class TeamMap:
         for own in evidence:
             knows = own.spans.leaves_at(codes) >= 0
             cells["seen"] |= np.where(knows, np.uint64(1) << np.uint64(min(own.index, _MASK_BITS)), np.uint64(0))
-        if self._evidence.has_history:
+        if self._evidence.of_result.has_history:
             cells["first"] = self._first.of(codes)
         cells["contradiction"] = self._contradictions.at(codes)
         cells = cells[(cells["label"] > 0) | (cells["contradiction"] >= CellContradiction.CONTRADICTION)]
@@ -200,7 +222,7 @@ def _contradictions(evidence: Sequence[RobotMap], limits: StateLimits) -> _CellV
     codes = np.unique(np.concatenate([np.empty(0, np.int64), *occupied]))
     if not len(codes):
         return _NO_CELLS
-    octrees = [own.stored.octree for own in evidence]
+    octrees = [own.octree for own in evidence]
     coords: Float64Array = (codes_to_keys(codes) + np.float64(0.5)) * octrees[0].resolution
     return _CellValues(codes, cell_contradictions(octrees, coords, limits))
 

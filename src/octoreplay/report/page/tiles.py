@@ -4,13 +4,12 @@ The cells of level k have an edge of 2^k r, r the map's resolution, and its tile
 near tiles at level 0 and far ones at coarser levels. Cells are ordered by Morton code, so that the cells of a tile are
 consecutive: the code of a tile is that of its cells without the last 15 bits.
 
-A tile that did not change, and tiles that are equal in several maps, are stored once (``TilePool``).
+A tile that did not change, and tiles that are equal in several maps, are stored once (``tile_pool.TilePool``).
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ MAX_LEVEL = 13
 NO_TILE = 0xFFFFFFFF
 """Index of a tile without contents."""
 FEW_TILES = 8
-"""Number of tiles at which no coarser level is made."""
+"""Number of tiles at which no coarser level is made, if it is that of all times."""
 
 PLAIN = (("code", "<i8"), ("size", "u1"), ("label", "u1"), ("probability", "<u2"))
 """Fields of a cube: Morton code of its first cell, binary logarithm of its edge in cells, class_id, and probability of
@@ -139,44 +138,6 @@ def coarser(cubes: Cubes) -> Cubes:
 def coarser_runs(runs: Runs) -> Runs:
     """Return the runs of the cells of the next coarser level that hold a cell of ``runs``."""
     return _joined(runs[:, 0] >> 3, ((runs[:, 0] + runs[:, 1] - 1) >> 3) + 1)
-
-
-class TilePool:
-    """Contents of tiles, each stored once: columns of all contents one after the other.
-
-    ``fields`` are the names and types of the columns.
-    """
-
-    def __init__(self, fields: Mapping[str, str]) -> None:
-        self._fields = fields
-        self._known: dict[bytes, int] = {}
-        self._counts: list[int] = []
-        self._columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in fields}
-
-    def __len__(self) -> int:
-        return len(self._counts)
-
-    def add(self, columns: Mapping[str, npt.NDArray[Any]]) -> int:
-        """Add a tile's columns, (n,) each, and return the index of its contents."""
-        arrays = {name: columns[name].astype(kind) for name, kind in self._fields.items()}
-        count = len(next(iter(arrays.values())))
-        digest = hashlib.blake2b(b"".join(array.tobytes() for array in arrays.values()), digest_size=16).digest()
-        found = self._known.setdefault(digest, len(self._counts))
-        if found == len(self._counts):
-            self._counts.append(count)
-            for name, array in arrays.items():
-                self._columns[name].append(array)
-        return found
-
-    def columns(self, wanted: Iterable[int]) -> dict[str, npt.NDArray[Any]]:
-        """Return the columns of some contents, and ``starts``: the first row of each and the end of the last one."""
-        indices = [int(index) for index in wanted]
-        starts = np.concatenate([[0], np.cumsum([self._counts[index] for index in indices])]).astype(np.uint32)
-        found: dict[str, npt.NDArray[Any]] = {"starts": starts}
-        for name, kind in self._fields.items():
-            parts = self._columns[name]
-            found[name] = np.concatenate([np.empty(0, kind), *(parts[index] for index in indices)])
-        return found
 
 
 def cube_columns(cubes: Cubes) -> dict[str, npt.NDArray[Any]]:

@@ -4,7 +4,8 @@ rerun-sdk is an optional dependency: ``pip install 'octoreplay[rerun]'``.
 
 Entities of the robots and of the centralised map lie below the frame that they are given in::
 
-    <frame>/<robot>/map/<class>/part <n>   Boxes3D, occupied leaves at their true sizes, in the class's colour
+    <frame>/<robot>/map/<class>/part <n>   Boxes3D, occupied leaves at their true sizes, in the class's colour; of a
+                                           result in tiles <frame>/<robot>/map/tile <k>/<class>/part <n>
     <frame>/<robot>/pose                   Transform3D of the sensor
     <frame>/<robot>/path                   LineStrips3D, one piece per tick
     <frame>/links                          LineStrips3D, the links of a tick
@@ -14,6 +15,7 @@ Entities of the robots and of the centralised map lie below the frame that they 
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -153,7 +155,7 @@ class _Writer:
         self._stream = stream
         self._result = result
         self._ticks = {tick.tick: tick for tick in result.metrics}
-        self._parts: dict[tuple[str, str, str], set[tuple[str, ...]]] = {}
+        self._parts: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
 
     def write_classes(self) -> None:
         """Write what holds at all times: the classes' names and colours, and the direction of z in every frame."""
@@ -251,39 +253,48 @@ class _Writer:
         self, shown: Sequence[str], every: float, map_kind: str, max_depth: int | None,
         progress: Callable[[float], None] | None,
     ) -> int:  # fmt: skip
-        """Write the stored maps of some robots, and return their number."""
-        last = {robot_id: self._result.stored_ticks(robot_id)[-1] for robot_id in shown}
-        written: dict[str, StoredMap] = {}
-        frames: dict[str, str] = {}
-        num_maps = 0
-        for maps in self._result.history():
-            newest = max(stored.tick for stored in maps.values())
-            for robot_id in shown:
-                stored = maps.get(robot_id)
-                if stored is None or stored.tick != newest:
-                    continue
-                if (
-                    robot_id in written
-                    and stored.tick != last[robot_id]
-                    and not _is_due(written[robot_id], stored, every)
-                ):
-                    continue
-                if frames.setdefault(robot_id, stored.frame_id) != stored.frame_id:
-                    self._set_time(self._ticks[stored.tick])
-                    self._clear(frames[robot_id], robot_id, "map")
-                self._write_map(stored.coarsened(max_depth), map_kind)
-                written[robot_id], frames[robot_id] = stored, stored.frame_id
-                num_maps += 1
-            if progress is not None:
-                progress((newest + 1) / (self._result.metrics[-1].tick + 1))
-        return num_maps
+        """Write the stored maps of some robots, one part of the result after the other; return their number."""
+        boxes = list(self._result.boxes(max_depth=max_depth))
+        chosen = self._chosen_ticks(shown, every)
+        last_tick = self._result.metrics[-1].tick
+        for number, bounds in enumerate(boxes):
+            tile = (f"tile {number + 1}",) if len(boxes) > 1 else ()
+            frames: dict[str, str] = {}
+            for maps in self._result.history(bounds=bounds):
+                newest = max(stored.tick for stored in maps.values())
+                for robot_id in shown:
+                    if newest not in chosen[robot_id]:
+                        continue
+                    stored = maps[robot_id]
+                    if frames.setdefault(robot_id, stored.frame_id) != stored.frame_id:
+                        self._set_time(self._ticks[stored.tick])
+                        self._clear(frames[robot_id], robot_id, "map")
+                        frames[robot_id] = stored.frame_id
+                    self._write_map(stored.coarsened(max_depth), map_kind, tile)
+                if progress is not None:
+                    progress((number + (newest + 1) / (last_tick + 1)) / len(boxes))
+        return sum(map(len, chosen.values()))
 
-    def _write_map(self, stored: StoredMap, map_kind: str) -> None:
+    def _chosen_ticks(self, shown: Sequence[str], every: float) -> dict[str, set[int]]:
+        """Ticks at which the map of each robot is shown: at least ``every`` seconds apart, and the last one."""
+        chosen: dict[str, set[int]] = {}
+        for robot_id in shown:
+            ticks = self._result.stored_ticks(robot_id)
+            chosen[robot_id] = {ticks[-1]}
+            before = -math.inf
+            for tick in ticks:
+                seconds = self._ticks[tick].stamp_ns / 1e9
+                if seconds - before >= every - 1e-9:
+                    chosen[robot_id].add(tick)
+                    before = seconds
+        return chosen
+
+    def _write_map(self, stored: StoredMap, map_kind: str, tile: tuple[str, ...]) -> None:
         """Write the occupied leaves of one map, by class and in parts; parts of an earlier map are cleared."""
         leaves = stored.leaves(map_kind=map_kind)
         labels = best_labels(leaves.log_odds)
         self._set_time(self._ticks[stored.tick])
-        entity = (stored.frame_id, stored.robot_id, "map")
+        entity = (stored.frame_id, stored.robot_id, "map", *tile)
         parts: set[tuple[str, ...]] = set()
         for class_id, name in enumerate(self._result.class_table.names, start=1):
             rows = np.flatnonzero(labels == class_id)
@@ -312,11 +323,6 @@ class _Writer:
     def _clear(self, *entity: str) -> None:
         """End an entity and all below it at the present time."""
         self._stream.log(_path(*entity), self._rerun.Clear(recursive=True))
-
-
-def _is_due(before: StoredMap, stored: StoredMap, every: float) -> bool:
-    """True where a map is at least ``every`` seconds after the one that was written before."""
-    return (stored.stamp_ns - before.stamp_ns) / 1e9 >= every - 1e-9
 
 
 def _frames(result: Result) -> list[str]:
