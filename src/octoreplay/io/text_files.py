@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from octoreplay.config.file_url import FileUrl
+
 
 def json_text(content: Any) -> str:
     """Return dataclasses, mappings, sequences and sets as JSON text; keys keep their order, sets are sorted.
@@ -34,4 +36,4 @@ def _plain(value: Any) -> Any:
         return _plain(value.item())
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
+    return str(value) if isinstance(value, Path | FileUrl) else value

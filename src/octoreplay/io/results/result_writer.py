@@ -18,6 +18,7 @@ import numpy.typing as npt
 from octoreplay import interrupts
 from octoreplay._version import __version__
 from octoreplay.config.fields import path_problem
+from octoreplay.config.file_url import is_url
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.team_file import dump_team
 from octoreplay.errors import ConfigError, OutputError
@@ -332,7 +333,8 @@ class ResultWriter:
     def _with_relative_paths(self, summary: RunSummary) -> RunSummary:
         """Return the summary with the paths of inputs in its sentences relative to the result's folder."""
         folder = self.path.parent.resolve()
-        files = {str(path): os.path.relpath(path, folder) for robot in self._config.robots for path in robot.files}
+        paths = (path for robot in self._config.robots for path in robot.files if isinstance(path, Path))
+        files = {str(path): os.path.relpath(path, folder) for path in paths}
         # Longest first, because a path may begin with another one.
         names = sorted((name for name in files if Path(name).is_absolute()), key=len, reverse=True)
 
@@ -366,7 +368,7 @@ class ResultWriter:
                         raise OutputError(f"{self.path}: is an input of robot '{robot.robot_id}'; name another output")
 
     def _inputs(self) -> dict[str, Fingerprint]:
-        """Return the fingerprints of all input files by absolute path, in the order of the robots."""
+        """Return the fingerprints of all input files by absolute path or URL, in the order of the robots."""
         whole = self._config.output.hash
         files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}
@@ -395,7 +397,7 @@ class ResultWriter:
         self._writer.write_metadata(
             "inputs",
             {
-                os.path.relpath(path, folder): json.dumps(
+                path if is_url(path) else os.path.relpath(path, folder): json.dumps(
                     {"size": entry.size, "method": entry.method, "fingerprint": entry.value}
                 )
                 for path, entry in inputs.items()
