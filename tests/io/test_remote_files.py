@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -126,7 +127,7 @@ def test_readers_name_the_url(server: WebServer) -> None:
     server.files["/wrong.tum"] = b"0 0 x\n"
     server.files["/wrong.mcap"] = b"no log at all, but text"
     url = log_url(server)
-    with open_log(url) as log, open_log(LOG) as same:
+    with open_log(str(url)) as log, open_log(LOG) as same:
         assert log.path == url
         assert log.topics == same.topics
         message = next(iter(log.messages([log.topics[0].name])))
@@ -141,6 +142,28 @@ def test_readers_name_the_url(server: WebServer) -> None:
             read_rows(wrong) if path.endswith("tum") else open_log(wrong)
         assert str(caught.value).startswith(str(wrong))
         assert str(cache_folder()) not in str(caught.value)
+
+
+def test_an_object_of_a_google_bucket_is_downloaded(server: WebServer) -> None:
+    """The server answers as the JSON interface of Google Cloud Storage does."""
+    pytest.importorskip("gcsfs")
+    data = LOG.read_bytes()
+    about = {"name": "run/husky_1.mcap", "bucket": "field", "size": str(len(data)), "generation": "7"}
+    server.files = {
+        "/storage/v1/b/field/o/run%2Fhusky_1.mcap": json.dumps(about).encode(),
+        "/download/storage/v1/b/field/o/run%2Fhusky_1.mcap": data,
+    }
+    environment = {**os.environ, "STORAGE_EMULATOR_HOST": f"http://{server.address}"}
+    for url, found in (("gs://field/run/husky_1.mcap", data), ("gs://field/run/none.mcap", None)):
+        done = subprocess.run(
+            [sys.executable, "-c", COPYING, url], env=environment, capture_output=True, text=True, check=False
+        )
+        if found is None:
+            assert done.stderr.splitlines()[-1].endswith(
+                f"{url}: no such object; check the bucket or host, and the name"
+            )
+        else:
+            assert (Path(done.stdout.strip()).read_bytes(), done.stderr) == (data, "")
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ _POLL_SECONDS = 0.5
 _CONNECT_SECONDS = 30.0
 _READ_SECONDS = 60.0
 """Longest time without a byte [s]. A download as a whole may take any time."""
+_PART_BYTES = 8 << 20
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _WITHOUT_CREDENTIALS = ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound", "DefaultCredentialsError")
 _LOGGERS = ("asyncio", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "s3fs")
@@ -167,9 +168,10 @@ def _file_system(file: FileUrl) -> Any:
 
 
 def _options(scheme: str) -> Mapping[str, Any]:
-    """Options of a file system: proxies and .netrc of the user, and no limit of the time of a whole download."""
+    """Options of a file system: small parts, proxies and .netrc of the user, and a download may take any time."""
     if scheme == "s3":
-        return {}
+        # s3fs holds ten parts in memory, of 50 MiB by default.
+        return {"default_block_size": _PART_BYTES}
     import aiohttp
 
     limits = aiohttp.ClientTimeout(total=None, sock_connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS)

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from octoreplay.config.file_url import FileUrl, InputFile
+from octoreplay.config.file_url import FileUrl, InputFile, input_file
 from octoreplay.errors import InputError
 from octoreplay.io.containers import bag_records, mcap_records
 from octoreplay.io.containers.bag_log import BagLog
@@ -23,14 +23,14 @@ _MAGIC_LENGTH = 16
 
 
 def open_log(path: FilePath | FileUrl) -> LogReader:
-    """Open one log; the reader is a context manager.
+    """Open one log, of which the path or the URL is given; the reader is a context manager.
 
     The container is recognised by the first bytes of the file, not by its name. A file with a URL is downloaded first
     (``local_copy``). Raises InputError for a path that is missing, empty or not a log.
     """
+    path = input_file(path)
     if isinstance(path, FileUrl):
         return _open_copy(local_copy(path), path)
-    path = Path(path)
     if path.is_dir():
         try:
             return _open_folder(path)
