@@ -206,6 +206,15 @@ def test_credentials_are_used_and_not_shown(server: WebServer) -> None:
     assert not any(secret in str(caught.value) for secret in ("word", "abc"))
 
 
+def test_credentials_of_netrc_are_used(server: WebServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "netrc"
+    path.write_text("machine 127.0.0.1 login user password word\n")
+    path.chmod(0o600)
+    monkeypatch.setenv("NETRC", str(path))
+    local_copy(log_url(server))
+    assert set(server.authorizations) == {"Basic dXNlcjp3b3Jk"}
+
+
 def test_urls_in_messages_of_packages_lose_their_credentials() -> None:
     text = "403, url='https://user:word@host/a?X-Signature=abc', and http://host:1/b?c d"
     assert remote_files._without_credentials(text) == "403, url='https://host/a', and http://host:1/b d"

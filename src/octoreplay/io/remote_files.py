@@ -98,13 +98,15 @@ def _current_copy(file: FileUrl) -> Path:
         version = _version(file, system)
     key = hashlib.sha256(f"{file.url}\n{version.identity}\n{version.size}".encode()).hexdigest()[:32]
     copy = cache_folder() / key / file.name
-    is_new = version.identity is None
+    is_new, is_waiting = version.identity is None, False
     while is_new or not _is_whole(copy, version.size):
         try:
             _download(file, system, version, copy)
             is_new = False
         except InUseError:
-            # Another process downloads the same version.
+            if not is_waiting:
+                _log.info("waiting for another process, which downloads %s", file)
+            is_waiting = True
             time.sleep(_POLL_SECONDS)
     return copy
 
@@ -119,8 +121,8 @@ def _download(file: FileUrl, system: Any, version: _Version, copy: Path) -> None
     _make_room(file, version, copy.parent)
     from fsspec.callbacks import Callback
 
-    _log.info("downloading %s%s", file, "" if version.size is None else f" ({version.size:,} bytes)")
     with unfinished(copy) as temporary, _shown[0](file) as progress:
+        _log.info("downloading %s%s", file, "" if version.size is None else f" ({version.size:,} bytes)")
         callback = Callback(hooks={"progress": lambda size, value, **_: progress(value, version.size or size)})
         with _quiet(), _store_errors(file, callback):
             # The name of the object must not be taken for a pattern or a chain of stores.

@@ -20,6 +20,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError, MemoryLimitError
+from octoreplay.io.containers.fingerprint import Fingerprint
 from octoreplay.io.output_file import writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
@@ -135,7 +136,7 @@ def replay_tiles(
         folder = stack.enter_context(work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         setup = Setup(dataclasses.replace(config, robots=robots), folder.absolute(), num_threads, room)
-        scans = _cast_scans(setup, start_workers, given_cells or BLOCK_CELLS, num_axes, progress)
+        scans = _cast_scans(setup, start_workers, given_cells or BLOCK_CELLS, num_axes, writer.inputs, progress)
         stages = _replay_all(setup, start_workers, scans, given_cells, progress)
         tiles = tuple(stages)
         outcome = Outcome.of(stages, _counts(config, scans, next(iter(stages.values())).num_frames_off))
@@ -191,14 +192,15 @@ def _allow_open_files(num_tiles: int) -> None:
 
 
 def _cast_scans(
-    setup: Setup, start_workers: StartWorkers, block_cells: int, num_axes: int, progress: Progress | None
-) -> list[ScanIndex]:
+    setup: Setup, start_workers: StartWorkers, block_cells: int, num_axes: int, inputs: Mapping[str, Fingerprint],
+    progress: Progress | None,
+) -> list[ScanIndex]:  # fmt: skip
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
     config, folder = setup.config, setup.folder
     start_ns, groups = team_start_ns(config), cast_groups(config, folder, setup.num_threads)
     names = [", ".join(config.robots[index].robot_id for index in group) for group in groups]
     requests = [
-        Request(name, cast_scans, (group, start_ns, block_cells, num_axes))
+        Request(name, cast_scans, (group, start_ns, block_cells, num_axes, inputs))
         for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
