@@ -198,6 +198,10 @@ def test_results_do_not_hold_credentials(server: WebServer, tmp_path: Path) -> N
     assert [robot.logs[0].url for robot in load_team_file(team).robots] == urls
     with ResultReader(output) as reader:
         assert list(reader.inputs) == [server.url(f"/husky_{number}.mcap") for number in (1, 2)]
+    done = octoreplay("info", *urls, "--json")
+    names = [server.url(f"/husky_{number}.mcap") for number in (1, 2)]
+    assert [log["path"] for log in json.loads(done.stdout)["logs"]] == names
+    assert "hidden" not in done.stdout
 
 
 @pytest.mark.parametrize(

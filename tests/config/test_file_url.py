@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from octoreplay.config.file_url import FileUrl, input_file, is_url
+from octoreplay.config.file_url import FileUrl, input_file, is_url, without_credentials
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team, parse_team
@@ -104,3 +104,8 @@ def test_urls_that_a_result_could_not_tell_apart_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"2 URLs of 'http://host/log.mcap' differ only in what results do not store"):
         RunConfig(robots)
     RunConfig((robots[0], RobotConfig("r2", robots[0].logs)))
+
+
+def test_urls_in_texts_lose_their_credentials() -> None:
+    text = "403, url='https://user:word@host/a?X-Signature=abc', and http://host:1/b?c d"
+    assert without_credentials(text) == "403, url='https://host/a', and http://host:1/b d"

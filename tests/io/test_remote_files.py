@@ -215,11 +215,6 @@ def test_credentials_of_netrc_are_used(server: WebServer, tmp_path: Path, monkey
     assert set(server.authorizations) == {"Basic dXNlcjp3b3Jk"}
 
 
-def test_urls_in_messages_of_packages_lose_their_credentials() -> None:
-    text = "403, url='https://user:word@host/a?X-Signature=abc', and http://host:1/b?c d"
-    assert remote_files._without_credentials(text) == "403, url='https://host/a', and http://host:1/b d"
-
-
 def test_a_download_that_ends_early_leaves_nothing(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
     server.cut_at = 40_000
     with pytest.raises(InputError, match=r"husky_1.mcap: the download ended after [0-9,]+ bytes: .*; run the command"):

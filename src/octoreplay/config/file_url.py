@@ -109,6 +109,11 @@ def is_url(text: object) -> bool:
     return isinstance(text, str) and _URL.fullmatch(text) is not None
 
 
+def without_credentials(text: str) -> str:
+    """Return a text in which URLs of web servers have no user name, password and query."""
+    return re.sub(r"(https?://)(?:[^/\s'\"]*@)?([^\s?'\"]*)(?:\?[^\s'\"]*)?", r"\1\2", text)
+
+
 def input_file(place: str | os.PathLike[str] | FileUrl, folder: Path | None = None) -> InputFile:
     """Return the place of an input file from a path or the text of a path or URL; paths are relative to ``folder``.
 

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Self
 
 from octoreplay import interrupts
+from octoreplay.config.file_url import without_credentials
 from octoreplay.errors import EARLY, OutputError
 
 SYNC_SECONDS = 5.0
@@ -433,7 +434,7 @@ def _in_use(target: Path, owner: str) -> str:
 def _own_name() -> str:
     """Return the process, host and command line, for the message of other processes."""
     program = Path(sys.argv[0]).name.replace("__main__.py", "octoreplay") or "python"
-    command = shlex.join([program, *sys.argv[1:]])
+    command = without_credentials(shlex.join([program, *sys.argv[1:]]))
     return f"process {os.getpid()} on {socket.gethostname()} ({command[:300]})"
 
 

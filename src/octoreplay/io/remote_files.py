@@ -12,7 +12,6 @@ import errno
 import hashlib
 import logging
 import os
-import re
 import shutil
 import threading
 import time
@@ -22,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from octoreplay.config.file_url import FileUrl, InputFile
+from octoreplay.config.file_url import FileUrl, InputFile, without_credentials
 from octoreplay.errors import ConfigError, InputError, OctoreplayError, OutputError
 from octoreplay.io.output_file import InUseError, unfinished
 
@@ -246,10 +245,5 @@ def _cause(error: BaseException | None) -> str:
         return "access was refused; check the credentials"
     if isinstance(status, int):
         return f"the server answered {status}"
-    text = " ".join(_without_credentials(str(error)).split())
+    text = " ".join(without_credentials(str(error)).split())
     return f"cannot be read: {text or name}"
-
-
-def _without_credentials(text: str) -> str:
-    """Text whose URLs have no user name, password and query."""
-    return re.sub(r"(https?://)(?:[^/\s'\"]*@)?([^\s?'\"]*)(?:\?[^\s'\"]*)?", r"\1\2", text)
