@@ -26,8 +26,8 @@ EXTRAS = tuple(sorted(PROJECT["optional-dependencies"].keys() - {"test", "bench"
 """Extras for users."""
 
 COMPATIBLE = frozenset({
-    "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-CMU", "MPL-2.0",
-    "PSF-2.0", "Unlicense", "Zlib", "any-OSI",
+    "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-0", "MIT-CMU",
+    "MPL-2.0", "PSF-2.0", "Unlicense", "Zlib", "any-OSI",
 })  # fmt: skip
 """Licences (SPDX) of libraries that a program under Apache-2.0 may use and be distributed with."""
 

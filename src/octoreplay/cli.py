@@ -28,6 +28,7 @@ from octoreplay.commands import (
     logs,
     page,
     plotting,
+    progress,
     recovering,
     refining,
     results,
@@ -41,6 +42,7 @@ from octoreplay.commands.console import echo
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST, EXIT_ERROR, EXIT_INTERRUPTED, EXIT_USAGE
 from octoreplay.commands.suggestions import SuggestingGroup, unknown_option
 from octoreplay.errors import ConfigError, OctoreplayError, printable
+from octoreplay.io.remote_files import show_downloads
 
 
 @click.group(cls=SuggestingGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -77,6 +79,7 @@ def _run() -> int:
     streams.protect_streams()
     logging.basicConfig(handlers=[log_handler()])
     logging.getLogger("octoreplay").setLevel(logging.INFO)
+    show_downloads(progress.download_bar)
     try:
         code = _exit_code(None)
     except (Exception, KeyboardInterrupt) as error:

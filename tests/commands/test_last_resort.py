@@ -49,6 +49,13 @@ def test_an_unexpected_error_is_a_sentence_with_a_report(tmp_path: Path) -> None
     assert "numpy " in text
 
 
+def test_a_report_has_no_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["octoreplay", "info", "http://user:hidden@host/a.mcap?signature=hidden"])
+    report = last_resort._report(KeyError("http://host/a.mcap?signature=hidden"))
+    assert report.startswith("octoreplay info 'http://host/a.mcap'\n")
+    assert "hidden" not in report
+
+
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [

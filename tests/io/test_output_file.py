@@ -251,3 +251,14 @@ def test_an_unfinished_file_appears_with_its_name_or_not_at_all(tmp_path: Path) 
         temporary.write_bytes(b"whole")
         assert not output.exists()
     assert names(tmp_path) == ["a.mcap"]
+
+
+def test_the_name_of_a_process_has_no_credentials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["octoreplay", "info", "https://user:word@host/a.mcap?signature=abc"])
+    path = tmp_path / "out"
+    with (
+        locked(path),
+        pytest.raises(OutputError, match=r"\(octoreplay info 'https://host/a.mcap'\); wait"),
+        locked(path),
+    ):
+        pass

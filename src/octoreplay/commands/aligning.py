@@ -19,6 +19,7 @@ from octoreplay.commands.options import (
     existing_path,
     force_option,
     lock_folder,
+    log_place,
     with_parameters,
 )
 from octoreplay.commands.progress import lost_data, progress_bar
@@ -26,6 +27,7 @@ from octoreplay.commands.suggestions import Choice
 from octoreplay.commands.team_options import base_config, save_team_file
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ def dof_option(kind: type[click.Option] = click.Option) -> Callable[[Any], Any]:
 
 @with_parameters("sensor", "map", "time")
 @click.command(cls=SectionedCommand, short_help="Find the frames of a team from its robots' maps.")
-@click.argument("inputs", nargs=-1, required=True, type=existing_path, metavar="TEAM.yaml | LOG... | RESULT.mcap")
+@click.argument("inputs", nargs=-1, required=True, type=log_place, metavar="TEAM.yaml | LOG... | RESULT.mcap")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="ALIGNED.yaml", help="team file to write")
 @dof_option()
 @click.option("--guess", type=existing_path, metavar="FRAMES.yaml",
@@ -61,8 +63,8 @@ def dof_option(kind: type[click.Option] = click.Option) -> Callable[[Any], Any]:
 @force_option
 @prints
 def align(
-    inputs: tuple[Path, ...], output: Path, dof: str | None, guess: Path | None, components: bool, csv: Path | None,
-    plot: Path | None, classes: str | None, **parameters: Any,
+    inputs: tuple[InputFile, ...], output: Path, dof: str | None, guess: Path | None, components: bool,
+    csv: Path | None, plot: Path | None, classes: str | None, **parameters: Any,
 ) -> int:  # fmt: skip
     """Find the frames of a team: each robot's T_team_map, from the overlap of the robots' own maps.
 
@@ -144,7 +146,7 @@ def aligned_run(chosen: RunConfig, dof: int, surveys: LogSurveys) -> tuple[Resol
 
 
 def _aligned(
-    inputs: tuple[Path, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any]
+    inputs: tuple[InputFile, ...], dof: int, guess: Path | None, classes: str | None, given: Mapping[str, Any]
 ) -> tuple[RunConfig, Alignment, tuple[str, ...], Mapping[str, FrameCounts]]:
     """The configuration of the inputs, the alignment of its robots, and warnings and counts of the logs."""
     from octoreplay.config.frames_file import load_frames_file
@@ -154,7 +156,7 @@ def _aligned(
     from octoreplay.replay.alignment import aligned_config, check_alignable
 
     guesses = None if guess is None else load_frames_file(guess)
-    if is_result(inputs[0]):
+    if isinstance(inputs[0], Path) and is_result(inputs[0]):
         if len(inputs) > 1:
             raise click.UsageError(f"name one result alone, without {inputs[1]}")
         if given or classes is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +11,11 @@ import click
 
 from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import check_output, existing_path, force_option
+from octoreplay.commands.options import check_output, existing_path, force_option, log_place
 from octoreplay.commands.progress import progress_bar
 from octoreplay.commands.suggestions import Choice
 from octoreplay.commands.team_options import is_team_file, save_team_file
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.config.time import TimeConfig
@@ -29,7 +30,7 @@ _SENSORS = ("lidar", "rgbd", "depth")
 
 
 @click.command(short_help="Estimate a robot's poses from its clouds or depth images.")
-@click.argument("inputs", nargs=-1, required=True, type=existing_path, metavar="LOG... | TEAM.yaml")
+@click.argument("inputs", nargs=-1, required=True, type=log_place, metavar="LOG... | TEAM.yaml")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="LOG.tum",
               help="trajectory file to write, for pose_file in the team file")  # fmt: skip
 @click.option("--save-team", type=existing_path, metavar="TEAM.yaml",
@@ -58,7 +59,7 @@ _SENSORS = ("lidar", "rgbd", "depth")
 @force_option
 @prints
 def odometry(
-    inputs: tuple[Path, ...], output: Path, save_team: Path | None, robot_id: str | None, sensor: str | None,
+    inputs: tuple[InputFile, ...], output: Path, save_team: Path | None, robot_id: str | None, sensor: str | None,
     topic: str | None, color_topic: str | None, frame: str | None, guess: str | None, max_range: float | None,
     voxel_size: float | None, max_speed: float, max_acceleration: float, start: float, duration: float | None,
     every: int, clock: str,
@@ -113,7 +114,7 @@ def odometry(
 
 
 def _robot_and_logs(
-    inputs: tuple[Path, ...], robot_id: str | None, surveys: LogSurveys
+    inputs: tuple[InputFile, ...], robot_id: str | None, surveys: LogSurveys
 ) -> tuple[RobotConfig, LogGroup]:
     """The robot, with what a team file sets, and its logs. Raises ConfigError for an unknown or unnamed robot."""
     from octoreplay.config.team_file import load_team_file
@@ -136,7 +137,7 @@ def _robot_and_logs(
     return robot, group
 
 
-def _only(known: list[str], robot_id: str | None, inputs: tuple[Path, ...]) -> str:
+def _only(known: list[str], robot_id: str | None, inputs: Sequence[InputFile]) -> str:
     """The named robot, or the only one."""
     if robot_id is None and len(known) == 1:
         return known[0]

@@ -9,10 +9,19 @@ import click
 
 from octoreplay.commands.console import prints, terminal
 from octoreplay.commands.exit_codes import EXIT_DATA_LOST
-from octoreplay.commands.options import RareOption, SectionedCommand, check_output, existing_path, force_option, numbers
+from octoreplay.commands.options import (
+    RareOption,
+    SectionedCommand,
+    check_output,
+    existing_path,
+    force_option,
+    log_place,
+    numbers,
+)
 from octoreplay.commands.progress import progress_bar
 from octoreplay.commands.suggestions import Choice
 from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import ConfigError
 
 
@@ -35,7 +44,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 @click.command(cls=SectionedCommand, short_help="Label a log with a segmentation network.")
-@click.argument("log", type=existing_path, metavar="LOG")
+@click.argument("log", type=log_place, metavar="LOG")
 @click.option("--model", type=existing_path, required=True, metavar="FILE.onnx", help="semantic segmentation network")
 @click.option("--classes", required=True, metavar="NAME|FILE",
               help=f"class table of the network's labels: {', '.join(BUILT_IN)}, or a file")  # fmt: skip
@@ -74,7 +83,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 @force_option
 @prints
 def label(
-    log: Path, model: Path, classes: str, output: Path, sensor_topic: str | None, colour_topic: str | None,
+    log: InputFile, model: Path, classes: str, output: Path, sensor_topic: str | None, colour_topic: str | None,
     aligned: bool, extrinsics: str | None, colour_intrinsics: str | None, pair_tolerance: float, every: int,
     input_size: str | None, mean: str | None, std: str | None, resume: bool, restart: bool, **network: Any,
 ) -> int:  # fmt: skip
@@ -84,6 +93,7 @@ def label(
     the depth images or clouds, by projection where the cameras differ.
     """
     from octoreplay.config.class_file import named_class_table
+    from octoreplay.io.remote_files import local_copy
     from octoreplay.labelling.finished_frames import check_unstarted
     from octoreplay.labelling.label_log import LabelOptions, label_log
     from octoreplay.labelling.network import NetworkOptions
@@ -107,6 +117,8 @@ def label(
         ),
         pair_tolerance, every,
     )  # fmt: skip
+    # A download has a bar of its own.
+    local_copy(log)
     with progress_bar("label") as update:
         summary = label_log(
             log, output, model, table, options, resume=resume, progress=lambda share, text: update(share, None, text)

@@ -11,6 +11,7 @@ import traceback
 from importlib import metadata
 
 from octoreplay._version import __version__
+from octoreplay.config.file_url import without_credentials
 
 _LIBRARIES = ("click", "mcap", "numba", "numpy", "open3d-cpu", "open3d", "rich", "rosbags", "scipy")
 
@@ -40,7 +41,7 @@ def _report(error: Exception) -> str:
         except metadata.PackageNotFoundError:
             continue
     trace = "".join(traceback.format_exception(error))
-    return "\n".join([shlex.join(sys.argv), "", trace, *versions, ""])
+    return without_credentials("\n".join([shlex.join(sys.argv), "", trace, *versions, ""]))
 
 
 def _save(report: str) -> str:

@@ -15,10 +15,12 @@ from octoreplay.commands.options import (
     existing_path,
     force_option,
     lock_folder,
+    log_place,
     numbers,
 )
 from octoreplay.commands.progress import progress_bar
 from octoreplay.commands.suggestions import Choice
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.robot import POSE_FORMATS
 from octoreplay.config.run import RunConfig
@@ -35,12 +37,12 @@ _map_frame = click.option(
 
 
 @click.command(short_help="Show the contents of logs and what is missing for a run.")
-@click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
+@click.argument("logs", nargs=-1, required=True, type=log_place, metavar="LOG...")
 @_strict_frames
 @click.option("--classes", metavar="NAME|FILE",
               help="class table of the run, to compare the labels with  [default: that of the logs]")  # fmt: skip
 @prints
-def info(logs: tuple[Path, ...], strict_frames: bool, classes: str | None) -> int:
+def info(logs: tuple[InputFile, ...], strict_frames: bool, classes: str | None) -> int:
     """Show the contents of logs: robots, topics, types, rates and time spans, and what is missing for a run.
 
     A table counts the raw labels in a sample of the messages. Frames, clocks, and labels that do not fit together are
@@ -66,12 +68,12 @@ def info(logs: tuple[Path, ...], strict_frames: bool, classes: str | None) -> in
 
 
 @click.command(short_help="Write a team file for logs, to be edited by hand.")
-@click.argument("logs", nargs=-1, required=True, type=existing_path, metavar="LOG...")
+@click.argument("logs", nargs=-1, required=True, type=log_place, metavar="LOG...")
 @click.option("-o", "--output", type=existing_path, required=True, metavar="TEAM.yaml", help="team file to write")
 @force_option
 @_strict_frames
 @prints
-def init(logs: tuple[Path, ...], output: Path, strict_frames: bool) -> int:
+def init(logs: tuple[InputFile, ...], output: Path, strict_frames: bool) -> int:
     """Write a team file with the robots and topics found in logs, and every other setting as a comment.
 
     Anything that is missing for a run is named in the file and on the terminal, and so are frames and clocks of robots

@@ -12,6 +12,7 @@ from click.shell_completion import CompletionItem
 
 from octoreplay.commands.suggestions import Choice
 from octoreplay.config.fields import path_problem
+from octoreplay.config.file_url import FileUrl, InputFile, is_url
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, Parameter
 from octoreplay.config.presets import PRESETS
 from octoreplay.errors import ConfigError, OutputError
@@ -27,6 +28,8 @@ class _PathType(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path; refuse a name that no file can have, and a folder that must not be read."""
+        if is_url(value):
+            self.fail(f"'{str(value).partition('://')[0]}://...': only logs can be named by URL", param, ctx)
         path = Path(value)
         problem = path_problem(path)
         if problem is None:
@@ -60,7 +63,26 @@ _LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 """Suffixes of logs in files."""
 
 
+class _LogType(_PathType):
+    """Path or URL of a log, or path of a team file."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path, or the FileUrl; refuse a URL that cannot be read, and that of a team file."""
+        if isinstance(value, FileUrl):
+            return value
+        if not is_url(value):
+            return super().convert(value, param, ctx)
+        try:
+            url = FileUrl(value)
+        except ConfigError as error:
+            self.fail(str(error), param, ctx)
+        if url.suffix.lower() in (".yaml", ".yml"):
+            self.fail(f"'{url}': only logs can be named by URL; download the team file", param, ctx)
+        return url
+
+
 existing_path = _PathType(path_type=Path, readable=False)
+log_place = _LogType(path_type=Path, readable=False)
 
 
 _UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
@@ -272,7 +294,9 @@ def _check_no_file(path: Path) -> None:
             raise OutputError(f"{path}: is a file; name a folder")
 
 
-def check_output(path: Path, suffix: str | Sequence[str], inputs: Sequence[Path] = (), *, is_kept: bool = True) -> None:
+def check_output(
+    path: Path, suffix: str | Sequence[str], inputs: Sequence[InputFile] = (), *, is_kept: bool = True
+) -> None:
     """Check, before any work is done, that an output file can be written, is new and no input, and lock it.
 
     ``suffix`` is that of its name, or several to choose from. With --force, and without ``is_kept``, it may exist.

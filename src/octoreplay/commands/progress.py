@@ -7,7 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
+
 from octoreplay.commands.console import terminal
+from octoreplay.config.file_url import FileUrl
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
@@ -51,6 +54,13 @@ def replay_bar() -> Iterator[Callable[[Progress], None]]:
         yield show
 
 
+@contextlib.contextmanager
+def download_bar(file: FileUrl) -> Iterator[Callable[[int, int | None], None]]:
+    """Progress bar of a download; gives a callback for the numbers of bytes that are there, and of all."""
+    with progress_bar("download") as update:
+        yield lambda done, size: update(done / size if size else None, None, file.name)
+
+
 def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
     """Simulate with a progress bar and report the files written; return the team file."""
     from octoreplay.report.tables import size
@@ -63,6 +73,10 @@ def simulate_with_bar(folder: Path, options: dict[str, Any]) -> Path:
     images = f"{summary.num_frames:,} {'scans' if config.is_lidar else 'images'}, {size(summary.num_bytes)}"
     terminal().line(f"simulated {len(summary.logs)} robots: {images} in {folder}")
     return summary.team_file
+
+
+_shown: list[str] = []
+"""Titles of the bars on the terminal, which holds one at a time."""
 
 
 def _ignore(*_: object) -> None:
@@ -80,7 +94,9 @@ def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, s
     from octoreplay.report import tables
 
     console = tables.terminal(stderr=True)
-    if not console.is_terminal or terminal().is_quiet:
+    # A log that is opened while another bar is shown may be downloaded, also by another thread, which has no context.
+    has_room = console.is_terminal and click.get_current_context(silent=True) is not None and not _shown
+    if not has_room or terminal().is_quiet:
         yield _ignore
         return
     columns = (
@@ -89,13 +105,17 @@ def progress_bar(title: str) -> Iterator[Callable[[float | None, float | None, s
     )  # fmt: skip
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=1.0, text="")
+        _shown.append(title)
 
         def update(done: float | None, log_seconds: float | None, text: str) -> None:
             wall = bar.tasks[0].elapsed or 0.0
             speed = f"  {log_seconds / wall:.1f}x real time" if log_seconds is not None and wall > 0.5 else ""
             bar.update(task, completed=done or 0.0, text=text + speed)
 
-        yield update
+        try:
+            yield update
+        finally:
+            _shown.remove(title)
 
 
 def show_results(summary: RunSummary, *, warnings: Sequence[str] = ()) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from octoreplay.commands.options import (
     existing_path,
     force_option,
     lock_folder,
+    log_place,
     numbers,
     parse_size,
     preset_option,
@@ -35,6 +36,7 @@ from octoreplay.commands.team_options import (
 from octoreplay.config.alignment import ON_AIR
 from octoreplay.config.class_file import with_classes
 from octoreplay.config.class_tables.label_rows import BUILT_IN
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.parameters import PARAMETERS
 from octoreplay.config.presets import with_options
 from octoreplay.errors import ConfigError, OutputError
@@ -91,7 +93,7 @@ def _check_input(word: str) -> None:
 
 @with_parameters()
 @click.command(cls=_RunCommand, short_help="Replay logs into maps and run a distributed consensus on them.")
-@click.argument("inputs", nargs=-1, type=existing_path, metavar="TEAM.yaml | LOG...")
+@click.argument("inputs", nargs=-1, type=log_place, metavar="TEAM.yaml | LOG...")
 @click.option("-o", "--output", type=existing_path, metavar="OUT.mcap", help="result to write")
 @click.option("--config-from", type=existing_path, metavar="RESULT.mcap",
               help="use the logs and settings stored in this result, instead of TEAM.yaml or LOG")  # fmt: skip
@@ -133,7 +135,7 @@ def _check_input(word: str) -> None:
 @force_option
 @prints
 def run(
-    inputs: tuple[Path, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
+    inputs: tuple[InputFile, ...], output: Path | None, config_from: Path | None, resume: bool, restart: bool,
     checkpoint_every: float | None, memory_limit: int | None, tiles: float | str | None, tiles_z: bool,
     jobs: int | None, scheduler: str | None, result_per_tile: bool, report: Path | None, save_team: Path | None,
     preset: str | None, edges: str | None, one_way: str | None, schedule: Path | None, align: str | None,

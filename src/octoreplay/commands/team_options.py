@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import click
 
 from octoreplay.commands.console import terminal
 from octoreplay.commands.options import RareOption, numbers
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, suggestion
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
     from octoreplay.io.robots.survey import LogSurveys
 
 
-def is_team_file(inputs: Sequence[Path]) -> bool:
+def is_team_file(inputs: Sequence[InputFile]) -> TypeGuard[Sequence[Path]]:
     """True if an input is a team file, not a log."""
-    return any(path.suffix.lower() in (".yaml", ".yml") for path in inputs)
+    return any(isinstance(path, Path) and path.suffix.lower() in (".yaml", ".yml") for path in inputs)
 
 
 static_pose_option = click.option(
@@ -32,7 +33,7 @@ static_pose_option = click.option(
 
 
 def base_config(
-    inputs: tuple[Path, ...], config_from: Path | None, surveys: LogSurveys, static_poses: Sequence[str] = ()
+    inputs: tuple[InputFile, ...], config_from: Path | None, surveys: LogSurveys, static_poses: Sequence[str] = ()
 ) -> RunConfig:
     """Return the configuration before options: from a stored result, from a team file, or detected in logs.
 
@@ -58,7 +59,7 @@ def with_static_poses(robots: Sequence[RobotConfig], static_poses: Sequence[str]
 
 
 def _config_of(
-    inputs: tuple[Path, ...], config_from: Path | None, surveys: LogSurveys, static_poses: Sequence[str]
+    inputs: tuple[InputFile, ...], config_from: Path | None, surveys: LogSurveys, static_poses: Sequence[str]
 ) -> RunConfig:
     """Configuration from a stored result, from a team file, or detected in logs with some static poses."""
     from octoreplay.config.team_file import load_team_file
@@ -79,7 +80,7 @@ def _config_of(
             raise click.UsageError("name one team file or several logs, not both")
         return load_team_file(inputs[0])
     for path in inputs:
-        if (path / "team.yaml").is_file():
+        if isinstance(path, Path) and (path / "team.yaml").is_file():
             raise ConfigError(f"{path}: contains a team file; name {path / 'team.yaml'}, or its logs one by one")
     robots = discover.discover(inputs, surveys, edit=lambda robots: with_static_poses(robots, static_poses))
     return RunConfig(robots=robots)

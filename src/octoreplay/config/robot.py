@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from octoreplay.config.fields import LARGEST, help_text, path_problem, transform_problem
+from octoreplay.config.file_url import FileUrl, InputFile, input_file
 from octoreplay.config.robot_sensor import SENSOR_KEYS, RobotSensor
 from octoreplay.errors import ConfigError
 from octoreplay.records import CENTRAL
@@ -30,13 +31,13 @@ class RobotConfig:
     ----------
     robot_id : str
         Name of the robot in the team.
-    logs : tuple of Path
-        Log files or folders. All paths may be given as text, and one log without a tuple.
+    logs : tuple of Path or FileUrl
+        Log files or folders. All paths and URLs may be given as text, and one log without a tuple.
     depth_topic, label_topic, confidence_topic : str or None
         Image topics.
     cloud_topic : str or None
         Topic of point clouds or laser scans, with labels in ``label_field`` and confidences in ``confidence_field``.
-    pose_topic, pose_file, pose_times : str or Path or None
+    pose_topic, pose_file, pose_times : str, Path or FileUrl, or None
         Pose source: a topic, or a trajectory file. A file without times goes with ``pose_times``, the time of each
         pose, or has one pose per message of the sensor.
     pose_format : str or None
@@ -79,7 +80,7 @@ class RobotConfig:
     """
 
     robot_id: str
-    logs: tuple[Path, ...]
+    logs: tuple[InputFile, ...]
     depth_topic: str | None = field(default=None, metadata=help_text("topic of the depth images, raw or compressed"))
     label_topic: str | None = field(
         default=None, metadata=help_text("topic of the label images, ids or colours; '' to map without labels")
@@ -96,8 +97,8 @@ class RobotConfig:
     pose_topic: str | None = field(
         default=None, metadata=help_text("topic of the poses: odometry, stamped poses, a path or TF")
     )
-    pose_file: Path | None = field(default=None, metadata=help_text("trajectory file, instead of pose_topic"))
-    pose_times: Path | None = field(
+    pose_file: InputFile | None = field(default=None, metadata=help_text("trajectory file, instead of pose_topic"))
+    pose_times: InputFile | None = field(
         default=None, metadata=help_text("file with the times of a trajectory without times, one a line [s]")
     )
     pose_format: str | None = field(
@@ -172,9 +173,10 @@ class RobotConfig:
     def __post_init__(self) -> None:
         for name in ("logs", "pose_file", "pose_times"):
             value = getattr(self, name)
-            # Paths may be given as text.
-            paths = tuple(map(Path, value)) if isinstance(value, tuple | list) else value and Path(value)
-            object.__setattr__(self, name, (paths,) if name == "logs" and isinstance(paths, Path) else paths)
+            # Paths and URLs may be given as text.
+            given = tuple(map(input_file, value)) if isinstance(value, tuple | list) else value and input_file(value)
+            is_one = name == "logs" and isinstance(given, Path | FileUrl)
+            object.__setattr__(self, name, (given,) if is_one else given)
         if not self.robot_id or "/" in self.robot_id:
             raise ConfigError(f"robot id '{self.robot_id}': every robot needs an id, without '/' in it")
         if self.robot_id == CENTRAL:
@@ -208,7 +210,7 @@ class RobotConfig:
     def _wrong_sources(self) -> Iterator[str]:
         """Problems of files and topics."""
         for path in self.files:
-            problem = path_problem(path)
+            problem = path_problem(path) if isinstance(path, Path) else None
             if problem is not None:
                 yield f"'{str(path)[:100]}': {problem}"
         if not self.logs:
@@ -290,15 +292,18 @@ class RobotConfig:
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) if self.T_team_map is None else self.T_team_map
 
     @property
-    def files(self) -> tuple[Path, ...]:
+    def files(self) -> tuple[InputFile, ...]:
         """All files and folders with the robot's data."""
         return (*self.logs, *(path for path in (self.pose_file, self.pose_times) if path is not None))
 
     def with_paths_from(self, folder: Path) -> Self:
-        """This robot with paths relative to an absolute folder without symbolic links."""
+        """This robot as a result in a folder names its files.
 
-        def path_from(path: Path) -> Path:
-            return Path(os.path.relpath(path.resolve(), folder))
+        Paths are relative to the folder, which is absolute and has no symbolic links; URLs have no credentials.
+        """
+
+        def path_from(path: InputFile) -> InputFile:
+            return path.public() if isinstance(path, FileUrl) else Path(os.path.relpath(path.resolve(), folder))
 
         logs = tuple(map(path_from, self.logs))
         pose_file, pose_times = (None if p is None else path_from(p) for p in (self.pose_file, self.pose_times))

@@ -16,6 +16,7 @@ from typing import Any, Self
 from octoreplay.config.alignment import ON_AIR, AlignmentConfig
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.consensus import FLOW_BITS, ConsensusConfig
+from octoreplay.config.file_url import FileUrl
 from octoreplay.config.network import POSITION_TOPOLOGIES, LinkConfig, NetworkConfig
 from octoreplay.config.output import OutputConfig
 from octoreplay.config.packets import PacketConfig
@@ -76,6 +77,7 @@ class RunConfig:
         for robot_id, number in Counter(ids).items():
             if number > 1:
                 raise ConfigError(f"robots: '{robot_id}' is listed twice")
+        self._check_urls()
         self._check_edges(ids)
         for key, robot_id in _named_robots(self):
             if robot_id not in ids:
@@ -101,6 +103,16 @@ class RunConfig:
         _ = self.effective_sensor  # raises ConfigError
         if self.alignment.is_on_air:
             _check_on_air(self)
+
+    def _check_urls(self) -> None:
+        """Raise ConfigError for two URLs that results, which do not store queries, could not tell apart."""
+        urls = {path for robot in self.robots for path in robot.files if isinstance(path, FileUrl)}
+        for name, number in Counter(map(str, urls)).items():
+            if number > 1:
+                raise ConfigError(
+                    f"robots: {number} URLs of '{name}' differ only in what results do not store (user, password and"
+                    " query); download these files"
+                )
 
     def _check_edges(self, ids: Sequence[str]) -> None:
         """Raise ConfigError for an edge with an unknown robot, to itself, or with an invalid weight."""

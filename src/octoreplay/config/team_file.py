@@ -10,6 +10,7 @@ from typing import Any
 
 from octoreplay.config.class_file import CLASSES_KEYS, class_settings, class_to_mapping
 from octoreplay.config.fields import as_number, is_number
+from octoreplay.config.file_url import FileUrl, InputFile, input_file
 from octoreplay.config.network import LinkConfig, ScheduleEntry
 from octoreplay.config.parameters import PARAMETERS, SECTIONS, coerced
 from octoreplay.config.robot import RobotConfig
@@ -85,14 +86,14 @@ def _robot_from_mapping(entry: Any, folder: Path) -> RobotConfig:
     logs = entry.get("log") or ()
     logs = (logs,) if isinstance(logs, str) else logs
     if not isinstance(logs, list | tuple) or not all(isinstance(log, str) for log in logs):
-        raise ConfigError(f"robot '{robot_id}': log: expects a path or a list of paths")
+        raise ConfigError(f"robot '{robot_id}': log: expects a path or URL, or a list of them")
     sensors = entry.get("sensors") or ()
     if not isinstance(sensors, list | tuple):
         raise ConfigError(f"robot '{robot_id}': sensors: expects a list of sensors, each with its topics")
     values = {key: value for key, value in entry.items() if key not in ("id", "log", "sensors")}
     return RobotConfig(
         robot_id=robot_id,
-        logs=tuple(folder / log for log in logs),
+        logs=tuple(input_file(log, folder) for log in logs),
         sensors=tuple(_sensor_from_mapping(robot_id, sensor) for sensor in sensors),
         **_robot_values(robot_id, values, folder),
     )
@@ -126,7 +127,7 @@ def _robot_values(robot_id: str, entry: Mapping[str, Any], folder: Path) -> dict
             else:
                 if not isinstance(value, str):
                     raise TypeError
-                fields[key] = folder / value if key in ("pose_file", "pose_times") else value
+                fields[key] = input_file(value, folder) if key in ("pose_file", "pose_times") else value
         except (TypeError, ValueError):
             raise ConfigError(f"robot '{robot_id}': {key}: {value!r} has the wrong type") from None
     return fields
@@ -280,7 +281,9 @@ def _entry_to_mapping(entry: ScheduleEntry) -> dict[str, Any]:
 def robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
     """Return the content of one robot's entry in a team file, by key."""
 
-    def text(path: Path) -> str:
+    def text(path: InputFile) -> str:
+        if isinstance(path, FileUrl):
+            return path.url
         return str(path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path)
 
     logs = [text(path) for path in robot.logs]
@@ -289,7 +292,7 @@ def robot_to_mapping(robot: RobotConfig, folder: Path | None) -> dict[str, Any]:
         if item.name in ("robot_id", "logs"):
             continue
         value = getattr(robot, item.name)
-        if isinstance(value, Path):
+        if isinstance(value, Path | FileUrl):
             value = text(value)
         if item.name == "sensors":
             value = [_set_values(sensor) for sensor in robot.sensors] or item.default

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Self
 
 from octoreplay import interrupts
+from octoreplay.config.file_url import without_credentials
 from octoreplay.errors import EARLY, OutputError
 
 SYNC_SECONDS = 5.0
@@ -39,6 +40,10 @@ _UNSUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _log = logging.getLogger(__name__)
 _temporary_paths: dict[Path, int] = {}
 """Temporary files and folders, with the process that made them: a forked process does not remove them."""
+
+
+class InUseError(OutputError):
+    """Another process, or another writer in this one, writes the output."""
 
 
 class OutputFile:
@@ -138,7 +143,7 @@ def locked(path: Path, *, is_folder: bool = False, is_awaited: bool = False) -> 
     A command holds the lock from its beginning with ``is_awaited``; the output then counts for ``mark_written``. Within
     the same process one writer at a time can hold it too. The lock ends with its process, also after a kill. Where the
     file system has no locks, a warning says so once. Raises OutputError, which names the other process, where the
-    output is in use, and where the lock file cannot be written.
+    output is in use (InUseError), and where the lock file cannot be written.
     """
     made = _make_folders(path) if is_folder else []
     lock: _Lock | None = None
@@ -330,7 +335,7 @@ def _place(lock_path: Path) -> str:
 
 
 def _acquire(target: Path, lock_path: Path, *, is_writer: bool) -> _Lock:
-    """Take the lock of an output, or take it once more. Raises OutputError where it is in use."""
+    """Take the lock of an output, or take it once more. Raises InUseError where it is in use."""
     place = _place(lock_path)
     with _mutex:
         lock = _locks.get(place)
@@ -339,7 +344,7 @@ def _acquire(target: Path, lock_path: Path, *, is_writer: bool) -> _Lock:
             if lock.is_exclusive and lock_path.parent == target.parent:
                 _remove_leftovers(target)
         if is_writer and lock.has_writer:
-            raise OutputError(_in_use(target, _own_name()))
+            raise InUseError(_in_use(target, _own_name()))
         lock.has_writer = lock.has_writer or is_writer
         lock.count += 1
     return lock
@@ -363,7 +368,7 @@ def _release(lock: _Lock, *, is_writer: bool) -> None:
 def _open_lock(target: Path, lock_path: Path) -> tuple[int, bool]:
     """Create and lock a lock file; return its descriptor, and False where the file system has no locks.
 
-    Raises OutputError where another process holds the lock.
+    Raises InUseError where another process holds the lock.
     """
     while True:
         with writing(target):
@@ -397,14 +402,14 @@ def _opened(lock_path: Path) -> int:
 
 
 def _lock_file(descriptor: int, target: Path) -> bool:
-    """Lock an open file; False where there are no locks. Raises OutputError where another process holds the lock."""
+    """Lock an open file; False where there are no locks. Raises InUseError where another process holds the lock."""
     try:
         import fcntl
 
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         owner = os.pread(descriptor, 1000, 0).decode(errors="replace").strip() or "another process"
-        raise OutputError(_in_use(target, owner)) from None
+        raise InUseError(_in_use(target, owner)) from None
     except (ImportError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in _UNSUPPORTED:
             raise OutputError(f"{target}: cannot be locked: {error.strerror}") from error
@@ -429,7 +434,7 @@ def _in_use(target: Path, owner: str) -> str:
 def _own_name() -> str:
     """Return the process, host and command line, for the message of other processes."""
     program = Path(sys.argv[0]).name.replace("__main__.py", "octoreplay") or "python"
-    command = shlex.join([program, *sys.argv[1:]])
+    command = without_credentials(shlex.join([program, *sys.argv[1:]]))
     return f"process {os.getpid()} on {socket.gethostname()} ({command[:300]})"
 
 

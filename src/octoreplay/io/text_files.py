@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from octoreplay.config.file_url import FileUrl
+
 
 def json_text(content: Any) -> str:
     """Return dataclasses, mappings, sequences and sets as JSON text; keys keep their order, sets are sorted.
@@ -22,6 +24,8 @@ def json_text(content: Any) -> str:
 
 def _plain(value: Any) -> Any:
     """Return a value in types that JSON supports."""
+    if isinstance(value, Path | FileUrl):
+        return str(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -34,4 +38,4 @@ def _plain(value: Any) -> Any:
         return _plain(value.item())
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
+    return value

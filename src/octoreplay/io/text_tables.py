@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import InputError
+from octoreplay.io.remote_files import local_copy
 from octoreplay.records import Float64Array
 
 _MAX_SECONDS = 1 << 32
 
 
-def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+def rows(path: InputFile) -> Iterator[tuple[str, list[str]]]:
     """Yield ('FILE line N', words) for each row of a text table; comments (#) and empty lines are skipped.
 
     Words are separated by spaces or commas. Raises InputError where the file cannot be read or is not text.
@@ -25,7 +27,7 @@ def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
             yield f"{path} line {number}", fields
 
 
-def comments(path: Path) -> list[str]:
+def comments(path: InputFile) -> list[str]:
     """Return the comment lines (#) above the first row of a text table, without the sign.
 
     Raises InputError where the file cannot be read or is not text.
@@ -38,10 +40,10 @@ def comments(path: Path) -> list[str]:
     return found
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: InputFile) -> str:
     """Text of a file."""
     try:
-        return path.read_text(encoding="utf-8")
+        return local_copy(path).read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

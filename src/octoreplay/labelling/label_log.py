@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from octoreplay import interrupts
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.fingerprint import fingerprint, log_files
 from octoreplay.io.containers.log_reader import LogReader, RawMessage
@@ -87,7 +88,7 @@ class LabelSummary:
 
 
 def label_log(
-    log: Path,
+    log: InputFile,
     output: Path,
     model: Path,
     classes: ClassTable,
@@ -169,7 +170,9 @@ def _nearest(sensor: Int64Array, colour: Int64Array, tolerance_ns: int) -> dict[
     return found
 
 
-def _why_unpaired(path: Path, streams: RobotStreams, sensor: Int64Array, colour: Int64Array, tolerance: float) -> str:
+def _why_unpaired(
+    path: InputFile, streams: RobotStreams, sensor: Int64Array, colour: Int64Array, tolerance: float
+) -> str:
     """Sentence on a sensor and a camera without a common time."""
     spans = []
     for topic, stamps in ((streams.sensor_topic, sensor), (streams.colour_topic, colour)):
@@ -398,7 +401,7 @@ def _write(
 
 
 def _settings(
-    log: Path, model: Path, classes: ClassTable, options: LabelOptions, robots: Sequence[RobotStreams]
+    log: InputFile, model: Path, classes: ClassTable, options: LabelOptions, robots: Sequence[RobotStreams]
 ) -> str:
     """Text that names everything that labels depend on."""
     prints = [fingerprint(file) for file in log_files(log)]

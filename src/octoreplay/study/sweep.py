@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from octoreplay._version import __version__
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import dump_team, load_team_file
 from octoreplay.data_table import Table
@@ -260,7 +261,7 @@ class _CacheKeys:
     """Hashes of everything that a run's numbers depend on; each file is read once."""
 
     def __init__(self) -> None:
-        self._files: dict[tuple[Path, bool], list[Any]] = {}
+        self._files: dict[tuple[InputFile, bool], list[Any]] = {}
 
     def key(self, config: RunConfig, team: str, truth: Path | None) -> str:
         """Hash of a configuration, its logs, the truth and the program's version."""
@@ -269,7 +270,7 @@ class _CacheKeys:
         truths = [] if truth is None else [self._identity(truth.resolve(), whole=whole)]
         return hashlib.sha256(json.dumps([__version__, team, logs, truths]).encode()).hexdigest()
 
-    def _identity(self, path: Path, *, whole: bool) -> list[Any]:
+    def _identity(self, path: InputFile, *, whole: bool) -> list[Any]:
         """Fingerprints of a file or of a folder's files, or the reason if unreadable, which the run reports too."""
         if (path, whole) not in self._files:
             try:

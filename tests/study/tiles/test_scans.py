@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
+from octoreplay.io.containers.fingerprint import fingerprint
 from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.sensor_logs import SensorCounts
 from octoreplay.mapping.octree import brick_keys
@@ -93,9 +96,9 @@ def test_a_pass_over_the_logs_gives_their_frames_and_counts(tmp_path):
     config = resolve(load_team_file(TRIO_TEAM))
     setup = Setup(config, tmp_path, 2)
     assert cast_groups(config, tmp_path, 2) == [(0, 1), (2,)]
-    assert cast_scans(setup, (0, 2), team_start_ns(config), 64, 2) == 2
+    assert cast_scans(setup, (0, 2), team_start_ns(config), 64, 2, {}) == 2
     assert cast_groups(config, tmp_path, 2) == [(1,)]
-    cast_scans(setup, (1,), team_start_ns(config), 64, 2)
+    cast_scans(setup, (1,), team_start_ns(config), 64, 2, {})
     assert cast_groups(config, tmp_path, 2) == []
     with TeamSources(config) as team:
         for index, (source, robot) in enumerate(zip(team.sources, config.robots, strict=True)):
@@ -125,3 +128,14 @@ def test_damaged_files_are_refused(tmp_path):
     files.index.write_bytes(b"other")
     with pytest.raises(InputError, match=r"robot_0\.index: cannot be read: .*--restart"):
         load_index(files.index)
+
+
+def test_a_log_that_differs_from_that_of_the_run_is_refused(tmp_path):
+    config = resolve(load_team_file(TRIO_TEAM))
+    paths = [robot.logs[0] for robot in config.robots]
+    inputs = {str(path.resolve()): fingerprint(path, whole=path == paths[0]) for path in paths}
+    inputs[str(paths[1].resolve())] = dataclasses.replace(inputs[str(paths[1].resolve())], value="0")
+    arguments = (team_start_ns(config), 64, 2, inputs)
+    assert cast_scans(Setup(config, tmp_path, 2), (0, 2), *arguments) == 2
+    with pytest.raises(InputError, match=r"husky_2.mcap: a worker found another version of it than the run began with"):
+        cast_scans(Setup(config, tmp_path, 2), (0, 1), *arguments)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+
+from octoreplay.config.file_url import InputFile
 
 
 class Damage:
@@ -66,7 +67,7 @@ class Damage:
         return (f"{counted(total, 'damaged message')} {_were(total)} skipped",) if total else ()
 
 
-def damage_sentence(path: Path, clauses: Sequence[str], start_ns: int | None, end_ns: int | None) -> str | None:
+def damage_sentence(path: InputFile, clauses: Sequence[str], start_ns: int | None, end_ns: int | None) -> str | None:
     """Return one sentence on the damage of a log with the log times of its first and last message; None if intact."""
     if not clauses:
         return None

@@ -31,6 +31,7 @@ class DamagedDb3Log(BlockLog):
     """A sqlite3 recording that is cut or damaged. Raises InputError where its tables cannot be found."""
 
     def __init__(self, path: Path) -> None:
+        self._recording = path
         self._database = sqlite3.connect(":memory:")
         self._cut_end = b""
         self._is_sound = True
@@ -54,7 +55,7 @@ class DamagedDb3Log(BlockLog):
         """Return the index of blocks of rows, from one pass over row number, topic, time and length of the rows."""
         try:
             self._database.close()
-            self._database = _connect(self.path, self._size)
+            self._database = _connect(self._recording, self._size)
             self._tables = {name for (name,) in self._database.execute(_TABLES)}
         except sqlite3.Error as error:
             raise InputError(f"{self.path}: cannot be read: {error}") from error

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import lz4.frame
 import zstandard
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import InputError
 from octoreplay.io.messages.decoders import Bytes
 
@@ -39,7 +40,7 @@ class ContentBudget:
     Methods raise InputError where the file holds more, which only files made for it do.
     """
 
-    def __init__(self, path: Path, num_bytes: int) -> None:
+    def __init__(self, path: InputFile, num_bytes: int) -> None:
         self._path = path
         self._num_bytes = num_bytes
         self._bytes_left = content_limit(num_bytes)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import BinaryIO
 
 from octoreplay.config.fields import path_problem
+from octoreplay.config.file_url import FileUrl, InputFile
 from octoreplay.errors import InputError
+from octoreplay.io.remote_files import local_copy
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 FOOTER_TAIL = 1 + 8 + 8 + 8 + 4 + len(MCAP_MAGIC)
@@ -19,25 +20,25 @@ EDGE = 1 << 20
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Fingerprint of one input file: path, size [bytes], hashed part, and SHA-256 of this part in hexadecimal.
+    """Fingerprint of one input file: path or URL, size [bytes], hashed part, and SHA-256 of this part in hexadecimal.
 
     ``method`` is ``sha256`` (the whole file), ``mcap-summary`` (summary and footer of an MCAP file) or ``edges`` (the
     first and the last MiB).
     """
 
-    path: Path
+    path: InputFile
     size: int
     method: str
     value: str
 
 
-def fingerprint(path: Path, *, whole: bool = False) -> Fingerprint:
+def fingerprint(path: InputFile, *, whole: bool = False) -> Fingerprint:
     """Return the fingerprint of one file; ``whole`` hashes all of it.
 
-    Raises InputError where the file cannot be read.
+    That of a URL is the fingerprint of its copy. Raises InputError where the file cannot be read.
     """
     try:
-        with path.open("rb") as stream:
+        with local_copy(path).open("rb") as stream:
             size = stream.seek(0, 2)
             if whole:
                 stream.seek(0)
@@ -51,12 +52,12 @@ def fingerprint(path: Path, *, whole: bool = False) -> Fingerprint:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def log_files(log: Path) -> tuple[Path, ...]:
+def log_files(log: InputFile) -> tuple[InputFile, ...]:
     """Return the files of one log: the file itself, or all files of a rosbag2 folder, sorted.
 
     Raises InputError where the folder cannot be read or holds a file with a name that is not UTF-8.
     """
-    if not log.is_dir():
+    if isinstance(log, FileUrl) or not log.is_dir():
         return (log,)
     try:
         files = tuple(sorted(path for path in log.iterdir() if path.is_file()))

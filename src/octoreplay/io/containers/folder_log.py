@@ -14,6 +14,7 @@ from octoreplay.config.yaml_file import load_yaml, read_text
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.decompression import ContentBudget, decompress_message
 from octoreplay.io.containers.log_reader import LogReader, RawMessage, TopicInfo
+from octoreplay.io.remote_files import local_copy
 
 METADATA = "metadata.yaml"
 MAX_NODES = 1_000_000
@@ -136,7 +137,7 @@ class FolderLog(LogReader):
         messages in this range are not read.
         """
         bad: Counter[str] = Counter()
-        budget = ContentBudget(self.path, sum(log.path.stat().st_size for log in self._logs))
+        budget = ContentBudget(self.path, sum(local_copy(log.path).stat().st_size for log in self._logs))
         for message in self._merged(topics, start_ns, stop_ns):
             if not self._compressed_messages:
                 yield message

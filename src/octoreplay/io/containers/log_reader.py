@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import ConfigError, InputError, printable
 from octoreplay.io.containers.damage import Damage, damage_sentence
 from octoreplay.io.messages import decoders
@@ -63,7 +64,7 @@ class RawMessage:
 
     __slots__ = ("_value", "channel", "data", "log", "log_time_ns")
 
-    def __init__(self, log: Path, channel: Channel, log_time_ns: int, data: Bytes) -> None:
+    def __init__(self, log: InputFile, channel: Channel, log_time_ns: int, data: Bytes) -> None:
         self.log = log
         self.channel = channel
         self.log_time_ns = log_time_ns
@@ -159,7 +160,7 @@ class LogReader(ABC):
     """One open log; a context manager. Several iterators over its messages may be in use at a time."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path: InputFile = path
         self._damage = Damage()
 
     @property

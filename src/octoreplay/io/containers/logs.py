@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from octoreplay.config.file_url import FileUrl, InputFile, input_file
 from octoreplay.errors import InputError
 from octoreplay.io.containers import bag_records, mcap_records
 from octoreplay.io.containers.bag_log import BagLog
@@ -15,18 +16,21 @@ from octoreplay.io.containers.decompression import decompress_file
 from octoreplay.io.containers.folder_log import FolderLog, folder_contents
 from octoreplay.io.containers.log_reader import LogReader
 from octoreplay.io.containers.mcap_log import McapLog
+from octoreplay.io.remote_files import local_copy
 from octoreplay.records import FilePath
 
 _MAGIC_LENGTH = 16
 
 
-def open_log(path: FilePath) -> LogReader:
-    """Open one log; the reader is a context manager.
+def open_log(path: FilePath | FileUrl) -> LogReader:
+    """Open one log, of which the path or the URL is given; the reader is a context manager.
 
-    The container is recognised by the first bytes of the file, not by its name. Raises InputError for a path that is
-    missing, empty or not a log.
+    The container is recognised by the first bytes of the file, not by its name. A file with a URL is downloaded first
+    (``local_copy``). Raises InputError for a path that is missing, empty or not a log.
     """
-    path = Path(path)
+    path = input_file(path)
+    if isinstance(path, FileUrl):
+        return _open_copy(local_copy(path), path)
     if path.is_dir():
         try:
             return _open_folder(path)
@@ -91,6 +95,14 @@ def _open_compressed(file: Path, scratch: Path) -> LogReader:
     copy = scratch / file.stem
     try:
         decompress_file(file, copy)
+    except InputError as error:
+        raise InputError(str(error).replace(str(copy), str(file))) from error
+    return _open_copy(copy, file)
+
+
+def _open_copy(copy: Path, file: InputFile) -> LogReader:
+    """Open the copy of a log, which has the name of the original."""
+    try:
         log = open_log(copy)
     except InputError as error:
         raise InputError(str(error).replace(str(copy), str(file))) from error

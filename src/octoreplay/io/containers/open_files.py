@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
+from octoreplay.config.file_url import FileUrl, InputFile
 from octoreplay.errors import InputError
 
 if sys.platform != "win32":
@@ -19,7 +19,7 @@ _OTHER_FILES = 100
 """Files that a process has open besides logs: libraries, results and pipes."""
 
 
-def allow_open_files(logs: Sequence[Path]) -> None:
+def allow_open_files(logs: Sequence[InputFile]) -> None:
     """Raise the process's limit of open files to what a run of some logs needs, one path for each robot and log.
 
     Raises InputError where the operating system does not allow it.
@@ -40,8 +40,10 @@ def allow_open_files(logs: Sequence[Path]) -> None:
     )
 
 
-def _num_files(path: Path) -> int:
+def _num_files(path: InputFile) -> int:
     """Number of files of a log: those in its folder, or one."""
+    if isinstance(path, FileUrl):
+        return 1
     with contextlib.suppress(OSError):
         return max(1, sum(1 for _ in path.iterdir()))
     return 1

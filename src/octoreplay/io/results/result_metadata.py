@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from octoreplay._version import __version__
+from octoreplay.config.file_url import is_url
 from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.team_file import dump_team
 from octoreplay.io.containers.fingerprint import Fingerprint
@@ -44,7 +45,7 @@ def description_of(config: ResolvedRun, inputs: Mapping[str, Fingerprint], folde
         "config": {"team_file": dump_team(used, with_defaults=True)},
         "classes": {"classes": json.dumps(classes)},
         "inputs": {
-            os.path.relpath(path, folder): json.dumps(
+            path if is_url(path) else os.path.relpath(path, folder): json.dumps(
                 {"size": entry.size, "method": entry.method, "fingerprint": entry.value}
             )
             for path, entry in inputs.items()
@@ -87,7 +88,8 @@ def summary_values(summary: RunSummary, config: ResolvedRun, folder: Path) -> di
 
 def _with_relative_paths(summary: RunSummary, config: ResolvedRun, folder: Path) -> RunSummary:
     """Summary with the paths of inputs in its sentences relative to a folder."""
-    files = {str(path): os.path.relpath(path, folder) for robot in config.robots for path in robot.files}
+    paths = (path for robot in config.robots for path in robot.files if isinstance(path, Path))
+    files = {str(path): os.path.relpath(path, folder) for path in paths}
     # Longest first, because a path may begin with another one.
     names = sorted((name for name in files if Path(name).is_absolute()), key=len, reverse=True)
 

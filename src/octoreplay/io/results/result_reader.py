@@ -18,6 +18,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
 from zstandard import ZstdError
 
+from octoreplay.config.file_url import input_file
 from octoreplay.config.run import RunConfig
 from octoreplay.config.team_file import parse_team
 from octoreplay.config.yaml_file import load_json
@@ -130,7 +131,7 @@ class ResultReader:
 
     @property
     def inputs(self) -> dict[str, tuple[int, str, str]]:
-        """Size [bytes], method and fingerprint of each input file by its path, in the order of the robots."""
+        """Size [bytes], method and fingerprint of each input file by path or URL, in the order of the robots."""
         found = {}
         for name, text in self._metadata.get("inputs", {}).items():
             entry = self._json("inputs", dict[str, Any], text)
@@ -301,8 +302,8 @@ class ResultReader:
         """Return a sentence for each input file that is missing or has changed since the run."""
         sentences = []
         for name, stored in self.inputs.items():
-            path = self.path.parent / name
-            if not path.exists():
+            path = input_file(name, self.path.parent)
+            if isinstance(path, Path) and not path.exists():
                 sentences.append(f"{path}: input of {self.path.name} is missing")
                 continue
             now = fingerprint(path, whole=stored[1] == "sha256")

@@ -336,7 +336,7 @@ class ResultWriter:
                         raise OutputError(f"{self.path}: is an input of robot '{robot.robot_id}'; name another output")
 
     def _inputs(self) -> dict[str, Fingerprint]:
-        """Return the fingerprints of all input files by absolute path, in the order of the robots."""
+        """Return the fingerprints of all input files by absolute path or URL, in the order of the robots."""
         whole = self._config.output.hash
         files = [file for robot in self._config.robots for path in robot.files for file in log_files(path)]
         return {str(file.resolve()): fingerprint(file, whole=whole) for file in files}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from octoreplay.config.class_tables.edits import edited
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.resolved import MapFrame, ResolvedRobot
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.time import TimeConfig
@@ -50,7 +50,7 @@ class LogSummary:
     ``error`` is the reason why it cannot be opened; None where it can.
     """
 
-    path: Path
+    path: InputFile
     start_ns: int | None
     end_ns: int | None
     num_messages: int
@@ -110,14 +110,16 @@ class LogDescription:
         return not self.missing and not any(robot.missing for robot in self.robots)
 
 
-def describe(logs: Sequence[Path], *, strict_frames: bool = False, classes: ClassTable | None = None) -> LogDescription:
+def describe(
+    logs: Sequence[InputFile], *, strict_frames: bool = False, classes: ClassTable | None = None
+) -> LogDescription:
     """Return the contents of some logs and what they lack for a run.
 
     ``classes`` is the class table of the run, by default that of the logs. A log that cannot be opened has a summary
     with the reason. Raises ConfigError with ``strict_frames`` where nothing relates the map frames of two robots.
     """
     with LogSurveys() as known:
-        errors: dict[Path, list[str]] = {path: [] for path in logs}
+        errors: dict[InputFile, list[str]] = {path: [] for path in logs}
         found = {path: attempt(functools.partial(known.of, path), errors[path]) for path in logs}
         surveys = [survey for survey in found.values() if survey is not None]
         missing: list[str] = []

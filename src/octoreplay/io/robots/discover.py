@@ -6,9 +6,9 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from pathlib import Path
 
 from octoreplay.config.class_tables.edits import edited
+from octoreplay.config.file_url import FileUrl, input_file
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
@@ -22,7 +22,7 @@ from octoreplay.records import FilePath
 
 
 def discover(
-    logs: Sequence[FilePath],
+    logs: Sequence[FilePath | FileUrl],
     surveys: LogSurveys | None = None,
     *,
     edit: Callable[[Sequence[RobotConfig]], Sequence[RobotConfig]] = list,
@@ -35,7 +35,7 @@ def discover(
     a team file), InputError where a log has no depth image, point cloud or pose.
     """
     with _shared(surveys) as known:
-        groups = groups_in([known.of(Path(path)) for path in logs])
+        groups = groups_in([known.of(input_file(path)) for path in logs])
         robots = edit([group.blank_robot() for group in groups])
         return tuple(
             _resolved(team_member(find_topics(robot, group), group))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.log_reader import TopicInfo
@@ -153,7 +153,7 @@ def group_of(robot: RobotConfig, surveys: tuple[Survey, ...]) -> LogGroup:
     return LogGroup(robot.robot_id, surveys, namespace if namespaces else None)
 
 
-def _names_of_files(paths: Sequence[Path]) -> dict[Path, str]:
+def _names_of_files(paths: Sequence[InputFile]) -> dict[InputFile, str]:
     """Robot name for each file: its stem without '.labelled', or its folder's name where stems repeat."""
     for names in (
         [path.stem.removesuffix(LABELLED_SUFFIX) for path in paths],

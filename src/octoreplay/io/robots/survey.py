@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.io.containers.log_reader import LogReader, TopicInfo, first_whole_message
 from octoreplay.io.containers.logs import open_log
@@ -137,8 +137,8 @@ class Survey:
     frame_trees: dict[Hashable, FrameTree] = field(default_factory=dict)
 
     @property
-    def path(self) -> Path:
-        """Path of the log."""
+    def path(self) -> InputFile:
+        """Path or URL of the log."""
         return self.log.path
 
     @property
@@ -156,7 +156,7 @@ class LogSurveys:
     """Surveys of logs, each of which is opened and surveyed once; a context manager that closes the logs."""
 
     def __init__(self) -> None:
-        self._surveys: dict[Path, Survey] = {}
+        self._surveys: dict[InputFile, Survey] = {}
         self._closing = ExitStack()
 
     def __enter__(self) -> Self:
@@ -167,7 +167,7 @@ class LogSurveys:
     ) -> None:
         self._closing.close()
 
-    def of(self, path: Path) -> Survey:
+    def of(self, path: InputFile) -> Survey:
         """Return the survey of a log, opened at the first call.
 
         Raises InputError where it cannot be opened, and for a result.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.resolved import MapFrame
 from octoreplay.config.robot import RobotConfig
 from octoreplay.errors import ConfigError
@@ -59,7 +59,7 @@ def team_frame_origins(members: Sequence[TeamMember]) -> dict[str, str]:
 
 def _shared_messages(robots: Sequence[RobotConfig]) -> Iterator[str]:
     """Sentences on robots that map the same messages."""
-    owners: dict[tuple[Path, str], str] = {}
+    owners: dict[tuple[InputFile, str], str] = {}
     for view in (view for robot in robots for view in robot.views):
         topic = view.depth_topic or view.cloud_topic
         for key in ((path.resolve(), topic) for path in view.logs if topic):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import InputError
 from octoreplay.geodesy import enu_points
 from octoreplay.io.robots.trajectory_columns import (
@@ -83,7 +83,7 @@ def trajectory(stamps_ns: Int64Array, poses: TrajectoryRows) -> Trajectory:
     return Trajectory(stamps, poses.positions[used], poses.rotations[used])
 
 
-def read_rows(path: Path, pose_format: str | None = None, origin: Sequence[float] | None = None) -> TrajectoryRows:
+def read_rows(path: InputFile, pose_format: str | None = None, origin: Sequence[float] | None = None) -> TrajectoryRows:
     """Return the poses of a trajectory file.
 
     Formats (``POSE_FORMATS``; found by the header and the number of columns where None is given): TUM, EuRoC, KITTI,
@@ -101,7 +101,7 @@ def read_rows(path: Path, pose_format: str | None = None, origin: Sequence[float
     return _in_axes(path, found, origin) if is_geodetic else _near_origin(path, found, origin)
 
 
-def proposed_origin(path: Path, pose_format: str | None = None) -> tuple[float, float, float]:
+def proposed_origin(path: InputFile, pose_format: str | None = None) -> tuple[float, float, float]:
     """Return an origin for the coordinates of a trajectory file: whole kilometres at its begin, and a whole height [m].
 
     Raises InputError as ``read_rows`` does, and for a file without a usable pose.
@@ -114,7 +114,7 @@ def proposed_origin(path: Path, pose_format: str | None = None) -> tuple[float, 
     return round(x, -3), round(y, -3), float(round(z))
 
 
-def _read(path: Path, pose_format: str | None) -> tuple[TrajectoryRows, bool]:
+def _read(path: InputFile, pose_format: str | None) -> tuple[TrajectoryRows, bool]:
     """The poses of a file in its own coordinates; True where these are latitudes and longitudes."""
     table, names = read_table(path)
     matrices = None if names else matrices_of(path, table, pose_format)
@@ -133,7 +133,7 @@ def _read(path: Path, pose_format: str | None) -> tuple[TrajectoryRows, bool]:
     return TrajectoryRows(stamps, positions, rotations, columns.name), columns.is_geodetic
 
 
-def _check_turning(path: Path, found: TrajectoryRows) -> None:
+def _check_turning(path: InputFile, found: TrajectoryRows) -> None:
     """Raise InputError for a track that moves with identity rotations, which positions without rotations have."""
     used = ~np.isnan(found.rotations[:, 0])
     way = np.ptp(found.positions[used], axis=0).max() if used.any() else 0.0
@@ -144,7 +144,7 @@ def _check_turning(path: Path, found: TrajectoryRows) -> None:
         )
 
 
-def _near_origin(path: Path, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
+def _near_origin(path: InputFile, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
     """The rows with positions relative to an origin. Raises InputError for coordinates such as UTM without one."""
     positions = found.positions if origin is None else found.positions - np.asarray(origin)
     largest = np.abs(positions[np.isfinite(positions)]).max(initial=0.0)
@@ -157,7 +157,7 @@ def _near_origin(path: Path, found: TrajectoryRows, origin: Sequence[float] | No
     return dataclasses.replace(found, positions=positions)
 
 
-def _in_axes(path: Path, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
+def _in_axes(path: InputFile, found: TrajectoryRows, origin: Sequence[float] | None) -> TrajectoryRows:
     """The rows with positions east, north and up of an origin instead of latitude, longitude and height."""
     used = np.isfinite(found.positions).all(axis=1)
     if not used.any() or (np.abs(found.positions[used][:, :2]) > (90.0, 360.0)).any():
@@ -176,7 +176,7 @@ def _origin_text(position: Float64Array, digits: int) -> str:
     return f"[{round(x, digits):.{max(digits, 0)}f}, {round(y, digits):.{max(digits, 0)}f}, {round(z):d}]"
 
 
-def read_times(path: Path) -> Int64Array:
+def read_times(path: InputFile) -> Int64Array:
     """Return the times [ns] of a text file with one time per line (``time_to_ns``). Raises InputError with the line."""
     return np.array([time_to_ns(where, fields[0]) for where, fields in rows(path)], dtype=np.int64)
 

@@ -16,8 +16,8 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.errors import InputError
 from octoreplay.io.text_tables import comments, floats, rows, seconds_to_ns
 
@@ -78,7 +78,7 @@ def time_to_ns(where: str, text: str) -> int:
     return int(text) * unit_ns
 
 
-def read_table(path: Path) -> tuple[Rows, list[str]]:
+def read_table(path: InputFile) -> tuple[Rows, list[str]]:
     """Return the rows of a trajectory file and the names of its columns, in lower case; no names without a header.
 
     A header is a first row without any number, or a comment above the first row with a name for each column. Raises
@@ -101,7 +101,7 @@ def read_table(path: Path) -> tuple[Rows, list[str]]:
     return table, names
 
 
-def columns_of(path: Path, table: Rows, names: Sequence[str], pose_format: str | None) -> Columns:
+def columns_of(path: InputFile, table: Rows, names: Sequence[str], pose_format: str | None) -> Columns:
     """Return the columns of a table with a position and a quaternion in each row.
 
     Raises InputError where the rows have different widths, hold no rotation, contradict ``pose_format``, or leave open
@@ -145,7 +145,7 @@ def columns_of(path: Path, table: Rows, names: Sequence[str], pose_format: str |
     )
 
 
-def matrices_of(path: Path, table: Rows, pose_format: str | None) -> tuple[str, Matrices] | None:
+def matrices_of(path: InputFile, table: Rows, pose_format: str | None) -> tuple[str, Matrices] | None:
     """Return the format of a table of matrices and their upper three rows; None for a table of other content.
 
     A row with one matrix has 12 or 16 numbers. Stacked matrices have a row for each of their 3 or 4 rows; in Redwood's

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
+from octoreplay.config.file_url import InputFile
 from octoreplay.config.resolved import ResolvedRun
+from octoreplay.errors import InputError
+from octoreplay.io.containers.fingerprint import Fingerprint, fingerprint, log_files
 from octoreplay.io.robots.read_ahead import ReadAhead
 from octoreplay.io.robots.sensor_logs import SensorLogs
 from octoreplay.io.robots.team_bodies import TeamBodies
@@ -33,13 +36,22 @@ def cast_groups(config: ResolvedRun, folder: Path, num_threads: int) -> list[tup
     return [tuple(left[first : first + size]) for first in range(0, len(left), max(size, 1))]
 
 
-def cast_scans(setup: Setup, robots: Sequence[int], start_ns: int, block_cells: int, num_axes: int) -> int:
+def cast_scans(
+    setup: Setup,
+    robots: Sequence[int],
+    start_ns: int,
+    block_cells: int,
+    num_axes: int,
+    inputs: Mapping[str, Fingerprint],
+) -> int:
     """Cast the rays of all scans of some robots and write the touched cells, as a request to a worker.
 
-    ``start_ns`` is the first stamp of the team; ``block_cells`` and ``num_axes`` are those of ``ScanWriter``. Returns
-    the number of robots. Raises ConfigError, InputError and OutputError.
+    ``start_ns`` is the first stamp of the team; ``block_cells`` and ``num_axes`` are those of ``ScanWriter``;
+    ``inputs`` are the fingerprints of the logs at the begin of the run, by path or URL. Returns the number of robots.
+    Raises ConfigError, InputError and OutputError.
     """
     config = setup.config
+    _check_unchanged([file for index in robots for file in config.robots[index].files], inputs)
     with ExitStack() as stack:
         logs = [stack.enter_context(_open(config, index)) for index in robots]
         sources = [stack.enter_context(ReadAhead(log, start_ns)) for log in logs]
@@ -66,6 +78,20 @@ def cast_scans(setup: Setup, robots: Sequence[int], start_ns: int, block_cells: 
         for log, writer in zip(logs, writers, strict=True):
             writer.finish(log.sensor_counts)
     return len(robots)
+
+
+def _check_unchanged(paths: Iterable[InputFile], inputs: Mapping[str, Fingerprint]) -> None:
+    """Raise InputError where this process finds another version of a log than the run began with."""
+    for file in (file for path in paths for file in log_files(path)):
+        began = inputs.get(str(file.resolve()))
+        if began is None:
+            continue
+        now = fingerprint(file, whole=began.method == "sha256")
+        if (now.size, now.value) != (began.size, began.value):
+            raise InputError(
+                f"{file}: a worker found another version of it than the run began with; run with --restart to start"
+                " from the beginning"
+            )
 
 
 def _open(config: ResolvedRun, index: int) -> SensorLogs:

@@ -20,6 +20,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.config.rules import Exchanged
 from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError, MemoryLimitError
+from octoreplay.io.containers.fingerprint import Fingerprint
 from octoreplay.io.output_file import writing
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.robots.discover import resolve
@@ -144,7 +145,9 @@ def replay_tiles(
         folder = stack.enter_context(work_folder(writer, given_cells, num_axes, restart=restart, resume=resume))
         robots = tuple(robot.with_absolute_paths() for robot in config.robots)
         setup = Setup(dataclasses.replace(config, robots=robots), folder.absolute(), num_threads, room)
-        replayed = _replayed(setup, start_workers, given_cells, num_axes, progress, joins=not result_per_tile)
+        replayed = _replayed(
+            setup, start_workers, given_cells, num_axes, writer.inputs, progress, joins=not result_per_tile
+        )
         workers, scans, stages = stack.enter_context(replayed)
         tiles = tuple(stages)
         maps: JoinedMaps | OtherMaps
@@ -207,6 +210,7 @@ def _replayed(
     start_workers: StartWorkers,
     given_cells: int | None,
     num_axes: int,
+    inputs: Mapping[str, Fingerprint],
     progress: Progress | None,
     *,
     joins: bool,
@@ -219,7 +223,7 @@ def _replayed(
     room: float = setup.memory_limit or math.inf
     while True:
         with start_workers(setup) as workers:
-            scans = _cast_scans(setup, workers, given_cells or BLOCK_CELLS, num_axes, progress)
+            scans = _cast_scans(setup, workers, given_cells or BLOCK_CELLS, num_axes, inputs, progress)
             if joins:
                 check_joining(scans, room)
             num_cells = given_cells or chosen_cells(setup.config, scans, room)
@@ -240,14 +244,15 @@ def _replayed(
 
 
 def _cast_scans(
-    setup: Setup, workers: Workers, block_cells: int, num_axes: int, progress: Progress | None
-) -> list[ScanIndex]:
+    setup: Setup, workers: Workers, block_cells: int, num_axes: int, inputs: Mapping[str, Fingerprint],
+    progress: Progress | None,
+) -> list[ScanIndex]:  # fmt: skip
     """Cast the scans of all robots that an earlier run has not cast; return the index of each robot."""
     config, folder = setup.config, setup.folder
     start_ns, groups = team_start_ns(config), cast_groups(config, folder, setup.num_threads)
     names = [", ".join(config.robots[index].robot_id for index in group) for group in groups]
     requests = [
-        Request(name, cast_scans, (group, start_ns, block_cells, num_axes))
+        Request(name, cast_scans, (group, start_ns, block_cells, num_axes, inputs))
         for name, group in zip(names, groups, strict=True)
     ]
     num_done = len(config.robots) - sum(map(len, groups))
