@@ -93,7 +93,7 @@ def test_a_killed_run_continues(tmp_path: Path, is_settling) -> None:
     assert "an earlier run left these tiles; continue it with --resume" in done.stderr
     done = octoreplay("run", TRIO_TEAM, "-q", "--tiles", 2 * float(EDGE), "--resume", "-o", output)
     assert done.returncode == 2
-    assert "the tiles had another edge; use the same --tiles" in done.stderr
+    assert "the tiles had another form; use the same --tiles and --tiles-z" in done.stderr
     done = octoreplay(*arguments, output, "--resume", "--rule", "gradient")
     assert done.returncode == 2
     assert "cannot be continued: 'gradient' was 'bayes'" in done.stderr
@@ -124,7 +124,7 @@ def test_what_tiles_cannot_do_is_one_sentence(tmp_path: Path, options, sentence)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [["--jobs", "2"], ["--tiles", "20", "--memory-limit", "1GB"]])
+@pytest.mark.parametrize("options", [["--jobs", "2"], ["--tiles-z"], ["--scheduler", "tcp://127.0.0.1:1"]])
 def test_options_that_do_not_go_together(tmp_path: Path, options) -> None:
     assert octoreplay("run", TRIO_TEAM, "-o", tmp_path / "out.mcap", *options).returncode == 2
     assert list(tmp_path.iterdir()) == []

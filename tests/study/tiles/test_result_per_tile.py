@@ -440,4 +440,4 @@ def test_the_command_writes_and_reads_a_result_per_tile(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["points"][0]["known"]
     assert octoreplay("report", output, "-o", tmp_path / "page.html").returncode == 0
     done = octoreplay("run", TRIO_TEAM, "-o", output, "--result-per-tile", "--force")
-    assert (done.returncode, "--result-per-tile needs --tiles" in done.stderr) == (2, True)
+    assert (done.returncode, "--result-per-tile need --tiles" in done.stderr) == (2, True)
