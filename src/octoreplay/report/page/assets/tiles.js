@@ -54,7 +54,7 @@ class Layer {
       this.finest = Math.min(this.finest, levels[row]);
       this.coarsest = Math.max(this.coarsest, levels[row]);
     }
-    // At levels between, a map of few tiles may have no coarser one.
+    // All tiles of the coarsest level.
     this.roots = [...this.tiles.values()].filter((tile) => !this.parent(tile));
   }
 
