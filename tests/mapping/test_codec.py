@@ -85,6 +85,15 @@ def test_delta_replaces_its_bricks(before, after, data):
 
 
 @long
+@examples(40)
+@given(octree=octrees(), level=st.sampled_from([None, 1, 3]), version=st.integers(0, 2**32 - 1))
+def test_a_delta_without_bricks_is_that_of_the_streams(octree, level, version):
+    nothing, packet_format = np.empty(0, np.int64), PacketFormat(zstd_level=level)
+    map_version = MapVersion(origin=1, version=version, base=version // 2)
+    packet = codec.encode_delta(octree, nothing, packet_format=packet_format, map_version=map_version)
+    assert packet == codec.pack(octree, octree.streams(nothing), codec.DELTA, packet_format, map_version)
+
+
 def test_large_uniform_cubes_are_one_leaf():
     octree = octree_of(cube((-64, -64, -64), 64, [-5.0, -5.0]))
     streams = octree.streams()

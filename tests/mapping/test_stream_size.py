@@ -60,6 +60,21 @@ def test_leaves_above_the_chunks_are_merged(side):
     assert meter.update(4).num_leaves == 1
 
 
+def test_the_part_is_that_of_the_last_change():
+    octree = uniform(16, -2.0)
+    meter = StreamMeter(octree)
+    meter.update(0)
+    before = meter.part(64)
+    octree.overwrite(octree_of(cube((3, 3, 3), 1, (1.0, 0.0))), np.arange(1), 2)
+    meter.update(2)
+    after, fresh = meter.part(64), StreamMeter(octree)
+    fresh.update(0)
+    assert after.size != before.size
+    for cells in (64, 32, 64):
+        assert meter.part(cells).size == fresh.part(cells).size
+        assert meter.part(cells).num_levels == fresh.part(cells).num_levels
+
+
 def test_equal_leaves_with_several_values_are_merged_above_the_chunks():
     octree = octree_of(cube((0, 0, 0), 32, (1.0, -2.0)))
     size = StreamMeter(octree).update(0)

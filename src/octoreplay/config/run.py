@@ -149,6 +149,8 @@ class RunConfig:
     def link_config(self, sender: str, receiver: str) -> LinkConfig:
         """Link configuration from one robot to another."""
         values = [changes for a, b, changes in self.link_overrides if (a, b) == (sender, receiver)]
+        if not values:
+            return self.link
         return dataclasses.replace(self.link, **{name: value for changes in values for name, value in changes})
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import struct
 import zlib
 from collections.abc import Iterator
@@ -128,6 +129,8 @@ def encode_delta(
     map_version: MapVersion = MapVersion(),
 ) -> bytes:
     """Return a delta packet with the whole bricks ``indices`` (n,) of a map. Raises ValueError like ``pack``."""
+    if not indices.size:
+        return _packet(octree, _encoded_nothing(octree.num_classes, packet_format), DELTA, packet_format, map_version)
     return pack(octree, octree.streams(indices), DELTA, packet_format, map_version)
 
 
@@ -143,20 +146,48 @@ def pack(
     Raises ValueError where the number format cannot represent the values exactly (``quantise.quantised`` makes values
     that it can), where the base is later than the version, and where a whole map has a base.
     """
-    if map_version.base > (map_version.version if kind == DELTA else 0):
-        raise ValueError(
-            f"a packet of kind {kind} and version {map_version.version} cannot have base {map_version.base}"
-        )
+    return _packet(octree, _encoded(streams, packet_format), kind, packet_format, map_version)
+
+
+@dataclass(frozen=True)
+class _Encoded:
+    """Encoded streams: numbers of words, leaves, masks and own values, and the parts of the payload."""
+
+    sizes: tuple[int, int, int, int]
+    payload: tuple[bytes, ...]
+
+
+def _encoded(streams: TreeStreams, packet_format: PacketFormat) -> _Encoded:
+    """Return the encoded streams. Raises ValueError where the number format cannot represent the values exactly."""
     numbers = [_numbers(values, packet_format) for values in (streams.values, streams.own_values)]
     level = packet_format.zstd_level
     payload = _payload(streams, numbers, is_coded=level is not None)
     if level is not None:
         payload = [_compressed(payload, level)]
+    sizes = streams.words.size, streams.num_leaves, len(streams.masks), streams.own_values.size
+    return _Encoded(sizes, tuple(payload))
+
+
+@functools.lru_cache(16)
+def _encoded_nothing(num_classes: int, packet_format: PacketFormat) -> _Encoded:
+    """Return the encoded streams of no bricks, which robots without changes send in every tick."""
+    return _encoded(SemanticOctree(1.0, num_classes).streams(), packet_format)
+
+
+def _packet(
+    octree: SemanticOctree, encoded: _Encoded, kind: int, packet_format: PacketFormat, map_version: MapVersion
+) -> bytes:
+    """Return the packet of encoded streams. Raises ValueError for a base that does not match the kind or version."""
+    if map_version.base > (map_version.version if kind == DELTA else 0):
+        raise ValueError(
+            f"a packet of kind {kind} and version {map_version.version} cannot have base {map_version.base}"
+        )
+    is_compressed, payload = packet_format.zstd_level is not None, encoded.payload
     fields = (
-        MAGIC, VERSION, kind, CONTENTS.index(packet_format.content), NO_COMPRESSION if level is None else ZSTD,
+        MAGIC, VERSION, kind, CONTENTS.index(packet_format.content), ZSTD if is_compressed else NO_COMPRESSION,
         octree.resolution, map_version.weight, octree.num_classes, map_version.origin, map_version.epoch,
         map_version.version, map_version.base, packet_format.step if packet_format.content == "int8" else 0.0,
-        streams.words.size, streams.num_leaves, len(streams.masks), streams.own_values.size, sum(map(len, payload)),
+        *encoded.sizes, sum(map(len, payload)),
     )  # fmt: skip
     checksum = zlib.crc32(_HEADER.pack(*fields, 0))
     for part in payload:

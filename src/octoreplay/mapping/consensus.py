@@ -272,6 +272,8 @@ def sum_of_evidence(target: SemanticOctree, evidence: Sequence[Evidence], codes:
 
     Either all entries of ``evidence`` have scan counts, or none has. Written bricks get ``revision``.
     """
+    if not codes.size:
+        return
     octrees = [entry.octree for entry in evidence]
     counts = [entry.scan_counts for entry in evidence if entry.scan_counts is not None]
     table, count_table = brick_table(octrees, codes), brick_table(counts, codes)

@@ -183,8 +183,10 @@ class SemanticOctree:
 
     def find_or_add(self, codes: Int64Array) -> Int64Array:
         """Return the index (n,) of each brick of ``codes`` (n,); missing bricks are added without known cells."""
-        self.reserve(bricks=codes.size)
         indices = np.empty(codes.size, np.int64)
+        if not codes.size:
+            return indices
+        self.reserve(bricks=codes.size)
         storage.find_or_add(self.bricks, codes, indices)
         return indices
 

@@ -61,6 +61,9 @@ class StreamMeter:
         self._leaf_values: Float32Array = np.zeros((0, octree.num_classes), np.float32)
         # Number of nodes of each level above the chunks.
         self._num_nodes = [0] * _CHUNK_DEPTH
+        # As of the last change; the part is None until it is asked for.
+        self._size = StreamSize()
+        self._part: StreamPart | None = None
 
     def update(self, since: int) -> StreamSize:
         """Return the size of the lossless stream; bricks with revisions below ``since`` are as at the last call."""
@@ -76,10 +79,11 @@ class StreamMeter:
         stale[self._chunk_of_brick[octree.revisions >= since]] = True
         if stale.any():
             self._measure(stale)
-        totals, leaves = self._sum()
-        totals[0] += sum(self._num_nodes)
-        _merge(totals, leaves, _CHUNK_DEPTH)
-        return StreamSize(*totals.tolist())
+            totals, leaves = self._sum()
+            totals[0] += sum(self._num_nodes)
+            _merge(totals, leaves, _CHUNK_DEPTH)
+            self._size, self._part = StreamSize(*totals.tolist()), None
+        return self._size
 
     def part(self, tile_cells: int) -> StreamPart:
         """Return the size as of the last ``update`` for ``joined_size``; tiles have an edge of ``tile_cells``.
@@ -87,11 +91,14 @@ class StreamMeter:
         ``tile_cells`` is a power of two, and at least CHUNK_CELLS.
         """
         num_levels = (tile_cells // CHUNK_CELLS).bit_length() - 1
+        if self._part is not None and self._part.num_levels == num_levels:
+            return self._part
         totals, leaves = self._sum()
         totals[0] += sum(self._num_nodes[:num_levels])
         leaves = _merge(totals, leaves, num_levels)
         codes = np.unique(self._chunks.codes[self._totals[:, 0] > 0] >> 3 * num_levels)
-        return StreamPart(num_levels, StreamSize(*totals.tolist()), codes, *leaves)
+        self._part = StreamPart(num_levels, StreamSize(*totals.tolist()), codes, *leaves)
+        return self._part
 
     def _measure(self, stale: BoolArray) -> None:
         """Measure the chunks where ``stale`` (m,) is True."""

@@ -10,7 +10,7 @@ import io
 import os
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import NamedTuple, Self
@@ -23,6 +23,7 @@ from octoreplay.records import RobotPose
 from octoreplay.replay.checkpoint import pickled, unpickled
 from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick_counts import TickCounts
+from octoreplay.run_metrics import LinkMetrics
 
 _LENGTH = struct.Struct("<I")
 _MAP = struct.Struct("<IBBHI")
@@ -63,6 +64,7 @@ class WorkFile:
 
     def __init__(self, path: Path, length: int) -> None:
         self._path = path
+        self._graph: CommunicationGraph | None = None
         with writing(path):
             self._file = path.open("r+b" if length else "wb")
             self._file.truncate(length)
@@ -76,8 +78,14 @@ class WorkFile:
             self._file.close()
 
     def write_tick(self, tick: TileTick) -> None:
-        """Write one tick."""
-        data = zstandard.compress(pickled({item.name: getattr(tick, item.name) for item in fields(TileTick)}), 1)
+        """Write one tick; without its graph where that is the one before."""
+        content = {item.name: getattr(tick, item.name) for item in fields(TileTick)}
+        content["graph"] = None if tick.graph is self._graph else tick.graph
+        # Tuples take a fraction of the time of objects.
+        content["counts"] = replace(tick.counts, links=())
+        content["links"] = [tuple(vars(link).values()) for link in tick.counts.links]
+        self._graph = tick.graph
+        data = zstandard.compress(pickled(content), 1)
         with writing(self._path):
             self._file.write(_LENGTH.pack(len(data)) + data)
 
@@ -113,13 +121,18 @@ def read_maps(path: Path, name: str) -> Iterator[StoredMap]:
 
 def read_ticks(path: Path) -> Iterator[TileTick]:
     """Yield the ticks of a tile. Raises InputError for a file that cannot be read."""
+    graph = None
     with _reading(path), path.open("rb") as file:
         while head := file.read(_LENGTH.size):
             (length,) = _LENGTH.unpack(head)
             data = file.read(length)
             if len(data) != length:
                 raise struct.error("it is cut")
-            yield TileTick(**unpickled(zstandard.decompress(data)))
+            content = unpickled(zstandard.decompress(data))
+            graph = content["graph"] = content["graph"] or graph
+            links = tuple(LinkMetrics(*values) for values in content.pop("links"))
+            content["counts"] = replace(content["counts"], links=links)
+            yield TileTick(**content)
 
 
 @contextlib.contextmanager
@@ -127,5 +140,5 @@ def _reading(path: Path) -> Iterator[None]:
     """Turn errors of a work file into InputError."""
     try:
         yield
-    except (OSError, struct.error, zstandard.ZstdError, UnpicklingError, TypeError) as error:
+    except (OSError, struct.error, zstandard.ZstdError, UnpicklingError, TypeError, KeyError) as error:
         raise InputError(f"{path}: cannot be read: {error}; run with --restart to start from the beginning") from error

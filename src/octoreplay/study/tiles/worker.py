@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import pickle
@@ -23,6 +24,9 @@ from octoreplay.errors import InputError, OctoreplayError
 
 MAX_TRIES = 3
 """Number of processes that may die on one request."""
+
+_NUM_ALLOCATIONS = 20_000
+"""Allocations between two collections of garbage: a tick of a large team makes more objects than Python's 700."""
 
 _log = logging.getLogger(__name__)
 
@@ -196,6 +200,7 @@ def serve() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The warnings of a run are those of all its tiles; the parent gives them once.
     logging.disable(logging.WARNING)
+    gc.set_threshold(_NUM_ALLOCATIONS)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     # Whatever else prints must not mix with the answers.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
