@@ -63,6 +63,7 @@ _OF_FRAMES = Comparison(
         DURING,
         SETTLED,
         _ERASED,
+        Measure("known cells", "num_known_cells", None, is_ratio=True),
         KILOBYTES,
     ),
     RIGHT,
