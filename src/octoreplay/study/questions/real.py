@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,9 @@ def _changes(team: RecordedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
 
 
 _CLEAR = Measure("clear contradiction, %", "clear_contradiction", 2, 100.0)
-_ERASED = Measure("own occupied cells made free, %", "erased", 2, 100.0)
+_ERASED = Measure("own occupied made free, %", "erased", 2, 100.0)
+_CELLS = Measure("known cells, 1000", "num_known_cells", None, 1e-3, is_ratio=True)
+_RESULTS = (DURING, SETTLED, _ERASED, _CELLS, KILOBYTES)
 _OF_FRAMES = Comparison(
     "real",
     "frames",
@@ -59,17 +62,14 @@ _OF_FRAMES = Comparison(
     (
         Measure("contradiction, %", "contradiction", 1, 100.0),
         _CLEAR,
-        Measure("different labels, %", "label_disagreement", 2, 100.0),
-        DURING,
-        SETTLED,
-        _ERASED,
-        Measure("known cells", "num_known_cells", None, is_ratio=True),
-        KILOBYTES,
+        Measure("different labels during the logs, %", "label_disagreement_mean", 2, 100.0),
+        *_RESULTS,
     ),
     RIGHT,
     "rule",
     "team",
 )
 _OF_RULES = Comparison("real", "rule", rule_name, (DURING, SETTLED, _ERASED, KILOBYTES), "bayes", "frames", "team")
+_DRAWN = dataclasses.replace(_OF_FRAMES, measures=(_CLEAR, *_RESULTS))
 
-QUESTION = Question(experiment, (_OF_FRAMES, _OF_RULES), {"real.png": Dots(_OF_FRAMES, 22.0)})
+QUESTION = Question(experiment, (_OF_FRAMES, _OF_RULES), {"real.png": Dots(_DRAWN, 19.0)})
