@@ -9,14 +9,13 @@ from typing import Any
 
 from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.repairs import erased_cells
-from octoreplay.report.comparisons import KILOBYTES, Comparison, Measure
+from octoreplay.report.comparisons import KILOBYTES, Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.result import open_result
 from octoreplay.study.experiments import Experiment, Plan, Question
 from octoreplay.study.questions.settings import DURING, LAST_MAPS, SETTLED, rule_name
 from octoreplay.study.recorded_teams import FRAMES, RIGHT, RecordedTeam, frame_errors, recorded_parts
 from octoreplay.study.sweep import Sweep
-from octoreplay.study.task import Row
 
 
 def experiment(recordings: Sequence[Path]) -> Experiment:
@@ -39,7 +38,7 @@ def experiment(recordings: Sequence[Path]) -> Experiment:
 
 def _changes(team: RecordedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     """Frames of a run, their errors, and the share of the robots' own occupied cells that the exchange made free."""
-    with open_result(sweep.result(row)) as result:
+    with open_result(sweep.result(dict(row))) as result:
         robots = result.config.robots
         counts = [erased_cells(result.evidence(robot.robot_id), result.map(robot.robot_id)) for robot in robots]
         right = load_team_file(robots[0].logs[0].parent / f"{RIGHT}.yaml")
@@ -51,6 +50,12 @@ def _changes(team: RecordedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _frames(row: Row) -> str:
+    """Name of a run's frames; teams that lack a robot are not compared with whole ones."""
+    is_whole = int(row["num_robots"]) == int(row["num_recordings"])
+    return str(row["frames"]) if is_whole else f"{row['frames']} in part"
+
+
 _CLEAR = Measure("clear contradiction, %", "clear_contradiction", 2, 100.0)
 _ERASED = Measure("own occupied made free, %", "erased", 2, 100.0)
 _CELLS = Measure("known cells, 1000", "num_known_cells", None, 1e-3, is_ratio=True)
@@ -58,7 +63,7 @@ _RESULTS = (DURING, SETTLED, _ERASED, _CELLS, KILOBYTES)
 _OF_FRAMES = Comparison(
     "real",
     "frames",
-    lambda row: str(row["frames"]),
+    _frames,
     (
         Measure("contradiction, %", "contradiction", 1, 100.0),
         _CLEAR,
