@@ -1,6 +1,6 @@
-"""Tables and figures of the page on experiments: ``python docs/tools/experiment_tables.py`` makes them of the stored runs.
+"""Tables and figures of the page on experiments: ``python docs/tools/experiment_tables.py`` writes them.
 
-The runs are the CSV files in ``docs/experiments/NAME``, those that ``octoreplay experiment NAME`` writes.
+They are made of the stored runs, the CSV files in ``docs/experiments/NAME``, which ``octoreplay experiment NAME`` writes.
 """
 
 from __future__ import annotations

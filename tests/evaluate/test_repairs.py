@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from octoreplay.evaluate.repairs import Repairs, repairs
+from octoreplay.evaluate.repairs import Repairs, erased_cells, repairs
 from octoreplay.evaluate.truth import Truth
 from octoreplay.mapping.octree import keys_to_codes
 from octoreplay.stored_map import StoredMap
@@ -84,3 +84,15 @@ def test_counts_equal_those_over_cells(own, after, surface) -> None:
         num_spread += was_right and not is_right
     expected = Repairs(counts, num_wrong, num_repaired, num_spread)
     assert repairs(stored(own), stored(after), truth_of(surface)) == expected
+
+
+@examples(60)
+@given(
+    own=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
+    after=st.dictionaries(KEYS, st.integers(0, 2), min_size=1, max_size=40),
+)
+def test_erased_cells_equal_those_over_cells(own, after) -> None:
+    occupied = [key for key, label in own.items() if label > 0]
+    # A cell that is unknown after the exchange has the label of the prior, free.
+    num_erased = sum(after.get(key, 0) == 0 for key in occupied)
+    assert erased_cells(stored(own), stored(after)) == (len(occupied), num_erased)

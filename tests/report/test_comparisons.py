@@ -116,6 +116,16 @@ def test_without_a_baseline_a_table_has_intervals_of_means() -> None:
     assert "intervals of means" in table.caption
 
 
+def test_the_caption_has_the_noun_of_what_is_paired() -> None:
+    base = [1.0, 2.0, 3.0, 4.0, 5.0]
+    teams = dataclasses.replace(COMPARED, unit="team")
+    (table,) = tables_of(teams, {"runs": rows({"bayes": base, "flood": base})})
+    assert table.caption.startswith("10 runs of 60 s, 5 teams (seed 0 to 4). ")
+    assert "within each team (" in table.caption
+    (alone,) = tables_of(teams, {"runs": rows({"bayes": base[:1]})})
+    assert alone.caption == "1 runs of 60 s, 1 team (seed 0)."
+
+
 def test_a_missing_number_is_a_dash() -> None:
     found = rows({"bayes": [1.0, 2.0], "local": [math.nan, math.nan]})
     (table,) = tables_of(COMPARED, {"runs": found})

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from octoreplay.config.network import ScheduleEntry
@@ -30,12 +32,13 @@ NUM_RUNS = {
     "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
+    "real": {"real": 9 * 3 * 3},
 }
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
-def test_every_experiment_consists_of_valid_distinct_runs(name: str) -> None:
-    experiment = QUESTIONS[name].experiment(30.0, 2)
+def test_every_experiment_consists_of_valid_distinct_runs(name: str, tmp_path: Path) -> None:
+    experiment = QUESTIONS[name].experiment(*_inputs(name, tmp_path))
     base = load_team_file(PAIR_TEAM)
     counts = {}
     for plan in experiment.plans:
@@ -47,6 +50,16 @@ def test_every_experiment_consists_of_valid_distinct_runs(name: str) -> None:
     assert counts == NUM_RUNS[name]
     # All runs of the last plan differ.
     assert len({str(run.config) + run.team for run in runs}) == len(runs)
+
+
+def _inputs(name: str, folder: Path) -> tuple[Any, ...]:
+    """Parameters of an experiment: a recording, or the length of logs and the number of villages."""
+    if name != "real":
+        return 30.0, 2
+    for index in range(64):
+        (folder / f"frame-{index:06d}.depth.png").touch()
+        np.savetxt(folder / f"frame-{index:06d}.pose.txt", np.eye(4))
+    return ([folder],)
 
 
 def small(**plan) -> Experiment:
@@ -79,7 +92,7 @@ def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
     assert all(0 < row["central_mean_iou"] <= 1 for row in rows)
     # Rule local exchanges nothing.
     assert [row["sent_bytes_per_second"] > 0 for row in rows] == [False, True, False, True]
-    assert "simulating team 2 of 2" in stages
+    assert "writing the logs of team 2 of 2" in stages
     assert stages[-1] == "first: run 4 of 4"
     (merged_file,) = (tmp_path / "teams").glob("seed_1_*/village_1.yaml")
     merged = load_team_file(merged_file)
@@ -113,6 +126,14 @@ def test_a_team_file_gets_the_schedule_and_the_period(tmp_path: Path) -> None:
     assert config.network.schedule == (cut,)
     assert {robot.publish_period for robot in config.robots} == {2.0}
     assert load_team_file(files["cut"].parent / "team.yaml").network.schedule == ()
+
+
+def test_a_team_without_a_team_file_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        SimulatedTeam, "team_file", lambda self, label, folder: None if self.seed else folder / "team.yaml"
+    )
+    rows = run_experiment(small(vary=("rule=local,bayes",), settings={"settle": 0}), tmp_path)["first"]
+    assert [row["team"] for row in rows] == ["village_0"] * 2
 
 
 def test_a_failed_run_fails_the_experiment(tmp_path: Path) -> None:

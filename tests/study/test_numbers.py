@@ -72,6 +72,8 @@ def test_the_numbers_of_a_run_match_its_ticks(run: tuple[RunSummary, tuple[TickM
         assert row[name] == worst[-1]
         assert row[f"{name}_log_end"] == worst[len(log_ticks) - 1] < row[name]
         assert row[f"{name}_mean"] == pytest.approx(np.mean(worst[1 : len(log_ticks)]))
+    for name in ("contradiction", "clear_contradiction", "label_contradiction"):
+        np.testing.assert_equal(row[name], getattr(metrics[-1], name))
     sent = sum(robot.sent_bytes for tick in log_ticks for robot in tick.robots)
     assert row["sent_bytes_per_second"] == pytest.approx(sent / 2 / summary.log_seconds)
     links = [link for tick in metrics for link in tick.links]

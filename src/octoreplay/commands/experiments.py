@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +16,7 @@ from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
     from octoreplay.simulate.settings import SimulationConfig
+    from octoreplay.study.experiments import Experiment
 
 
 @click.group(cls=SuggestingGroup, short_help="Repeat the experiments of the documentation.")
@@ -70,8 +72,50 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     return 0
 
 
+def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> int:
+    """Run the experiment of a question, and write its tables and figures; ``run`` are options of run_experiment."""
+    from octoreplay.io.output_file import mark_written, write_whole
+    from octoreplay.report.comparisons import latex, markdown
+    from octoreplay.report.figures import save_figures
+    from octoreplay.report.tables import made_files
+    from octoreplay.study.experiments import run_experiment
+    from octoreplay.study.questions import QUESTIONS
+
+    question = QUESTIONS[name]
+    with progress_bar(name) as update:
+        found = run_experiment(teams, folder, **run, progress=lambda stage, share: update(share, None, stage))
+    tables = question.tables(found)
+    write_whole(folder / "tables.md", "\n".join(map(markdown, tables)))
+    write_whole(folder / "tables.tex", "\n".join(map(latex, tables)))
+    drawn = {file: drawing.draw(found) for file, drawing in question.drawings.items()}
+    written = {
+        **dict.fromkeys(save_figures(drawn, folder / "figures"), "figure"),
+        folder / "tables.md": "tables",
+        folder / "tables.tex": "tables as LaTeX",
+        **{folder / f"{plan}.csv": "numbers of every run" for plan in found},
+    }
+    mark_written(folder)
+    terminal().show(made_files(written))
+    terminal().give(written=list(written))
+    return 0
+
+
+_parallel_options = (
+    click.option("--jobs", type=click.IntRange(min=1), metavar="N",
+                 help="number of parallel runs on this machine  [default: number of processors]"),
+    click.option("--scheduler", metavar="tcp://HOST:PORT",
+                 help="address of a dask scheduler; runs are executed on its workers instead of this machine"),
+)  # fmt: skip
+
+
+def _folder_argument(name: str) -> Callable[[Any], Any]:
+    """The argument DIR of an experiment."""
+    default = Path(f"octoreplay-{name}")
+    return click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False)
+
+
 def _add_experiment(name: str, duration: float, num_villages: int, question: str, *, is_timed: bool = False) -> None:
-    """Add the command of one experiment; ``is_timed`` if it measures time."""
+    """Add the command of one experiment with simulated teams; ``is_timed`` if it measures time."""
 
     def run_and_report(
         folder: Path,
@@ -81,47 +125,20 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         scheduler: str | None = None,
         teams: Path | None = None,
     ) -> int:
-        from octoreplay.io.output_file import mark_written, write_whole
-        from octoreplay.report.comparisons import latex, markdown
-        from octoreplay.report.figures import save_figures
-        from octoreplay.report.tables import made_files
-        from octoreplay.study.experiments import run_experiment
         from octoreplay.study.questions import QUESTIONS
 
         lock_folder(folder)
-        question = QUESTIONS[name]
-        with progress_bar(name) as update:
-            found = run_experiment(
-                question.experiment(duration, villages), folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler,
-                progress=lambda stage, share: update(share, None, stage),
-            )  # fmt: skip
-        tables = question.tables(found)
-        write_whole(folder / "tables.md", "\n".join(map(markdown, tables)))
-        write_whole(folder / "tables.tex", "\n".join(map(latex, tables)))
-        drawn = {file: drawing.draw(found) for file, drawing in question.drawings.items()}
-        written = {
-            **dict.fromkeys(save_figures(drawn, folder / "figures"), "figure"),
-            folder / "tables.md": "tables",
-            folder / "tables.tex": "tables as LaTeX",
-            **{folder / f"{plan}.csv": "numbers of every run" for plan in found},
-        }
-        mark_written(folder)
-        terminal().show(made_files(written))
-        terminal().give(written=list(written))
-        return 0
+        simulated = QUESTIONS[name].experiment(duration, villages)
+        return _answer(name, simulated, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
 
-    default = Path(f"octoreplay-{name}")
     # Parallel runs would disturb time measurements, and run times hardly depend on the village.
     sweep_options = (
         click.option("--villages", type=click.IntRange(1, 100), default=num_villages, show_default=True,
                      help="number of villages, each with a team of its own"),
-        click.option("--jobs", type=click.IntRange(min=1), metavar="N",
-                     help="number of parallel runs on this machine  [default: number of processors]"),
-        click.option("--scheduler", metavar="tcp://HOST:PORT",
-                     help="address of a dask scheduler; runs are executed on its workers instead of this machine"),
+        *_parallel_options,
     )  # fmt: skip
     options = (
-        click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False),
+        _folder_argument(name),
         click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]"),
         click.option(
             "--teams",
@@ -132,8 +149,8 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         *(() if is_timed else sweep_options),
     )
     text = (
-        f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default: {default}). The"
-        " same command continues after an interruption."
+        f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default:"
+        f" octoreplay-{name}). The same command continues after an interruption."
     )
     command = prints(run_and_report)
     for option in reversed(options):
@@ -151,6 +168,29 @@ _add_experiment("noise", 60.0, 10, "Measure which wrong labels, poses and depths
 _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
 _add_experiment("steps", 60.0, 10, "Vary the step sizes epsilon and gamma.")
 _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
+
+
+@experiment.command(short_help="Measure what agrees on real recordings, before and after 'align'.")
+@_folder_argument("real")
+@click.option("--data", type=existing_path, multiple=True, required=True, metavar="FOLDER",
+              help="recording: a folder of depth images with poses that import-rgbd reads, or a folder of such folders;"
+                   " may be repeated")  # fmt: skip
+@click.option("--teams", type=existing_path, metavar="DIR", help="folder of the teams' logs  [default: DIR/teams]")
+@_parallel_options[0]
+@_parallel_options[1]
+@prints
+def real(folder: Path, data: tuple[Path, ...], teams: Path | None, jobs: int | None, scheduler: str | None) -> int:
+    """Measure what agrees on real recordings, before and after 'align'.
+
+    A recording is split into teams of 2, 3 and 4 robots; the recordings of a folder of folders are one team. Each team
+    is replayed with right frames, with a random one of each robot's own, and with those that 'align' finds. Writes
+    tables and figures into DIR (default: octoreplay-real). The same command continues after an interruption.
+    """
+    from octoreplay.study.questions import QUESTIONS
+
+    lock_folder(folder)
+    recorded = QUESTIONS["real"].experiment(data)
+    return _answer("real", recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig, *, replaces_others: bool = False) -> Path:

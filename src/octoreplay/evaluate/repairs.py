@@ -66,3 +66,14 @@ def repairs(own: StoredMap, after: StoredMap, truth: Truth) -> Repairs:
         int((~was_right & is_right).sum()),
         int((was_right & ~is_right).sum()),
     )
+
+
+def erased_cells(own: StoredMap, after: StoredMap) -> tuple[int, int]:
+    """Return the number of cells that a robot's own evidence calls occupied, and of these that its map calls free.
+
+    ``own`` is the robot's evidence or its map without an exchange, ``after`` its map after an exchange.
+    """
+    own_spans, after_spans = own.octree.spans(), after.octree.spans()
+    codes = own_spans.cells_in(best_labels(own_spans.deviations + np.float32(own.prior)) > 0)
+    labels = best_labels(after_spans.deviations_at(codes) + np.float32(after.prior))
+    return codes.size, int((labels == 0).sum())

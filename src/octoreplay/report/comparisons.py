@@ -97,6 +97,8 @@ class Comparison:
         Label that the others are compared with; None for means alone.
     section : str or None
         Column by whose values the runs are divided into tables; comparisons stay within a table.
+    unit : str
+        Noun for what the column TEAM numbers.
     """
 
     plan: str
@@ -105,6 +107,7 @@ class Comparison:
     measures: tuple[Measure, ...]
     baseline: str | None = None
     section: str | None = None
+    unit: str = "village"
 
     def sections(self, found: Tables) -> dict[str, dict[str, list[Row]]]:
         """Return the rows of each section by label, in the order of first occurrence."""
@@ -169,20 +172,21 @@ def tables_of(comparison: Comparison, found: Tables) -> Iterator[TextTable]:
                     line.append("" if is_itself else measure.change_text(comparison.change(measure, rows, baseline)))
             lines.append(tuple(line))
         every = [row for rows in parts.values() for row in rows]
-        yield TextTable(section, tuple(headings), tuple(lines), _caption(every, has_changes=baseline is not None))
+        caption = _caption(every, comparison.unit, has_changes=baseline is not None)
+        yield TextTable(section, tuple(headings), tuple(lines), caption)
 
 
-def _caption(rows: Sequence[Row], *, has_changes: bool) -> str:
+def _caption(rows: Sequence[Row], unit: str, *, has_changes: bool) -> str:
     """Number of runs, their teams, and what the intervals are."""
     teams = sorted({int(row[TEAM]) for row in rows})
     listed = f"{teams[0]} to {teams[-1]}" if len(teams) > 1 else f"{teams[0]}"
     durations = sorted({round(float(row["log_seconds"])) for row in rows})
     span = f"{durations[0]} s" if len(durations) == 1 else f"{durations[0]} to {durations[-1]} s"
-    noun = "village" if len(teams) == 1 else "villages"
+    noun = unit if len(teams) == 1 else f"{unit}s"
     text = f"{len(rows)} runs of {span}, {len(teams)} {noun} (seed {listed})."
     if len(teams) < MIN_TEAMS:
         return text
-    what = "differences and quotients within each village" if has_changes else "means"
+    what = f"differences and quotients within each {unit}" if has_changes else "means"
     text += f" In brackets: {CONFIDENCE:.0%} bootstrap intervals of {what} ({NUM_RESAMPLES:,} resamples)."
     return text + (" \\*: the interval excludes equality." if has_changes else "")
 

@@ -1,4 +1,4 @@
-"""Experiments: simulated teams, sweeps over them, and what of the runs is compared (docs/experiments.md)."""
+"""Experiments: teams, sweeps over them, and what of the runs is compared (docs/experiments.md)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from octoreplay.config.class_tables.edits import Merges
 from octoreplay.config.network import ScheduleEntry
@@ -27,6 +27,24 @@ from octoreplay.study.teams import simulated_team
 
 TRUTH = "world.npz"
 """File of a simulated team's ground truth, in the folder of its team file."""
+
+
+class ExperimentTeam(Protocol):
+    """Team of an experiment: its logs in a folder, and its team file there."""
+
+    @property
+    def seed(self) -> int:
+        """Number of the team; runs of teams with equal numbers are paired."""
+
+    @property
+    def folder_name(self) -> str:
+        """Name of the folder of the logs. Teams with equal logs share it."""
+
+    def write(self, folder: Path, progress: Callable[[float], None]) -> None:
+        """Write the logs into a folder, unless it holds them; ``progress`` is called with the finished share."""
+
+    def team_file(self, label: str, folder: Path) -> Path | None:
+        """Return the team file of written logs, which may be named ``label``; None where the team has none."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +68,37 @@ class SimulatedTeam:
     schedule: tuple[ScheduleEntry, ...] = ()
     publish_period: float | None = None
 
+    @property
+    def seed(self) -> int:
+        """Seed of the simulation."""
+        return self.simulation.seed
+
+    @property
+    def folder_name(self) -> str:
+        """Name of a simulation's folder: its seed, and a digest of all settings."""
+        digest = hashlib.sha256(json_text(self.simulation).encode()).hexdigest()[:10]
+        return f"seed_{self.seed}_{digest}"
+
+    def write(self, folder: Path, progress: Callable[[float], None]) -> None:
+        """Simulate the team as ``simulated_team`` does."""
+        simulated_team(folder, self.simulation, progress)
+
+    def team_file(self, label: str, folder: Path) -> Path:
+        """Return the team file; it is written beside the simulated one where it differs."""
+        path = folder / "team.yaml"
+        if self == SimulatedTeam(self.simulation):
+            return path
+        base = load_team_file(path)
+        config = dataclasses.replace(
+            base,
+            robots=tuple(dataclasses.replace(robot, publish_period=self.publish_period) for robot in base.robots),
+            merge_classes=self.merge_classes,
+            network=dataclasses.replace(base.network, schedule=self.schedule),
+        )
+        changed = folder / f"{label}.yaml"
+        write_whole(changed, dump_team(config, folder.resolve()))
+        return changed
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -60,7 +109,7 @@ class Plan:
     name : str
         Name of the sweep's folder and CSV file.
     teams : tuple of str
-        Labels of the teams.
+        Labels of the teams. Those without a team file are left out.
     vary, settings
         Variations and settings of ``run_sweep``.
     has_truth : bool
@@ -80,14 +129,14 @@ class Plan:
     has_truth: bool = True
     keep: bool = False
     num_threads: int = 1
-    extra_columns: Callable[[SimulatedTeam, Row, Sweep], Row] = lambda *_: {}
+    extra_columns: Callable[[Any, Row, Sweep], Row] = lambda *_: {}
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Simulated teams by label, and the sweeps over them."""
+    """Teams by label, and the sweeps over them."""
 
-    teams: Mapping[str, SimulatedTeam]
+    teams: Mapping[str, ExperimentTeam]
     plans: tuple[Plan, ...]
 
 
@@ -98,14 +147,15 @@ class Question:
     Attributes
     ----------
     experiment : function
-        Experiment with logs of a length [s] and with a number of villages.
+        Experiment. Its parameters are the length of the logs [s] and the number of villages for simulated teams, and
+        the folders of the recordings for recorded ones.
     comparisons : tuple of Comparison
         Tables.
     drawings : dict
         Figures by file name.
     """
 
-    experiment: Callable[[float, int], Experiment]
+    experiment: Callable[..., Experiment]
     comparisons: tuple[Comparison, ...]
     drawings: Mapping[str, Drawing]
 
@@ -127,13 +177,14 @@ def run_experiment(
     scheduler: str | None = None,
     progress: Stage | None = None,
 ) -> dict[str, list[Row]]:
-    """Simulate the teams, do the sweeps, and return the rows of each plan by its name.
+    """Write the logs of the teams, do the sweeps, and return the rows of each plan by its name.
 
     ``folder`` gets a folder and ``<plan>.csv`` for each plan. ``teams_folder`` (default: ``folder / "teams"``) gets a
-    folder for each simulation; several experiments can share it. Teams and runs that they already hold are used again.
+    folder for the logs of each team; several experiments can share it. Teams and runs that they already hold are used
+    again.
     ``num_jobs`` and ``scheduler`` are those of ``run_sweep`` for plans that do not measure time.
 
-    Raises InputError if a run failed, and the errors of ``simulated_team`` and ``run_sweep``.
+    Raises InputError if a run failed, and the errors of ``ExperimentTeam.write`` and ``run_sweep``.
     """
     check_workers(num_jobs, 1, scheduler)
     show = progress or _ignore_progress
@@ -144,11 +195,12 @@ def run_experiment(
         def show_runs(runs: SweepProgress, name: str = plan.name) -> None:
             show(f"{name}: run {runs.num_finished} of {runs.num_runs}", runs.num_finished / runs.num_runs)
 
+        labels = [label for label in plan.teams if label in teams]
         measures_time = plan.num_threads > 1
         if measures_time:
-            _compile(teams[plan.teams[0]])
+            _compile(teams[labels[0]])
         sweep = run_sweep(
-            [teams[label] for label in plan.teams], plan.vary, folder / plan.name, settings=plan.settings,
+            [teams[label] for label in labels], plan.vary, folder / plan.name, settings=plan.settings,
             truth=TRUTH if plan.has_truth else None, keep=plan.keep, num_threads=plan.num_threads,
             num_jobs=1 if measures_time else num_jobs, scheduler=None if measures_time else scheduler,
             progress=show_runs,
@@ -158,20 +210,20 @@ def run_experiment(
                 f"{folder / plan.name}: {len(sweep.failed)} of {len(sweep.rows)} runs failed, the first with:"
                 f" {row['error']}; the same command repeats them"
             )
-        tables[plan.name] = _rows(experiment, plan, sweep)
+        tables[plan.name] = _rows(plan, {label: experiment.teams[label] for label in labels}, sweep)
         columns = list(dict.fromkeys(name for row in tables[plan.name] for name in row))
         write_whole(folder / f"{plan.name}.csv", table_csv(columns, tables[plan.name]))
     return tables
 
 
-def _rows(experiment: Experiment, plan: Plan, sweep: Sweep) -> list[Row]:
-    """Rows of a sweep with the experiment's team labels, the teams' seeds and the plan's extra columns."""
+def _rows(plan: Plan, teams: Mapping[str, ExperimentTeam], sweep: Sweep) -> list[Row]:
+    """Rows of a sweep over teams by label, with their labels, their seeds and the plan's extra columns."""
     # The team is the outermost variation of a sweep.
-    num_runs = len(sweep.rows) // len(plan.teams)
-    teams = [(label, experiment.teams[label]) for label in plan.teams for _ in range(num_runs)]
+    num_runs = len(sweep.rows) // len(teams)
+    repeated = [entry for entry in teams.items() for _ in range(num_runs)]
     rows = (
-        {**row, "team": label, TEAM: team.simulation.seed, **plan.extra_columns(team, row, sweep)}
-        for (label, team), row in zip(teams, sweep.rows, strict=True)
+        {**row, "team": label, TEAM: team.seed, **plan.extra_columns(team, row, sweep)}
+        for (label, team), row in zip(repeated, sweep.rows, strict=True)
     )
     return [{name: _rounded(value) for name, value in row.items()} for row in rows]
 
@@ -182,35 +234,13 @@ def _rounded(value: Any) -> Any:
 
 
 def _team_files(experiment: Experiment, folder: Path, show: Stage) -> dict[str, Path]:
-    """Team files by label; each distinct simulation is done once."""
-    folders = {team.simulation: folder / _folder_name(team.simulation) for team in experiment.teams.values()}
-    for index, (simulation, team_folder) in enumerate(folders.items()):
-        stage = f"simulating team {index + 1} of {len(folders)}"
-        simulated_team(team_folder, simulation, functools.partial(show, stage))
-    return {label: _team_file(label, team, folders[team.simulation]) for label, team in experiment.teams.items()}
-
-
-def _folder_name(simulation: SimulationConfig) -> str:
-    """Name of a simulation's folder: its seed, and a digest of all settings."""
-    digest = hashlib.sha256(json_text(simulation).encode()).hexdigest()[:10]
-    return f"seed_{simulation.seed}_{digest}"
-
-
-def _team_file(label: str, team: SimulatedTeam, folder: Path) -> Path:
-    """Team file of one team whose logs are in ``folder``; written beside them if it differs from the simulated one."""
-    path = folder / "team.yaml"
-    if team == SimulatedTeam(team.simulation):
-        return path
-    base = load_team_file(path)
-    config = dataclasses.replace(
-        base,
-        robots=tuple(dataclasses.replace(robot, publish_period=team.publish_period) for robot in base.robots),
-        merge_classes=team.merge_classes,
-        network=dataclasses.replace(base.network, schedule=team.schedule),
-    )
-    changed = folder / f"{label}.yaml"
-    write_whole(changed, dump_team(config, folder.resolve()))
-    return changed
+    """Team files by label, of the teams that have one; equal logs are written once."""
+    distinct = {team.folder_name: team for team in experiment.teams.values()}
+    for index, (name, team) in enumerate(distinct.items()):
+        stage = f"writing the logs of team {index + 1} of {len(distinct)}"
+        team.write(folder / name, functools.partial(show, stage))
+    files = {label: team.team_file(label, folder / team.folder_name) for label, team in experiment.teams.items()}
+    return {label: path for label, path in files.items() if path is not None}
 
 
 def _compile(team: Path) -> None:

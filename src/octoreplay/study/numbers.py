@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from octoreplay.evaluate.checks import ticks_to_consensus
-from octoreplay.run_metrics import RunSummary, TickMetrics
+from octoreplay.run_metrics import PAIR_SHARES, RunSummary, TickMetrics
 
 if TYPE_CHECKING:
     from octoreplay.evaluate.records import Evaluation
@@ -21,7 +21,7 @@ RUN_COLUMNS = (
     "label_disagreement", "label_disagreement_log_end", "label_disagreement_mean",
     "agreement", "agreement_log_end", "agreement_mean",
     "agreement_occupied", "agreement_occupied_log_end", "agreement_occupied_mean",
-    "agreement_connected", "agreement_occupied_connected",
+    "agreement_connected", "agreement_occupied_connected", *PAIR_SHARES,
     "contraction", "entropy_bits", "packet_bytes", "octree_bytes", "grid_bytes", "sent_bytes_per_second",
     "delivered_share", "num_leaves", "memory_bytes",
 )  # fmt: skip
@@ -74,6 +74,7 @@ def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str
         "total_distance_peak": summary.peak_total_distance,
         "total_distance_all_peak": summary.peak_total_distance_all,
         **agreements,
+        **{name: getattr(last, name) for name in PAIR_SHARES},
         "contraction": contraction([tick.total_distance for tick in metrics if tick.settling]),
         "entropy_bits": _mean(robot.entropy_bits for robot in last.robots),
         "packet_bytes": summary.mean_packet_bytes,

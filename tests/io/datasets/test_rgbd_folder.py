@@ -97,6 +97,13 @@ def test_seven_scenes_keeps_pixels_poses_and_intrinsics(tmp_path):
     np.testing.assert_array_equal(info.k, [4, 0, 2.5, 0, 4.5, 1.5, 0, 0, 1])
 
 
+def test_poses_can_be_moved_to_another_map_frame(tmp_path):
+    T_map_given = pose(5)
+    import_rgbd(seven_scenes(tmp_path / "in"), tmp_path / "a.mcap", rate=8.0, T_map_given=T_map_given)
+    for index, (_, T) in enumerate(camera_poses(read_messages(tmp_path / "a.mcap"))):
+        np.testing.assert_allclose(T, T_map_given @ pose(index), atol=1e-9)
+
+
 def test_intrinsics_one_folder_up_and_by_option(tmp_path):
     folder = seven_scenes(tmp_path / "scene" / "seq-01", count=1)
     (folder / "camera-intrinsics.txt").rename(folder.parent / "camera-intrinsics.txt")

@@ -65,6 +65,7 @@ def import_rgbd(
     every: int = 1,
     map_frame: str = MAP_FRAME,
     camera_axes: str = "optical",
+    T_map_given: Float64Array | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> ImportSummary:
     """Write the depth images and poses of a folder as one robot's log (MCAP).
@@ -80,6 +81,8 @@ def import_rgbd(
     - ``robot_id`` defaults to the log's file name. ``map_frame`` names the frame of the poses.
     - ``camera_axes`` are those of the poses: 'optical' (x right, y down, z forward), or 'opengl' (x right, y up, z
       backward), as Habitat and Blender write them.
+    - ``T_map_given`` (4, 4) is the transform from the frame of the given poses to the log's map frame (default: the
+      identity).
 
     The same input gives the same bytes. Raises InputError for missing or damaged files, ConfigError for options that do
     not fit, OutputError where the log cannot be written; then no file is left.
@@ -104,6 +107,7 @@ def import_rgbd(
         read_depth=layout.read_depth,
         is_opengl=camera_axes == "opengl",
         distortion=layout.distortion if intrinsics is None else None,
+        T_map_given=np.eye(4) if T_map_given is None else T_map_given,
     )
     with unfinished(output) as partial:
         job.write(partial, robot_id, class_table, progress)
@@ -127,6 +131,7 @@ class _Import:
     read_depth: DepthReader
     is_opengl: bool
     distortion: tuple[float, ...] | None
+    T_map_given: Float64Array
     num_frames: int = 0
     num_labelled: int = 0
     num_without_pose: int = 0
@@ -137,17 +142,17 @@ class _Import:
         """Write the log."""
         T_body_sensor = np.eye(4)
         T_body_sensor[:3, :3] = OPTICAL_IN_BODY
-        T_given_body = (np.diag([1.0, -1.0, -1.0, 1.0]) if self.is_opengl else np.eye(4)) @ inverse(T_body_sensor)
+        T_sensor_body = (np.diag([1.0, -1.0, -1.0, 1.0]) if self.is_opengl else np.eye(4)) @ inverse(T_body_sensor)
         with RobotLogWriter(
             path, robot_id, self.camera, class_table, T_body_sensor=T_body_sensor, start_ns=self.stamps[0],
             map_frame=self.map_frame, distortion=self.distortion,
         ) as log:  # fmt: skip
 
-            def write_frame(index: int, stamp_ns: int, T_map_sensor: Float64Array) -> None:
+            def write_frame(index: int, stamp_ns: int, T_given_sensor: Float64Array) -> None:
                 frame = self.frames[index]
                 depth = self._depth_image(frame.depth_file)
                 label_image = None if frame.label_file is None else self._label_image(frame.label_file)
-                log.write_pose(stamp_ns, T_map_sensor @ T_given_body)
+                log.write_pose(stamp_ns, self.T_map_given @ T_given_sensor @ T_sensor_body)
                 log.write_frame(stamp_ns, depth, label_image)
                 self.num_frames += 1
                 self.num_labelled += label_image is not None

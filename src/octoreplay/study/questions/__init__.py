@@ -12,6 +12,7 @@ from octoreplay.study.questions import (
     noise,
     packets,
     radio,
+    real,
     rules,
     scale,
     steps,
@@ -27,6 +28,7 @@ QUESTIONS: Mapping[str, Question] = MappingProxyType(
         "confidence": confidence.QUESTION,
         "steps": steps.QUESTION,
         "scale": scale.QUESTION,
+        "real": real.QUESTION,
     }
 )
 """Questions by name, in the order of the page."""

@@ -12,7 +12,7 @@ from octoreplay.report.comparisons import Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.result import open_result
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, villages
+from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, rule_name, villages
 from octoreplay.study.sweep import Sweep
 
 _NAMES = ("prob_free", "hit", "miss", "hit_other", "clamp_min", "clamp_max")
@@ -70,11 +70,6 @@ def _model(row: Row) -> str:
     return next(name for name, wanted in _MODELS.items() if wanted == values)
 
 
-def _rule(row: Row) -> str:
-    """Name of a run's rule."""
-    return str(row["rule"])
-
-
 _MODELS_COMPARED = Comparison(
     "sensor_models",
     "sensor model",
@@ -91,7 +86,7 @@ _MODELS_COMPARED = Comparison(
 _RULES_COMPARED = Comparison(
     "calibration",
     "rule",
-    _rule,
+    rule_name,
     (
         MEAN_IOU,
         Measure("calibration error, all cells", "calibration_error"),

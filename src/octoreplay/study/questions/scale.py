@@ -10,7 +10,7 @@ from octoreplay.report.experiment_plots import Curves
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.simulate.world import village_classes
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import LAST_MAPS
+from octoreplay.study.questions.settings import LAST_MAPS, rule_name
 
 _NUM_ROBOTS = (2, 4, 8, 16, 32, 64)
 _RESOLUTIONS = (0.1, 0.15, 0.2, 0.3, 0.5)
@@ -74,11 +74,6 @@ def _graph(row: Row) -> str:
     return f"{row['topology']}, {row['resolution']} m"
 
 
-def _rule(row: Row) -> str:
-    """Name of a run's rule."""
-    return str(row["rule"])
-
-
 _MEASURES = (
     Measure("real-time factor", "realtime_factor", None, is_ratio=True),
     Measure("peak memory, MB", "peak_rss_bytes", None, 1e-6, is_ratio=True),
@@ -96,7 +91,7 @@ QUESTION = Question(
     ),
     {
         "robots.png": Curves("robots", "num_robots", "robots", _MEASURES[:4], _graph, is_log=True),
-        "resolution.png": Curves("resolution", "resolution", "cells [m]", _MEASURES[:4], _rule, is_log=True),
-        "classes.png": Curves("classes", "num_classes", "classes", _MEASURES[:4], _rule, is_log=True),
+        "resolution.png": Curves("resolution", "resolution", "cells [m]", _MEASURES[:4], rule_name, is_log=True),
+        "classes.png": Curves("classes", "num_classes", "classes", _MEASURES[:4], rule_name, is_log=True),
     },
 )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from octoreplay.report.comparisons import KILOBYTES, Measure
+from octoreplay.report.comparisons import KILOBYTES, Measure, Row
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.experiments import SimulatedTeam
 
@@ -29,3 +29,8 @@ def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, S
         f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **settings))
         for seed in range(num_villages)
     }
+
+
+def rule_name(row: Row) -> str:
+    """Name of a run's rule."""
+    return str(row["rule"])
