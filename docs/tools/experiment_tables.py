@@ -1,6 +1,7 @@
 """Tables and figures of the page on experiments: ``python docs/tools/experiment_tables.py`` writes them.
 
-They are made of the stored runs, the CSV files in ``docs/experiments/NAME``, which ``octoreplay experiment NAME`` writes.
+They are made of the stored runs: the CSV files in ``docs/experiments/NAME``, which ``octoreplay experiment NAME``
+writes.
 """
 
 from __future__ import annotations

@@ -51,6 +51,7 @@ def test_curves_have_bands_and_theory_as_a_curve() -> None:
 
     plain = Curves("runs", "step", "step", (SCORE,), rule, "graph").draw({"runs": rows()})
     assert len(plain.axes) == 2
+    assert [axes.get_xlabel() for axes in plain.axes] == ["", "step"]
     for axes in plain.axes:
         assert len(axes.lines) == 2
         assert len(axes.collections) == 2

@@ -87,9 +87,10 @@ class Curves:
         panels = figure.subplots(len(parts), len(self.measures), sharex=True, squeeze=False)
         for line, (section, rows) in zip(panels, parts.items(), strict=True):
             for axes, measure in zip(line, self.measures, strict=True):
-                title = f"{section}: {measure.heading}" if section else measure.heading
-                style(axes, title, self.x_label if line is panels[-1] else "")
+                style(axes, f"{section}: {measure.heading}" if section else measure.heading)
                 self._panel(axes, rows, measure)
+        for axes in panels[-1]:
+            axes.set_xlabel(self.x_label)
         legend_below(figure, panels[0][0])
         return figure
 
