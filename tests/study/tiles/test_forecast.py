@@ -110,9 +110,9 @@ def test_tiles_that_take_more_than_forecast_become_smaller(tmp_path: Path, monke
     config, tried = load_team_file(TRIO_TEAM), []
     replay_logs = run._replay_logs
 
-    def replay(tiles, workers, folder, progress):
+    def replay(tiles, *arguments):
         tried.append(tiles[0].num_cells)
-        stages = replay_logs(tiles, workers, folder, progress)
+        stages = replay_logs(tiles, *arguments)
         if len(tried) == 1:
             raise MemoryLimitError("tile_0_0: takes more")
         return stages
