@@ -32,6 +32,7 @@ NUM_RUNS = {
     "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
+    "frames": {"conditions": 9 * 2, "lengths": 4 * 2},
     "real": {"real": 9 * 3 * 3},
 }
 

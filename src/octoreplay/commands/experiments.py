@@ -168,6 +168,7 @@ _add_experiment("noise", 60.0, 10, "Measure which wrong labels, poses and depths
 _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
 _add_experiment("steps", 60.0, 10, "Vary the step sizes epsilon and gamma.")
 _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
+_add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and which wrong ones it accepts.")
 
 
 @experiment.command(short_help="Measure what agrees on real recordings, before and after 'align'.")

@@ -9,6 +9,7 @@ from octoreplay.study.experiments import Question
 from octoreplay.study.questions import (
     confidence,
     forgetting,
+    frames,
     noise,
     packets,
     radio,
@@ -28,6 +29,7 @@ QUESTIONS: Mapping[str, Question] = MappingProxyType(
         "confidence": confidence.QUESTION,
         "steps": steps.QUESTION,
         "scale": scale.QUESTION,
+        "frames": frames.QUESTION,
         "real": real.QUESTION,
     }
 )
