@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import time
@@ -13,9 +14,22 @@ MEBIBYTE = 1024
 
 
 class Peaks(NamedTuple):
-    """Seconds of a command, peak memory of its process and of its largest child [MiB], peak size of a folder [MB]."""
+    """Costs of a command.
+
+    Attributes
+    ----------
+    seconds : float
+        Time.
+    processor_seconds : float
+        Processor time of all its processes.
+    own, child : float
+        Peak memory of its process, and of its largest child [MiB].
+    folder : float
+        Peak size of a folder [MB].
+    """
 
     seconds: float
+    processor_seconds: float
     own: float
     child: float
     folder: float
@@ -24,6 +38,7 @@ class Peaks(NamedTuple):
 def octoreplay(*words: object, folder: Path | None = None) -> Peaks:
     """Run a command; ``folder`` is watched while it runs. Ends this process where the command fails."""
     started, own, child, size = time.perf_counter(), 0, 0, 0
+    before = _processor_seconds()
     process = subprocess.Popen([sys.executable, "-m", "octoreplay", *map(str, words)], stdout=subprocess.DEVNULL)
     while process.poll() is None:
         own = max(own, _peak(process.pid))
@@ -32,7 +47,14 @@ def octoreplay(*words: object, folder: Path | None = None) -> Peaks:
         time.sleep(0.1)
     if process.returncode:
         raise SystemExit(f"octoreplay {' '.join(map(str, words))} ended with code {process.returncode}")
-    return Peaks(time.perf_counter() - started, own / MEBIBYTE, child / MEBIBYTE, size / 1e6)
+    seconds, used = time.perf_counter() - started, _processor_seconds() - before
+    return Peaks(seconds, used, own / MEBIBYTE, child / MEBIBYTE, size / 1e6)
+
+
+def _processor_seconds() -> float:
+    """Processor time of all processes that this one has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _peak(pid: int) -> int:

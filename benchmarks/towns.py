@@ -65,6 +65,7 @@ def _measure(report: Report, folder: Path, edge: int, robots: int, options: argp
             )
             name = f"{title}: whole run" if tiles == "whole" else f"{title}: tiles of {tiles} m, {jobs} at once"
             report.add(Row(name, found.seconds, "s"))
+            report.add(Row(f"{name}, processor time", found.processor_seconds, "s"))
             report.add(Row(f"{name}, memory of the process that joins", found.own, "MiB"))
             report.add(Row(f"{name}, memory of the largest process of a tile", found.child, "MiB"))
             report.add(Row(f"{name}, work files", found.folder, "MB", note=f"result {result.stat().st_size / 1e6:.0f}"))
