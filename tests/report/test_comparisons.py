@@ -43,6 +43,16 @@ def test_an_interval_holds_the_mean_and_lies_within_the_values(values: list[floa
     assert min(values) - slack <= low <= high <= max(values) + slack
 
 
+def test_tiny_differences_have_intervals_and_those_of_rounding_have_none() -> None:
+    low, high = 0.0, 1e-200
+    found = interval([low, low, low, low, high])
+    assert low <= found.low < found.mean < found.high <= high
+    # A power of two does not change the resamples.
+    assert interval([0.1, 0.2, 0.3, 0.5, 0.9]) == tuple(v / 8 for v in interval([0.8, 1.6, 2.4, 4.0, 7.2]))
+    mean, *ends = interval([1.0, 1.0, 1.0, 1.0, 1.0 + 4e-16])
+    assert ends == [mean, mean]
+
+
 def test_intervals_cover_the_true_mean_as_often_as_they_say() -> None:
     rng = np.random.default_rng(3)
     covered = [interval(rng.normal(1.0, 2.0, 20).tolist()) for _ in range(300)]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.group(cls=SuggestingGroup, short_help="Repeat the experiments of the documentation.")
 def experiment() -> None:
-    """Repeat an experiment: simulate, replay, and write its figures and numbers.
+    """Repeat an experiment: make its teams, replay them, and write figures and numbers.
 
     Complete logs and results of the same settings in the folder are used again.
     """

@@ -14,6 +14,8 @@ NUM_RESAMPLES = 10_000
 MIN_TEAMS = 5
 """Least number of teams with an interval; fewer say too little about others."""
 _SEED = 0
+_ROUNDING = 1e-12
+"""Relative differences up to which values are equal."""
 
 
 class Interval(NamedTuple):
@@ -42,10 +44,13 @@ def interval(values: Sequence[float]) -> Interval:
     mean = float(known.mean())
     if known.size < MIN_TEAMS:
         return Interval(mean, math.nan, math.nan)
-    if np.ptp(known) == 0.0:
+    spread = float(np.ptp(known))
+    if spread <= _ROUNDING * float(np.abs(known).max()):
         return Interval(mean, mean, mean)
+    # Powers of small differences underflow; a power of two scales without rounding.
+    unit = 2.0 ** math.floor(math.log2(spread))
     found = bootstrap(
-        (known,), np.mean, n_resamples=NUM_RESAMPLES, confidence_level=CONFIDENCE, method="BCa",
+        (known / unit,), np.mean, n_resamples=NUM_RESAMPLES, confidence_level=CONFIDENCE, method="BCa",
         rng=np.random.default_rng(_SEED), vectorized=True,
     ).confidence_interval  # fmt: skip
-    return Interval(mean, float(found.low), float(found.high))
+    return Interval(mean, float(found.low) * unit, float(found.high) * unit)
