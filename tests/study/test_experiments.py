@@ -76,7 +76,10 @@ def small(**plan) -> Experiment:
     return Experiment(teams, (Plan("first", tuple(teams), **plan),))
 
 
-def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
+def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    # A relative folder, as the default of the command is.
+    folder = Path("octoreplay-small")
     stages: list[str] = []
     experiment = small(
         vary=("rule=local,bayes",), settings={"settle": 0}, keep=True,
@@ -84,7 +87,7 @@ def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
             "seed_of_team": team.simulation.seed, "is_kept": sweep.result(row).is_file(),
         },
     )  # fmt: skip
-    rows = run_experiment(experiment, tmp_path, progress=lambda stage, _: stages.append(stage))["first"]
+    rows = run_experiment(experiment, folder, progress=lambda stage, _: stages.append(stage))["first"]
     assert [(row["team"], row["rule"]) for row in rows] == [
         ("village_0", "local"), ("village_0", "bayes"), ("village_1", "local"), ("village_1", "bayes"),
     ]  # fmt: skip
@@ -95,15 +98,15 @@ def test_a_small_experiment_runs_from_beginning_to_end(tmp_path: Path) -> None:
     assert [row["sent_bytes_per_second"] > 0 for row in rows] == [False, True, False, True]
     assert "writing the logs of team 2 of 2" in stages
     assert stages[-1] == "first: run 4 of 4"
-    (merged_file,) = (tmp_path / "teams").glob("seed_1_*/village_1.yaml")
+    (merged_file,) = (folder / "teams").glob("seed_1_*/village_1.yaml")
     merged = load_team_file(merged_file)
     assert merged.classes is not None
     assert merged.classes.names[0] == "plant"
     assert merged.classes.num_classes == 7
 
-    stored = list(csv.DictReader((tmp_path / "first.csv").read_text(encoding="utf-8").splitlines()))
+    stored = list(csv.DictReader((folder / "first.csv").read_text(encoding="utf-8").splitlines()))
     assert [{name: str(value) for name, value in row.items()} for row in rows] == stored
-    again = run_experiment(experiment, tmp_path)["first"]
+    again = run_experiment(experiment, folder)["first"]
     assert str(again) == str(rows)
 
 

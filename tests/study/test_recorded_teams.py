@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -40,6 +40,7 @@ def numbers(part: Part) -> list[int]:
 
 
 @examples(200)
+@example(num_images=291, num_robots=2, overlap=0.0)
 @given(
     num_images=st.integers(64, 3000),
     num_robots=st.integers(2, 4),

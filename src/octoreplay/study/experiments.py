@@ -188,7 +188,8 @@ def run_experiment(
     """
     check_workers(num_jobs, 1, scheduler)
     show = progress or _ignore_progress
-    teams = _team_files(experiment, teams_folder or folder / "teams", show)
+    # Team files that are written beside the logs name them relative to an absolute folder.
+    teams = _team_files(experiment, (teams_folder or folder / "teams").resolve(), show)
     tables: dict[str, list[Row]] = {}
     for plan in experiment.plans:
 

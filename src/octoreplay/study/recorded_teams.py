@@ -162,7 +162,8 @@ def _split(sequence: Path, num_images: int, num_robots: int, overlap: float) -> 
         start = round(index * (1.0 - overlap) * length)
         # The remainder of an image's number says which robot may have it.
         first = start + (index - start) % every
-        yield Part(sequence.resolve(), first, max(first, round(start + length) - 1), every)
+        end = min(round(start + length), num_images)
+        yield Part(sequence.resolve(), first, max(first, end - 1), every)
 
 
 def frame_errors(right: RunConfig, found: RunConfig) -> tuple[float, float]:
