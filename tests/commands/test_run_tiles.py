@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
 from octoreplay.io.results.result_reader import ResultReader
-from support.command_line import octoreplay, octoreplay_process, started
+from support.command_line import command, octoreplay, octoreplay_process, started
 from support.fixture_paths import TRIO, TRIO_TEAM
 from support.long_suite import long
 
@@ -101,6 +103,25 @@ def test_a_killed_run_continues(tmp_path: Path, is_settling) -> None:
     assert done.returncode == 0, done.stderr
     assert output.read_bytes() == (tmp_path / "whole.mcap").read_bytes()
     assert not folder.exists()
+
+
+@long
+def test_a_worker_that_cannot_write_ends_the_run_with_one_sentence(tmp_path: Path) -> None:
+    arguments = ("run", TRIO_TEAM, "-q", "--tiles", EDGE, "-o", tmp_path / "out.mcap")
+    # Files of more than 100 KiB fail, as on a full disk: those with the maps of a tile, not those with its scans.
+    words = ["bash", "-c", 'ulimit -f 100 && exec "$0" "$@"', *command(*arguments)]
+    done = subprocess.run(words, text=True, capture_output=True, check=False, timeout=200)
+    assert done.returncode == 1
+    *_, sentence = done.stderr.strip().splitlines()
+    assert re.fullmatch(
+        r"error: .*/out\.tiles/tile_\S+: cannot be written: File too large; the finished parts are in .*/out\.tiles;"
+        r" --resume continues the run",
+        sentence,
+    )
+    assert not (tmp_path / "out.mcap").exists()
+    assert octoreplay(*arguments, "--resume").returncode == 0
+    assert octoreplay(*arguments[:-1], tmp_path / "whole.mcap").returncode == 0
+    assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "whole.mcap").read_bytes()
 
 
 @pytest.mark.parametrize(
