@@ -140,14 +140,10 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
     options = (
         _folder_argument(name),
         click.option("--duration", type=float, default=duration, show_default=True, help="length of the logs [s]"),
-        click.option(
-            "--teams",
-            type=existing_path,
-            metavar="DIR",
-            help="folder of the simulated teams, which experiments can share  [default: DIR/teams]",
-        ),
+        click.option("--teams", type=existing_path, metavar="DIR",
+                     help="folder of the simulated teams, which experiments can share  [default: DIR/teams]"),
         *(() if is_timed else sweep_options),
-    )
+    )  # fmt: skip
     text = (
         f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default:"
         f" octoreplay-{name}). The same command continues after an interruption."

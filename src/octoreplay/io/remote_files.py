@@ -124,8 +124,7 @@ def _download(file: FileUrl, system: Any, version: _Version, copy: Path) -> None
         _log.info("downloading %s%s", file, "" if version.size is None else f" ({version.size:,} bytes)")
         callback = Callback(hooks={"progress": lambda size, value, **_: progress(value, version.size or size)})
         with _quiet(), _store_errors(file, callback):
-            # The name of the object must not be taken for a pattern or a chain of stores.
-            system.get_file(system._strip_protocol(file.url), str(temporary), callback=callback)  # noqa: SLF001
+            system.get_file(_object_name(file, system), str(temporary), callback=callback)
             now = _version(file, system)
         found = temporary.stat().st_size
         if now != version:
@@ -180,10 +179,17 @@ def _options(scheme: str) -> Mapping[str, Any]:
     return {name: {"trust_env": True, "timeout": limits}}
 
 
+def _object_name(file: FileUrl, system: Any) -> str:
+    """Name of an object in its store."""
+    # Public functions of fsspec would take the URL for a pattern or a chain of stores.
+    name: str = system._strip_protocol(file.url)  # noqa: SLF001 - fsspec's own way to name an object
+    return name
+
+
 def _version(file: FileUrl, system: Any) -> _Version:
     """Present version of an object. Raises InputError for a folder."""
     system.invalidate_cache()
-    info = system.info(system._strip_protocol(file.url))  # noqa: SLF001
+    info = system.info(_object_name(file, system))
     if info.get("type") == "directory":
         raise InputError(
             f"{file}: is a folder; give the URL of one file (.mcap, .bag, .db3), or mount the store to read a rosbag2"

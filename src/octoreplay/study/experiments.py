@@ -181,8 +181,7 @@ def run_experiment(
 
     ``folder`` gets a folder and ``<plan>.csv`` for each plan. ``teams_folder`` (default: ``folder / "teams"``) gets a
     folder for the logs of each team; several experiments can share it. Teams and runs that they already hold are used
-    again.
-    ``num_jobs`` and ``scheduler`` are those of ``run_sweep`` for plans that do not measure time.
+    again. ``num_jobs`` and ``scheduler`` are those of ``run_sweep`` for plans that do not measure time.
 
     Raises InputError if a run failed, and the errors of ``ExperimentTeam.write`` and ``run_sweep``.
     """

@@ -1,18 +1,16 @@
-"""Which prior, sensor model and clamps give probabilities that can be trusted, and the best maps?"""
+"""Priors, sensor models, clamps and rules: calibration of their probabilities, and quality of their maps."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from octoreplay.evaluate.evaluation import truth_beside_logs
 from octoreplay.evaluate.temperature import calibrating_temperature
-from octoreplay.evaluate.truth import load_truth
 from octoreplay.records import CENTRAL
 from octoreplay.report.comparisons import Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.result import open_result
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, rule_name, villages
+from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, rule_name, village_of, villages
 from octoreplay.study.sweep import Sweep
 
 _NAMES = ("prob_free", "hit", "miss", "hit_other", "clamp_min", "clamp_max")
@@ -58,10 +56,7 @@ def experiment(duration: float, num_villages: int) -> Experiment:
 def _temperature(_: SimulatedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     """Temperature that calibrates the centralised map, and the negative log likelihood with it and without."""
     with open_result(sweep.result(dict(row))) as result:
-        world = truth_beside_logs(result.path)
-        assert world is not None
-        truth = load_truth(world, result.class_table, result.config.map.resolution)
-        return calibrating_temperature(result.map(CENTRAL), truth)._asdict()
+        return calibrating_temperature(result.map(CENTRAL), village_of(result))._asdict()
 
 
 def _model(row: Row) -> str:

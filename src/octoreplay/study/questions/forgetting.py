@@ -1,4 +1,4 @@
-"""What does a robot keep that is cut off, and what does a team keep that separates and meets again?"""
+"""Knowledge that a robot keeps after it is cut off, and a team that separates and meets again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which frames of simulated teams does ``align`` find, and which wrong ones does it accept?"""
+"""Frames of simulated teams that ``align`` finds, and wrong ones that it accepts."""
 
 from __future__ import annotations
 

@@ -1,18 +1,16 @@
-"""Which wrong labels, poses and depths does the exchange repair, and which does it spread?"""
+"""Wrong labels, poses and depths that the exchange repairs, and those that it spreads."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from octoreplay.evaluate.evaluation import truth_beside_logs
 from octoreplay.evaluate.repairs import repairs
-from octoreplay.evaluate.truth import load_truth
 from octoreplay.report.comparisons import Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.result import open_result
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU
+from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, village_of
 from octoreplay.study.sweep import Sweep
 
 _CLEAN: dict[str, Any] = {"label_noise": 0.0}
@@ -46,9 +44,7 @@ def experiment(duration: float, num_villages: int) -> Experiment:
 def _changes(team: SimulatedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     """Name of a team's noise, and the shares of its cells that are wrong, repaired and spoiled (``Repairs``)."""
     with open_result(sweep.result({**row, "rule": "local"})) as own, open_result(sweep.result(dict(row))) as after:
-        world = truth_beside_logs(own.path)
-        assert world is not None
-        truth = load_truth(world, own.class_table, own.config.map.resolution)
+        truth = village_of(own)
         counts = [repairs(own.map(robot_id), after.map(robot_id), truth) for robot_id in own.robots]
     num_cells, *changes = (sum(count) for count in zip(*counts, strict=True))
     shares = dict(zip(("wrong", "repaired", "spread"), (change / num_cells for change in changes), strict=True))

@@ -1,4 +1,4 @@
-"""What do packet formats cost and save, with six robots and with sixteen?"""
+"""Packet formats: bytes and agreement, with six robots and with sixteen."""
 
 from __future__ import annotations
 

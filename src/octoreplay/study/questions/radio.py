@@ -1,4 +1,4 @@
-"""What does each fault of a poor radio cost, alone and with the others?"""
+"""Faults of a radio: the cost of each alone and of all together."""
 
 from __future__ import annotations
 

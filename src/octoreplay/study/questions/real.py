@@ -1,4 +1,4 @@
-"""What agrees on real recordings, at what bytes and with what contradiction, before and after ``align``?"""
+"""Agreement, bytes and contradiction on real recordings, before and after ``align``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which rule, on which graph?"""
+"""Consensus rules on a complete graph and within a radio range."""
 
 from __future__ import annotations
 

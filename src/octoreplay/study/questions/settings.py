@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from octoreplay.evaluate.evaluation import truth_beside_logs
+from octoreplay.evaluate.truth import Truth, load_truth
 from octoreplay.report.comparisons import KILOBYTES, Measure, Row
+from octoreplay.result import Result
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.experiments import SimulatedTeam
 
@@ -29,6 +32,13 @@ def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, S
         f"village_{seed}": SimulatedTeam(SimulationConfig(duration=duration, seed=seed, **settings))
         for seed in range(num_villages)
     }
+
+
+def village_of(result: Result) -> Truth:
+    """Truth of a result of a simulated team: the world beside its logs."""
+    world = truth_beside_logs(result.path)
+    assert world is not None
+    return load_truth(world, result.class_table, result.config.map.resolution)
 
 
 def rule_name(row: Row) -> str:

@@ -1,4 +1,4 @@
-"""How do the steps epsilon and gamma act, and does the bound on epsilon hold?"""
+"""Effect of the steps epsilon and gamma, and the bound on epsilon."""
 
 from __future__ import annotations
 

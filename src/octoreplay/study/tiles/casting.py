@@ -47,8 +47,8 @@ def cast_scans(
     """Cast the rays of all scans of some robots and write the touched cells, as a request to a worker.
 
     ``start_ns`` is the first stamp of the team; ``block_cells`` and ``num_axes`` are those of ``ScanWriter``;
-    ``inputs`` are the fingerprints of the logs at the begin of the run, by path or URL. Returns the number of robots.
-    Raises ConfigError, InputError and OutputError.
+    ``inputs`` are the fingerprints of the logs at the beginning of the run, by path or URL. Returns the number of
+    robots. Raises ConfigError, InputError and OutputError.
     """
     config = setup.config
     _check_unchanged([file for index in robots for file in config.robots[index].files], inputs)
