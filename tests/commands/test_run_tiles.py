@@ -8,13 +8,12 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 
 from octoreplay.io.results.result_reader import ResultReader
-from support.command_line import command, octoreplay, octoreplay_process, started
+from support.command_line import command, octoreplay, octoreplay_process, started, wait_for
 from support.fixture_paths import TRIO, TRIO_TEAM
 from support.long_suite import long
 
@@ -34,13 +33,6 @@ def workers_of(pid: int) -> list[int]:
             if parent == pid and b"import serve" in words:
                 found.append(int(folder.name))
     return found
-
-
-def wait_for(condition, seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 @long

@@ -42,7 +42,8 @@ def dask(tmp_path: Path) -> Iterator[Cluster]:
 
     try:
         scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
-        wait_for(file.exists)
+        # The scheduler creates its file before it writes it.
+        wait_for(lambda: file.exists() and file.read_text().endswith("}"))
         address = json.loads(file.read_text())["address"]
         workers = [start("worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2)]
         yield Cluster(address, scheduler, workers)
