@@ -17,9 +17,9 @@ from support.octree_factory import cube, octree_of
 EMPTY = {}
 
 
-def _compare(maps, oracle, links=((0, 1),), prior=0.0):
+def _compare(maps, oracle, links=((0, 1),), prior=0.0, **options):
     octrees = [octree_of(cells) for cells in maps]
-    return MapComparer(len(maps), prior).compare(octrees, octree_of(oracle), links, 0)
+    return MapComparer(len(maps), prior).compare(octrees, octree_of(oracle), links, 0, **options)
 
 
 def test_distances_by_hand():
@@ -147,21 +147,25 @@ def _dense(maps, oracle, prior):
     return dense[:-1], known, dense[-1]
 
 
-def _reference(maps, oracle, prior, links):
+def _reference(maps, oracle, prior, links, num_averaged=None):
     """Metrics of the reference."""
     dense, known, of_oracle = _dense(maps, oracle, prior)
-    return team_metrics(dense, known, of_oracle, links, 0.0, published=dense, least_tolerance=0.0)
+    labelled = dense.copy()
+    for values, count in zip(labelled, num_averaged or [1] * len(maps), strict=True):
+        values[:, 1:] += prior / count - prior
+    return team_metrics(dense, known, of_oracle, links, 0.0, published=dense, least_tolerance=0.0, labelled=labelled)
 
 
 @examples(40)
-@given(seed=st.integers(0, 10_000), prior=st.sampled_from([0.0, -1.2]))
-def test_random_maps_against_the_reference(seed, prior):
+@given(seed=st.integers(0, 10_000), prior=st.sampled_from([0.0, -1.2, 0.8]), is_mean=st.booleans())
+def test_random_maps_against_the_reference(seed, prior, is_mean):
     rng = np.random.default_rng(seed)
     maps = [_random_cells(rng) for _ in range(rng.integers(1, 5))]
     oracle = {key: np.sum([cells.get(key, np.zeros(2)) for cells in maps], axis=0) for key in set().union(*maps)}
     links = [pair for pair in itertools.combinations(range(len(maps)), 2) if rng.random() < 0.6]
-    found = _compare(maps, oracle, links, prior)
-    expected = _reference(maps, oracle, prior, links)
+    num_averaged = rng.integers(1, 7, len(maps)).tolist() if is_mean else None
+    found = _compare(maps, oracle, links, prior, num_averaged=num_averaged)
+    expected = _reference(maps, oracle, prior, links, num_averaged)
     assert found.total_distance == pytest.approx(expected.total_distance, rel=1e-5)
     assert found.total_distance_all == pytest.approx(expected.total_distance_all, rel=1e-5, abs=1e-9)
     assert found.num_known_cells == expected.num_known_cells
@@ -170,6 +174,22 @@ def test_random_maps_against_the_reference(seed, prior):
     assert found.label_disagreement == pytest.approx(expected.label_disagreement)
     assert found.agreement.tolist() == pytest.approx(expected.agreement)
     assert found.agreement_occupied.tolist() == pytest.approx(expected.agreement_occupied)
+
+
+def test_the_mean_of_robots_has_the_labels_of_their_posterior():
+    sums = {(0, 0, 0): [6.0, -1.0], (1, 0, 0): [2.0, -1.0]}
+    mean = {key: [value / 6 for value in values] for key, values in sums.items()}
+    found = _compare([mean, mean], sums, prior=-3.0, num_averaged=[6, 6])
+    assert (found.agreement.tolist(), found.agreement_occupied.tolist()) == ([1.0, 1.0], [1.0, 1.0])
+    assert _compare([mean, mean], sums, prior=-3.0).agreement_occupied.tolist() == [0.0, 0.0]
+
+
+def test_another_number_of_robots_compares_all_bricks_again():
+    sums = {(0, 0, 0): [6.0, -1.0]}
+    octrees, comparer = [octree_of({(0, 0, 0): [1.0, -1 / 6]})], MapComparer(1, -3.0)
+    oracle = octree_of(sums)
+    assert comparer.compare(octrees, oracle, [], 0, num_averaged=[6]).agreement.tolist() == [1.0]
+    assert comparer.compare(octrees, oracle, [], 5, num_averaged=[2]).agreement.tolist() == [0.0]
 
 
 @examples(25)

@@ -35,10 +35,18 @@ def flow_step(largest: float | Float64Array, flow_bits: int) -> Float64Array:
     return np.where(largest > 0.0, np.ldexp(1.0, exponent - 1 - flow_bits), 0.0)
 
 
+def link_bits(weight: float) -> int:
+    """Return the least b >= 0 with 2^(b + 3) w >= 1: additional bits of a link with w = 2 epsilon A_ij, as float32."""
+    bits = 0
+    while 2.0 ** (bits + 3) * float(np.float32(weight)) < 1.0:
+        bits += 1
+    return bits
+
+
 def flow_steps(own: Float64Array, other: Float64Array, flow_bits: int, quantum: float) -> Float64Array:
     """Return e (M, 1) of two published maps: max(2^(floor(log2 m) - flow_bits), quantum), m their largest |log-odds|.
 
-    It is ``quantum`` where both maps are 0.
+    ``flow_bits`` are those of the link. It is ``quantum`` where both maps are 0.
     """
     largest = np.maximum(np.abs(own), np.abs(other)).max(axis=-1, keepdims=True)
     return np.maximum(flow_step(largest, flow_bits), quantum)

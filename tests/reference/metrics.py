@@ -48,15 +48,18 @@ def team_metrics(
     *,
     published: Float64Array,
     least_tolerance: float,
+    labelled: Float64Array | None = None,
 ) -> TwinMetrics:
     """Return all metrics of one tick.
 
     ``published`` (N, M, K) are the maps before the iterations. ``least_tolerance`` of ties is N times the largest
-    difference of two neighbours at rest, N quantum / (2 epsilon A_min); 0 without flows.
+    difference of two neighbours at rest, N quantum / (2 epsilon A_min); 0 without flows. ``labelled`` (N, M, K) are the
+    posteriors of the maps, divided by the numbers of robots whose mean they are; default: ``maps``.
     """
     robots = range(len(maps))
     pairs = list(itertools.combinations(robots, 2))
-    labels = robot_labels(maps, known)
+    labelled = maps if labelled is None else labelled
+    labels = robot_labels(labelled, known)
     known_to_any: BoolArray = np.any(known, axis=0)
     total = sum(squared_distance(maps[i], maps[j]) for i, j in links)
     cells_and_links = sum(int((known[i] | known[j]).sum()) for i, j in links)
@@ -68,7 +71,7 @@ def team_metrics(
         total_distance_all=sum(squared_distance(maps[i], maps[j]) for i, j in pairs),
         distance_per_cell_and_link=total / cells_and_links if cells_and_links else 0.0,
         num_known_cells=int(known_to_any.sum()),
-        label_disagreement=label_disagreement(labels, ties(maps, least_tolerance), known_to_any),
+        label_disagreement=label_disagreement(labels, ties(labelled, least_tolerance), known_to_any),
         max_change=max_change,
         agreement=tuple(both[0] for both in agreement),
         agreement_occupied=tuple(both[1] for both in agreement),

@@ -46,6 +46,22 @@ def test_a_flow_is_rounded_towards_zero():
     assert flows.flow(own, other, 0.2, steps).tolist() == [[0.0, 0.0, 0.0]]
 
 
+def test_a_link_of_small_weight_has_more_bits():
+    weights = [0.9, 1 / 7, 1 / 8, 1 / 9, 1 / 16, 1 / 17, 1 / 32, 1 / 64]
+    assert [flows.link_bits(weight) for weight in weights] == [0, 0, 0, 1, 1, 2, 2, 3]
+
+
+@pytest.mark.parametrize("num_robots", [2, 6, 8, 9, 16, 33, 128])
+def test_evidence_of_one_robot_reaches_all_others_on_a_complete_graph(num_robots):
+    own, others = np.array([[0.0, -0.3, -0.3]]), np.zeros((1, 3))
+    weight = 1 / num_robots
+    steps = flows.flow_steps(own, others, 4 + flows.link_bits(weight), QUANTUM)
+    amount = flows.flow(others, own, weight, steps)
+    # A step is at most a third of the flow that it rounds.
+    np.testing.assert_allclose(amount, weight * own, rtol=0.34)
+    assert amount[0, 1] < 0
+
+
 @examples(200)
 @given(own=log_odds, other=log_odds, weight=weights, flow_bits=bits)
 def test_flows_are_antisymmetric_multiples_of_the_step(own, other, weight, flow_bits):

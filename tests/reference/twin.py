@@ -168,6 +168,7 @@ class Twin:
         self.sensor = config.effective_sensor
         self.quantum = config.consensus.effective_quantum
         self.flow_bits = config.effective_flow_bits
+        self.num_averaged = [1] * self.num_robots
         self.blocks = _codes(recording.keys // flows.BLOCK_EDGE)
         self._graph_of(tuple([True] * self.num_robots), self.start_ns)
         self.scans = [scan for scan in recording.scans if not self._is_off(scan.robot, scan.stamp_ns)]
@@ -248,6 +249,7 @@ class Twin:
             if active[robot]:
                 self._iterate_robot(robot, exchange, stage)
         oracle = self.log_q.sum(axis=0)
+        self._count_averaged(team, active)
         return TwinTick(
             tick=tick,
             stamp_ns=self.start_ns + tick * self.period_ns,
@@ -278,6 +280,9 @@ class Twin:
             float(np.abs(self.maps - exchange.published).max(initial=0.0)),
             published=self._with_prior(exchange.published),
             least_tolerance=least_tolerance,
+            labelled=np.array(
+                [self._with_prior(own, count) for own, count in zip(self.maps, self.num_averaged, strict=True)]
+            ),
         )
 
     def _exchange(self, tick: int, active: tuple[bool, ...], team: TeamGraph) -> Exchange:
@@ -383,7 +388,7 @@ class Twin:
 
     def _flow(self, own: Float64Array, other: Float64Array, weight: float, stage: Stage) -> Float64Array:
         """Return the flow from a neighbour."""
-        steps = flows.flow_steps(own, other, stage.flow_bits, self.quantum)
+        steps = flows.flow_steps(own, other, stage.flow_bits + flows.link_bits(weight), self.quantum)
         amounts = flows.flow(own, other, weight, steps)
         gate = self.config.consensus.flow_gate
         if stage.settling or gate == 0.0:
@@ -418,8 +423,19 @@ class Twin:
         self.log_q_used[robot] = log_q
         self.num_iterations[robot] += 1
 
-    def _with_prior(self, deviation: Float64Array) -> Float64Array:
-        """Return absolute log-odds: the prior is added to the classes 1..C."""
+    def _count_averaged(self, team: TeamGraph, active: tuple[bool, ...]) -> None:
+        """Update the number of robots that each active robot's map is the mean of: those that reach it, and itself."""
+        consensus = self.config.consensus
+        if consensus.rule in ("local", "merge") or consensus.evidence != "sum":
+            return
+        for robot in np.flatnonzero(active).tolist():
+            reaching = {robot}
+            while more := {sender for sender, receiver in team.directed if receiver in reaching} - reaching:
+                reaching |= more
+            self.num_averaged[robot] = len(reaching)
+
+    def _with_prior(self, deviation: Float64Array, num_averaged: int = 1) -> Float64Array:
+        """Return absolute log-odds: the prior, divided by ``num_averaged``, is added to the classes 1..C."""
         absolute = deviation.copy()
-        absolute[..., 1:] += self.prior
+        absolute[..., 1:] += self.prior / num_averaged
         return absolute

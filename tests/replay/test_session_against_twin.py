@@ -64,6 +64,11 @@ def test_flows_with_a_gate(gate, mode, topology):
     assert outcome.twin_tick.settling
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_flows_over_links_of_small_weight(mode):
+    compare(SMALL, rule="bayes", mode=mode, topology="complete", epsilon=0.05, settle=0, every=1)
+
+
 @pytest.mark.parametrize(("rule", "mode", "topology"), one_in(13, RULES, MODES, TOPOLOGIES))
 def test_every_rule_mode_and_topology(rule, mode, topology):
     """The tolerance is far above the rounding of float32, so that both stop settling in the same tick."""

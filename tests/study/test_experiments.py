@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long
 
 NUM_RUNS = {
     "rules": {"rules": 8 * 2 * 2},
-    "forgetting": {"cut": 9 * 3 * 2, "halves": 9 * 2},
+    "forgetting": {"cut": 9 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
     "radio": {"radio": 4 * 6 * 2, "delay": 4 * 4 * 2},
     "noise": {"noise": 14 * 3 * 2},
@@ -34,6 +34,7 @@ NUM_RUNS = {
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
     "frames": {"conditions": 9 * 2, "lengths": 4 * 2},
     "real": {"real": 9 * 3 * 3},
+    "prediction": {"prediction": 17 * 9},
 }
 
 
@@ -55,7 +56,7 @@ def test_every_experiment_consists_of_valid_distinct_runs(name: str, tmp_path: P
 
 def _inputs(name: str, folder: Path) -> tuple[Any, ...]:
     """Parameters of an experiment: a recording, or the length of logs and the number of villages."""
-    if name != "real":
+    if name not in ("real", "prediction"):
         return 30.0, 2
     for index in range(64):
         (folder / f"frame-{index:06d}.depth.png").touch()

@@ -89,7 +89,7 @@ def test_dormant_robots_do_not_count_as_the_worst() -> None:
     summary_tick = dataclasses.replace(
         tick, robots=(tick.robots[0], dataclasses.replace(tick.robots[1], agreement=0.0, active=False))
     )
-    assert numbers._worst(summary_tick, "agreement") == tick.robots[0].agreement
+    assert numbers.worst(summary_tick, "agreement") == tick.robots[0].agreement
 
 
 def scores(robot_id: str, number: float) -> MapScores:

@@ -167,27 +167,48 @@ _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cell
 _add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and which wrong ones it accepts.")
 
 
-@experiment.command(short_help="Measure what agrees on real recordings, before and after 'align'.")
-@_folder_argument("real")
-@click.option("--data", type=existing_path, multiple=True, required=True, metavar="FOLDER",
-              help="recording: a folder of depth images with poses that import-rgbd reads, or a folder of such folders;"
-                   " may be repeated")  # fmt: skip
-@click.option("--teams", type=existing_path, metavar="DIR", help="folder of the teams' logs  [default: DIR/teams]")
-@_parallel_options[0]
-@_parallel_options[1]
-@prints
-def real(folder: Path, data: tuple[Path, ...], teams: Path | None, jobs: int | None, scheduler: str | None) -> int:
-    """Measure what agrees on real recordings, before and after 'align'.
+def _add_recorded(name: str, question: str, runs: str) -> None:
+    """Add the command of one experiment with recorded teams; ``runs`` says what is done with each team."""
 
-    A recording is split into teams of 2, 3 and 4 robots; the recordings of a folder of folders are one team. Each team
-    is replayed with right frames, with a random one of each robot's own, and with those that 'align' finds. Writes
-    tables and figures into DIR (default: octoreplay-real). The same command continues after an interruption.
-    """
-    from octoreplay.study.questions import QUESTIONS
+    def run_and_report(
+        folder: Path, data: tuple[Path, ...], teams: Path | None, jobs: int | None, scheduler: str | None
+    ) -> int:
+        from octoreplay.study.questions import QUESTIONS
 
-    lock_folder(folder)
-    recorded = QUESTIONS["real"].experiment(data)
-    return _answer("real", recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        lock_folder(folder)
+        recorded = QUESTIONS[name].experiment(data)
+        return _answer(name, recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+
+    options = (
+        _folder_argument(name),
+        click.option("--data", type=existing_path, multiple=True, required=True, metavar="FOLDER",
+                     help="recording: a folder of depth images with poses that import-rgbd reads, or a folder of such"
+                          " folders; may be repeated"),
+        click.option("--teams", type=existing_path, metavar="DIR",
+                     help="folder of the teams' logs, which experiments can share  [default: DIR/teams]"),
+        *_parallel_options,
+    )  # fmt: skip
+    text = (
+        f"{question}\n\nA recording is split into teams of 2, 3 and 4 robots; the recordings of a folder of folders are"
+        f" one team. {runs} Writes tables and figures into DIR (default: octoreplay-{name}). The same command continues"
+        " after an interruption."
+    )
+    command = prints(run_and_report)
+    for option in reversed(options):
+        command = option(command)
+    experiment.command(name, help=text, short_help=question)(command)
+
+
+_add_recorded(
+    "real",
+    "Measure what agrees on real recordings, before and after 'align'.",
+    "Each team is replayed with right frames, with random ones of each robot, and with those that 'align' finds.",
+)
+_add_recorded(
+    "prediction",
+    "Measure how well maps of each sensor model predict what another robot measures.",
+    "Each team is replayed with right frames and every sensor model.",
+)
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig, *, replaces_others: bool = False) -> Path:

@@ -13,7 +13,7 @@ from octoreplay.evaluate.records import TruthScores
 from octoreplay.evaluate.truth import Truth
 from octoreplay.log_odds import TIE_TOLERANCE, best_labels, shifted_exp_sum
 from octoreplay.mapping.octree import LeafSpans
-from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
+from octoreplay.records import NO_CLASS, BoolArray, Float32Array, Float64Array, FloatArray, Int64Array, UInt8Array
 
 NUM_BINS = 15
 """Number of bins of the expected calibration error (Guo, Pleiss, Sun and Weinberger, ICML 2017)."""
@@ -57,8 +57,8 @@ class TruthCounts(NamedTuple):
             _ratio(known[0, 0], known[0].sum()),
             _ratio(self.num_seen_observed, self.num_observed),
             _ratio(self.num_seen, num_surface),
-            _calibration_error(self.calibration),
-            _calibration_error(self.calibration_occupied),
+            calibration_error(self.calibration),
+            calibration_error(self.calibration_occupied),
         )
 
 
@@ -213,17 +213,29 @@ def _calibrations(
     # Of a leaf that the map calls free, only the surface in it counts as occupied, and all of it is wrong.
     num_surface = surface.num_cells - surface.num_void
     confidence = 1.0 / shifted_exp_sum(by_class, class_axis=0).astype(np.float64)
+    return (
+        calibration_bins(confidence, num_correct, num_judged),
+        calibration_bins(confidence, num_hits, np.where(is_occupied, num_judged, num_surface)),
+    )
+
+
+def calibration_bins(
+    confidence: FloatArray, num_correct: npt.NDArray[np.number], num_cells: npt.NDArray[np.number]
+) -> Float64Array:
+    """Return the counts (3, NUM_BINS) of each bin of the confidence: correct cells, summed confidence and all cells.
+
+    ``confidence`` (P,) is the probability of the label, ``num_correct`` and ``num_cells`` (P,) are cells with it.
+    """
     bins = np.clip(np.ceil(confidence * NUM_BINS).astype(np.int64) - 1, 0, NUM_BINS - 1)
-
-    def counts(of_correct: Int64Array, of_all: Int64Array) -> Float64Array:
-        rows = of_correct, confidence * of_all, of_all
-        return np.array([np.bincount(bins, weights, NUM_BINS) for weights in rows])
-
-    return counts(num_correct, num_judged), counts(num_hits, np.where(is_occupied, num_judged, num_surface))
+    rows = num_correct, confidence * num_cells, num_cells
+    return np.array([np.bincount(bins, weights, NUM_BINS) for weights in rows])
 
 
-def _calibration_error(counts: Float64Array) -> float:
-    """Sum over bins of |correct cells - summed confidence|, divided by the number of cells: Guo et al., equation 3."""
+def calibration_error(counts: Float64Array) -> float:
+    """Return the expected calibration error of bins: Guo et al., equation 3.
+
+    It is the sum over bins of |correct cells - summed confidence|, divided by the number of cells.
+    """
     correct, expected, num_cells = counts
     return _ratio(np.abs(correct - expected).sum(), num_cells.sum())
 

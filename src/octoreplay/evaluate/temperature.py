@@ -39,15 +39,17 @@ def calibrating_temperature(stored: StoredMap, truth: Truth) -> Calibration:
     Cells of a true class that the map does not have are not counted; cells without surface are free. The method is
     temperature scaling (Guo, Pleiss, Sun and Weinberger, "On Calibration of Modern Neural Networks", ICML 2017).
     """
-    from scipy.optimize import minimize_scalar
+    return fitted_temperature(*_distinct_cells(stored, truth))
 
-    log_odds, counts = _distinct_cells(stored, truth)
+
+def fitted_temperature(log_odds: Float64Array, counts: Float64Array) -> Calibration:
+    """Return the fit of log-odds (P, C) to ``counts`` (P, C + 1), the numbers of their cells by true class."""
+    from scipy.optimize import minimize_scalar
 
     def loss(log_temperature: float) -> float:
         """Mean log loss of the scaled map."""
         chances = class_probabilities(log_odds / np.exp(log_temperature))
-        total: float = -(counts * np.log(np.maximum(chances, np.finfo(np.float64).tiny))).sum() / counts.sum()
-        return total
+        return float(-(counts * np.log(np.maximum(chances, np.finfo(np.float64).tiny))).sum() / counts.sum())
 
     limit = float(np.log(_LARGEST))
     best = minimize_scalar(loss, bounds=(-limit, limit), method="bounded", options={"xatol": 1e-4})

@@ -51,7 +51,8 @@ def gamma_at(consensus: ConsensusConfig, iteration: int) -> float:
 class Flows:
     """Coarse amounts that move over a robot's links, equal at both ends (docs/algorithm.md).
 
-    - ``bits``: the step of a cell is its largest |log-odds|, rounded down to a power of two, times 2^-bits.
+    - ``bits``: the step of a cell is its largest |log-odds|, rounded down to a power of two, times 2^-bits; links of
+      small weight have more bits (``link_bits``).
     - ``has_flow``: True for each neighbour whose link has flows; the others' amounts are exact.
     - ``gate``: a brick has no flow over a link where in each of its cells both ends have the same label and no class
       differs by ``gate`` times the cell's largest |log-odds| or more; 0 holds nothing back.
@@ -60,6 +61,20 @@ class Flows:
     bits: int
     has_flow: Sequence[bool]
     gate: float = 0.0
+
+
+LARGE_WEIGHT = 0.125
+"""Step weight from which a link has no additional bits."""
+
+
+def link_bits(step_weight: float) -> int:
+    """Return the additional bits of a link's flows: max(0, -3 - floor(log2 w)) for the step weight w = 2 epsilon A_ij.
+
+    A flow is at most 2 w m, m the largest |log-odds| in the cell. Without them a robot with many neighbours would round
+    most flows to 0.
+    """
+    # frexp gives floor(log2 x) + 1 exactly.
+    return max(0, math.frexp(LARGE_WEIGHT)[1] - math.frexp(np.float32(step_weight))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +119,7 @@ def team_step(
 
     The mixed map is h~ = h_i + sum_j f_ij, summed over the neighbours, with f_ij = w_ij (h_j - b_i), or with flows
     f_ij = e trunc(w_ij (h_j - b_i) / e), evaluated in float32. The step e of a cell is
-    2^(floor(log2 max_c(|h_j[c]|, |b_i[c]|)) - bits), and at least ``quantum``. The gate of the flows
+    2^(floor(log2 max_c(|h_j[c]|, |b_i[c]|)) - bits - link_bits(w_ij)), and at least ``quantum``. The gate of the flows
     makes all f_ij of a brick 0. The new map is
 
     - ``GRADIENT`` (Alg. 1): h_i = h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), with D = h~ - log q_i and
@@ -166,10 +181,8 @@ class _TeamBricks:
         """Write the new values of the bricks that need it."""
         columns = np.concatenate(self._columns)
         first_columns = np.cumsum([0, *(of_robot.size for of_robot in self._columns)])
-        weights, flow_weights, has_plain = _link_weights(self._steps)
-        flows = [step.flows for step in self._steps]
-        shares = np.array([1.0 if f is None else 2.0**-f.bits for f in flows], np.float32)
-        gates = np.array([0.0 if f is None else f.gate for f in flows], np.float32)
+        weights, flow_weights, shares, has_plain = _link_weights(self._steps)
+        gates = np.array([0.0 if step.flows is None else step.flows.gate for step in self._steps], np.float32)
         gammas = np.array([step.gamma for step in self._steps], np.float32)
         num_classes = self._steps[0].own.num_classes
 
@@ -204,16 +217,23 @@ def _copy_absent(table: BrickTable, indices: Int64Array, column: int, source: in
         array[column, is_absent] = array[source, is_absent]
 
 
-def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """Weights of the links without and with flows at the kernel's columns, and which robots have plain links."""
-    plain, flowing, has_plain = [], [], []
+def _link_weights(steps: Sequence[Step]) -> tuple[Float32Array, Float32Array, Float32Array, BoolArray]:
+    """Weights of the links without and with flows and shares of the flows' steps, at the kernel's columns.
+
+    The last array tells which robots have plain links.
+    """
+    plain, flowing, shares, has_plain = [], [], [], []
     for step in steps:
         has_flow = step.flows.has_flow if step.flows is not None else [False] * len(step.neighbours)
+        bits = 0 if step.flows is None else step.flows.bits
         own = [0.0] * FIRST_NEIGHBOUR
         plain += [*own, *(0.0 if flow else w for w, flow in zip(step.step_weights, has_flow, strict=True))]
         flowing += [*own, *(w if flow else 0.0 for w, flow in zip(step.step_weights, has_flow, strict=True))]
+        shares += [*own, *(2.0 ** -(bits + link_bits(w)) for w in step.step_weights)]
         has_plain.append(not all(has_flow))
-    return np.array(plain, np.float32), np.array(flowing, np.float32), np.array(has_plain)
+    return (
+        np.array(plain, np.float32), np.array(flowing, np.float32), np.array(shares, np.float32), np.array(has_plain),
+    )  # fmt: skip
 
 
 def _octrees(step: Step) -> list[SemanticOctree]:

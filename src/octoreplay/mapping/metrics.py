@@ -107,6 +107,7 @@ class MapComparer:
         self._bricks = SemanticOctree(1.0, 1)
         self._links: Int64Array | None = None
         self._least_tie = 0.0
+        self._label_priors = np.full(num_robots, prior, np.float32)
         self._result: MapComparison | None = None
         self._distances = BlockSums(2, np.float64, np.float64)
         self._counts = BlockSums(4 + 3 * num_robots, np.int32, np.int64)
@@ -121,15 +122,20 @@ class MapComparer:
         threads: Executor | None = None,
         *,
         least_tie: float = 0.0,
+        num_averaged: Sequence[int] | None = None,
     ) -> MapComparison:
         """Return the comparison; bricks with all revisions below ``since`` are not compared again.
 
         ``links`` are robot indices, each linked pair once. Log-odds tie with the largest of their cell where they are
-        within ``least_tie``, or the relative tolerance, of it. The result does not depend on ``threads``.
+        within ``least_tie``, or the relative tolerance, of it. ``num_averaged`` (N,) are the numbers of robots whose
+        mean each map is (default: 1): labels are those of the posterior h_0 + N (h - h_0), as in the oracle. The result
+        does not depend on ``threads``.
         """
         link_ends = np.array(links, np.int64).reshape(-1, 2)
-        stale_rows = self._stale_rows((*maps, oracle), link_ends, since, is_new=self._least_tie != least_tie)
-        self._links, self._least_tie = link_ends, least_tie
+        label_priors = np.float32(self._prior) / np.array(num_averaged or [1] * len(maps), np.float32)
+        is_new = self._least_tie != least_tie or not np.array_equal(self._label_priors, label_priors)
+        stale_rows = self._stale_rows((*maps, oracle), link_ends, since, is_new=is_new)
+        self._links, self._least_tie, self._label_priors = link_ends, least_tie, label_priors
         self._refresh((*maps, oracle), stale_rows, threads)
         if self._result is None or stale_rows.size:
             for of_bricks in (self._distances, self._counts, self._entropies):
@@ -195,6 +201,7 @@ class MapComparer:
                 brick_table(octrees, self._bricks.codes[rows[part]]),
                 link_ends,
                 np.float32(self._prior),
+                self._label_priors,
                 np.float32(TIE_TOLERANCE),
                 np.float32(self._least_tie),
                 num_classes,

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from octoreplay.config.output import OutputConfig
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.config.rules import Exchanged
 from octoreplay.io.results.map_views import view_points
 from octoreplay.io.results.occupancy_grid import Grid, grid_of
 from octoreplay.io.results.octomap_trees import binary_tree
@@ -21,7 +20,6 @@ from octoreplay.mapping import codec
 from octoreplay.mapping.consensus import scaled_map
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL, LeafTable, MapState
-from octoreplay.replay.network.graph import CommunicationGraph
 from octoreplay.replay.tick import falls_due
 
 _log = logging.getLogger(__name__)
@@ -109,28 +107,6 @@ class MapTick(NamedTuple):
     evidence: Mapping[str, SemanticOctree]
     num_robots: Mapping[str, int]
     frame_ids: Mapping[str, str]
-
-
-class NumAveraged:
-    """Number N of robots whose evidence each map is the mean of.
-
-    ``by_name`` has it for each robot and for the centralised map.
-    """
-
-    def __init__(self, config: ResolvedRun) -> None:
-        self._consensus = config.consensus
-        self.by_name = dict.fromkeys((*(robot.robot_id for robot in config.robots), CENTRAL), 1)
-
-    def update(self, graph: CommunicationGraph) -> None:
-        """Update N of each active robot: the robots that reach it, or the team where evidence goes by origin.
-
-        The map of a dormant robot stays as it is, and so does its N.
-        """
-        if not self._consensus.map_is_mean:
-            return
-        ids, is_by_origin = graph.robot_ids, self._consensus.traits.exchanges is Exchanged.EVIDENCE
-        for index in range(len(ids)) if is_by_origin else graph.active:
-            self.by_name[ids[index]] = len(ids) if is_by_origin else int(graph.num_reaching[index])
 
 
 class MapSink(Protocol):

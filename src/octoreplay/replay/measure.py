@@ -20,6 +20,7 @@ from octoreplay.mapping.stream_size import StreamPart
 from octoreplay.replay.exchange.messages import Receipt
 from octoreplay.replay.network.graph import CommunicationGraph, Link, step_size
 from octoreplay.replay.network.links import LinkCounts
+from octoreplay.replay.num_averaged import NumAveraged
 from octoreplay.replay.robots.robot import Publication, Robot, Team
 from octoreplay.replay.tick_counts import RobotCounts, TickCounts, TileParts
 from octoreplay.run_metrics import LinkMetrics, PairMetrics
@@ -72,11 +73,19 @@ class _Component:
         maps, links = self._maps_and_links(team, graph)
         return self._comparer.link_distance(maps, links, self._since, self._threads)
 
-    def compare(self, team: Team[Robot], graph: CommunicationGraph) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
-        """Comparison of the maps after a tick, arrays over all robots, and the metrics of the pairs of members."""
+    def compare(
+        self, team: Team[Robot], graph: CommunicationGraph, num_averaged: Sequence[int]
+    ) -> tuple[MapComparison, tuple[PairMetrics, ...]]:
+        """Comparison of the maps after a tick, arrays over all robots, and the metrics of the pairs of members.
+
+        ``num_averaged`` (N,) is the number of robots whose mean each robot's map is.
+        """
         maps, links = self._maps_and_links(team, graph)
         least_tie = len(team.robots) * rest_difference(self._config, graph)
-        comparison = self._comparer.compare(maps, self.oracle, links, self._since, self._threads, least_tie=least_tie)
+        comparison = self._comparer.compare(
+            maps, self.oracle, links, self._since, self._threads,
+            least_tie=least_tie, num_averaged=[num_averaged[index] for index in self.members],
+        )  # fmt: skip
         evidence = [team.robots[index].evidence.octree for index in self.members]
         pairs = self._evidence_comparer.compare(evidence, self._since, self._threads)
         return comparison.spread(self.members, len(team.robots)), pairs
@@ -118,12 +127,18 @@ class TickMeasurer:
         self._period_ns = round(config.network.publish_period * 1e9)
         self._published_parts: list[StreamPart] = []
         self._components: list[_Component] = []
+        self._num_averaged = NumAveraged(config)
         self.regroup([range(len(self._robot_ids))])
 
     @property
     def oracle(self) -> SemanticOctree:
         """The centralised map."""
         return self._components[0].oracle
+
+    @property
+    def num_averaged(self) -> dict[str, int]:
+        """Number of robots whose mean each map is after the last tick, by robot_id and for the centralised map."""
+        return dict(self._num_averaged.by_name)
 
     def regroup(self, components: Sequence[Sequence[int]]) -> None:
         """Compare robots with those of their component only from the next tick on; each has an oracle of its own."""
@@ -153,7 +168,9 @@ class TickMeasurer:
         max_change: float,
     ) -> TickCounts:
         """Counts of the team after a tick. ``max_change`` is the largest change of a log-odds by the iterations."""
-        compared = [component.compare(team, graph) for component in self._components]
+        self._num_averaged.update(graph)
+        num_averaged = [self._num_averaged.by_name[robot_id] for robot_id in self._robot_ids]
+        compared = [component.compare(team, graph, num_averaged) for component in self._components]
         links = self._link_metrics(graph, traffic)
         sent_bytes = dict.fromkeys(self._robot_ids, 0)
         for link in links:

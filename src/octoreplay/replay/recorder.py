@@ -11,7 +11,7 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.records import CENTRAL, FrameCounts
 from octoreplay.replay.joining import Joining
-from octoreplay.replay.map_recorder import MapRecorder, MapTick, NumAveraged
+from octoreplay.replay.map_recorder import MapRecorder, MapTick
 from octoreplay.replay.team_recorder import TeamRecorder
 from octoreplay.replay.tick import Tick
 from octoreplay.replay.warnings import team_frame_warnings
@@ -30,7 +30,6 @@ class Recorder:
         self._has_result = writer is not None
         self._team = TeamRecorder(config, writer, threads)
         self._maps = MapRecorder(config, self._team.queue, threads)
-        self._num_averaged = NumAveraged(config)
 
     def __enter__(self) -> Self:
         self._team.__enter__()
@@ -46,17 +45,13 @@ class Recorder:
 
     def state(self) -> dict[str, Any]:
         """Wait until all ticks are written; return what ``restore`` needs to continue after the last one."""
-        return {
-            "last": self.last, "team": self._team.state(), "maps": self._maps.state(),
-            "num_averaged": self._num_averaged.by_name,
-        }  # fmt: skip
+        return {"last": self.last, "team": self._team.state(), "maps": self._maps.state()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue a new recorder after the last tick of a ``state``."""
         self.last = state["last"]
         self._team.restore(state["team"])
         self._maps.restore(state["maps"])
-        self._num_averaged.by_name = state["num_averaged"]
 
     def frame_warnings(self) -> tuple[str, ...]:
         """Sentences on the frames of the robots with evidence after the last tick; empty before the first tick."""
@@ -71,7 +66,6 @@ class Recorder:
         # Without the messages, which keep versions of maps.
         self.last = dataclasses.replace(tick, published=())
         self._team.record(tick.metrics, tick.graph, tick.poses)
-        self._num_averaged.update(tick.graph)
         if not self._has_result:
             return
         if self._config.output.keep_packets:
@@ -105,6 +99,6 @@ class Recorder:
         return MapTick(
             tick.number, tick.stamp_ns, tick.stamp_ns - self.start_ns,
             dict(zip((*names, CENTRAL), (*tick.maps, tick.oracle), strict=True)),
-            dict(zip(names, tick.evidence, strict=True)), self._num_averaged.by_name,
+            dict(zip(names, tick.evidence, strict=True)), tick.num_averaged,
             {name: tick.metrics.frame_of(name) for name in (*names, CENTRAL)},
         )  # fmt: skip

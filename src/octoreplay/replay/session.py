@@ -240,6 +240,7 @@ class Session:
         return Tick(
             number, stamp_ns, settling, graph, published, tuple(robot.map for robot in robots),
             tuple(robot.evidence.octree for robot in robots), self._measurer.oracle, tuple(poses), metrics, counts,
+            self._measurer.num_averaged,
         )  # fmt: skip
 
     # --- the steps of a tick ------------------------------------------------------------------------------------------

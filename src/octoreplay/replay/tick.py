@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from octoreplay.mapping.octree import SemanticOctree
@@ -17,7 +18,8 @@ class Tick:
     """The team after one tick.
 
     ``counts`` are those that the ``metrics`` were computed from. ``maps`` are the robots' octrees h_i - h_0, and
-    ``evidence`` their octrees s_i; the next tick changes both.
+    ``evidence`` their octrees s_i; the next tick changes both. ``num_averaged`` has, for each robot_id and for the
+    centralised map, the number of robots whose mean a map is.
     """
 
     number: int
@@ -31,6 +33,7 @@ class Tick:
     poses: tuple[RobotPose, ...]
     metrics: TickMetrics
     counts: TickCounts
+    num_averaged: Mapping[str, int]
 
 
 def falls_due(elapsed_ns: int, period_ns: int, every: float) -> bool:

@@ -58,10 +58,10 @@ def run_numbers(summary: RunSummary, metrics: Sequence[TickMetrics]) -> dict[str
     connected = [tick for tick in seen if is_connected(tick)]
     for name in ("agreement", "agreement_occupied"):
         agreements |= {
-            name: _worst(last, name),
-            f"{name}_log_end": _worst(log_ticks[-1], name),
-            f"{name}_mean": _mean(_worst(tick, name) for tick in seen),
-            f"{name}_connected": _worst(connected[-1], name) if connected else math.nan,
+            name: worst(last, name),
+            f"{name}_log_end": worst(log_ticks[-1], name),
+            f"{name}_mean": _mean(worst(tick, name) for tick in seen),
+            f"{name}_connected": worst(connected[-1], name) if connected else math.nan,
         }
     values = {
         "stop_reason": summary.stop_reason,
@@ -99,6 +99,11 @@ def truth_numbers(evaluation: Evaluation) -> dict[str, float]:
     }
 
 
+def worst(tick: TickMetrics, name: str) -> float:
+    """Return the minimum of a metric over the active robots, or over all if none is active."""
+    return min((float(getattr(robot, name)) for robot in tick.counted_robots), key=lambda v: (not math.isnan(v), v))
+
+
 def is_connected(tick: TickMetrics) -> bool:
     """Return True where links that work both ways connect all active robots at a tick."""
     links = {(link.sender, link.receiver) for link in tick.links}
@@ -123,11 +128,6 @@ def contraction(distances: Sequence[float]) -> float:
         return math.nan
     later = distances[num_ticks // 2 - 1 : num_ticks]
     return float((later[-1] / later[0]) ** (1.0 / (len(later) - 1)))
-
-
-def _worst(tick: TickMetrics, name: str) -> float:
-    """Minimum of a metric over the active robots, or over all if none is active."""
-    return min((float(getattr(robot, name)) for robot in tick.counted_robots), key=lambda v: (not math.isnan(v), v))
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -256,7 +256,7 @@ def _add_flows(
     - ``scratch_at``, ``spare_at``: addresses of three blocks of ``room`` bytes and of one more.
     - ``terms_at``: address of 64 float32.
     - ``octets``, ``num_shared``, ``rows``, ``room``, ``num_classes``: as for ``_add_gradient``.
-    - ``weight``, ``share``, ``gate``, ``quantum``: float32; ``share`` is 2^-flow_bits, ``gate`` 0 holds nothing back.
+    - ``weight``, ``share``, ``gate``, ``quantum``: float32; ``share`` is a power of two, ``gate`` 0 holds nothing back.
     """
     size, shared_size = rows * OCTETS, num_shared * OCTETS
     mixed, base, other = float_array(mixed_at, (size,)), float_array(base_at, (size,)), float_array(map_at, (size,))
@@ -308,7 +308,7 @@ def team_step(
     - ``first_columns`` (R + 1,) int64: robot r has the entries ``first_columns[r]`` to ``first_columns[r + 1]``.
     - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours without flows, parallel to ``columns``.
     - ``flow_weights`` float32: 2 epsilon A_ij at the entries of neighbours with flows, parallel to ``columns``.
-    - ``flow_shares`` (R,) float32: 2^-flow_bits.
+    - ``flow_shares`` float32: largest power of two in a cell to the step of its flow, parallel to ``columns``.
     - ``flow_gates`` (R,) float32: least difference of a moving cell, relative to its largest |log-odds|; 0 for none.
     - ``has_plain`` (R,) bool: True where any of a robot's ``weights`` is not 0.
     - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT and NATURAL; 0 for none.
@@ -359,7 +359,7 @@ def team_step(
                 if flow_weights[first + k] != np.float32(0.0):
                     _add_flows(
                         mixed_at, base_at, places[k], gradient_at, delta_at, terms_at, octets, num_shared, rows, room,
-                        num_classes, flow_weights[first + k], flow_shares[robot], flow_gates[robot], least_step,
+                        num_classes, flow_weights[first + k], flow_shares[first + k], flow_gates[robot], least_step,
                     )  # fmt: skip
             for k in range(FIRST_NEIGHBOUR, num_columns if has_plain[robot] else 0, 3):
                 b_at, b_weight, c_at, c_weight = base_at, np.float32(0.0), base_at, np.float32(0.0)

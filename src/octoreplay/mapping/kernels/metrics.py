@@ -82,12 +82,12 @@ def _total(cells):
 
 
 @kernel
-def _label_cells(rows, oracle, prior, tie_share, least_tie, labels, best, oracle_there, least_tied):
+def _label_cells(rows, oracle, prior, oracle_prior, tie_share, least_tie, labels, best, oracle_there, least_tied):
     """Find the most probable class of each cell; free is 0, equal values go to the lower id.
 
     - ``rows`` (width, 64) float32: deviations of the map.
     - ``oracle`` (width, 64) float32: deviations of the oracle.
-    - ``prior``: float32 log-odds h_0.
+    - ``prior``, ``oracle_prior``: float32, prior that is added to each.
     - ``tie_share``, ``least_tie``: float32, tolerance of ties as a share of the cell's largest |log-odds|, and its
       least value.
     - ``labels`` (64,) int32: output, class ids.
@@ -105,7 +105,7 @@ def _label_cells(rows, oracle, prior, tie_share, least_tie, labels, best, oracle
             value = rows[c, i] + prior
             higher = value > best[i]
             labels[i] = np.int32(c + 1) if higher else labels[i]
-            oracle_there[i] = oracle[c, i] + prior if higher else oracle_there[i]
+            oracle_there[i] = oracle[c, i] + oracle_prior if higher else oracle_there[i]
             best[i] = value if higher else best[i]
             least_tied[i] = max(least_tied[i], abs(value))
     for i in range(BRICK_CELLS):
@@ -113,14 +113,29 @@ def _label_cells(rows, oracle, prior, tie_share, least_tie, labels, best, oracle
 
 
 @kernel
-def _num_differing(bricks, labels, least_tied, differs, prior):
+def _largest(rows, prior, largest):
+    """Find the largest log-odds of each cell, free included.
+
+    - ``rows`` (width, 64) float32: deviations of the map.
+    - ``prior``: float32 log-odds h_0.
+    - ``largest`` (64,) float32: output.
+    """
+    for i in range(BRICK_CELLS):
+        largest[i] = np.float32(0.0)
+    for c in range(rows.shape[0]):
+        for i in range(BRICK_CELLS):
+            largest[i] = max(largest[i], rows[c, i] + prior)
+
+
+@kernel
+def _num_differing(bricks, labels, least_tied, differs, label_priors):
     """Number of cells in which two robots' labels differ and do not tie.
 
     - ``bricks`` (N, width, 64) float32: deviations of the robots.
     - ``labels`` (N, 64) int32: class ids, -1 where unknown.
     - ``least_tied`` (N, 64) float32: least log-odds of each robot that ties with its largest.
     - ``differs`` (64,) int32: not 0 where labels differ.
-    - ``prior``: float32 log-odds h_0.
+    - ``label_priors`` (N,) float32: prior of each robot's labels.
     """
     num = 0
     for i in range(BRICK_CELLS):
@@ -135,8 +150,11 @@ def _num_differing(bricks, labels, least_tied, differs, prior):
                 if one < 0 or other < 0:
                     found = True
                     break
-                there = bricks[r, min(other, bricks.shape[1]) - 1, i] + prior if other > 0 else np.float32(0.0)
-                here = bricks[k, min(one, bricks.shape[1]) - 1, i] + prior if one > 0 else np.float32(0.0)
+                there, here = np.float32(0.0), np.float32(0.0)
+                if other > 0:
+                    there = bricks[r, min(other, bricks.shape[1]) - 1, i] + label_priors[r]
+                if one > 0:
+                    here = bricks[k, min(one, bricks.shape[1]) - 1, i] + label_priors[k]
                 if there < least_tied[r, i] and here < least_tied[k, i]:
                     found = True
                     break
@@ -223,8 +241,8 @@ def _link_distance(bricks, link_ends, square):
 
 @kernel
 def compare_maps(
-    table, link_ends, prior, tie_share, least_tie, num_classes, distances_only, scratch, int_scratch, places, distances,
-    counts, entropies,
+    table, link_ends, prior, label_priors, tie_share, least_tie, num_classes, distances_only, scratch, int_scratch,
+    places, distances, counts, entropies,
 ):  # fmt: skip
     """Contribution of each brick to the metrics.
 
@@ -233,6 +251,7 @@ def compare_maps(
     - ``table``: BrickTable (N + 1, n) of the robots' maps and, in the last column, the oracle.
     - ``link_ends`` (L, 2) int64: robot indices.
     - ``prior``: float32 log-odds h_0.
+    - ``label_priors`` (N,) float32: prior of each robot's labels, h_0 / N for the mean over N robots.
     - ``tie_share``: float32, tolerance of ties as a share of a cell's largest |log-odds|.
     - ``least_tie``: float32, least tolerance of ties.
     - ``num_classes``: C.
@@ -280,7 +299,9 @@ def compare_maps(
         for k in range(link_ends.shape[0]):
             link_cells += count_ones(table.known[link_ends[k, 0], b] | table.known[link_ends[k, 1], b])
         oracle = bricks[robots]
-        _label_cells(oracle, oracle, prior, tie_share, least_tie, labels[0], oracle_best, oracle_there, oracle_tied)
+        _label_cells(
+            oracle, oracle, prior, prior, tie_share, least_tie, labels[0], oracle_best, oracle_there, oracle_tied
+        )
         num_occupied = np.int32(0)
         for i in range(BRICK_CELLS):
             in_any = np.int32(anyone >> np.uint64(i) & np.uint64(1))
@@ -292,7 +313,12 @@ def compare_maps(
             if r == 0 or mask != table.known[r - 1, b]:
                 for i in range(BRICK_CELLS):
                     seen[i] = np.int32(mask >> np.uint64(i) & np.uint64(1))
-            _label_cells(bricks[r], oracle, prior, tie_share, least_tie, labels[r], best, oracle_there, least_tied[r])
+            _label_cells(
+                bricks[r], oracle, label_priors[r], prior, tie_share, least_tie, labels[r], best, oracle_there,
+                least_tied[r],
+            )  # fmt: skip
+            if label_priors[r] != prior:
+                _largest(bricks[r], prior, best)
             entropies[place, r] = _brick_entropy(bricks[r], terms, prior, best, seen, total, weighted)
             # Casts keep the sums int32; int64 sums use half as many vector lanes.
             agreeing, agreeing_occupied = np.int32(0), np.int32(0)
@@ -308,5 +334,5 @@ def compare_maps(
             counts[place, 6 + 3 * r] = agreeing_occupied
         counts[place, 0] = count_ones(anyone)
         counts[place, 1] = num_occupied
-        counts[place, 2] = _num_differing(bricks[:robots], labels, least_tied, differs, prior)
+        counts[place, 2] = _num_differing(bricks[:robots], labels, least_tied, differs, label_priors)
         counts[place, 3] = link_cells

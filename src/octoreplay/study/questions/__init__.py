@@ -12,6 +12,7 @@ from octoreplay.study.questions import (
     frames,
     noise,
     packets,
+    prediction,
     radio,
     real,
     rules,
@@ -31,6 +32,7 @@ QUESTIONS: Mapping[str, Question] = MappingProxyType(
         "scale": scale.QUESTION,
         "frames": frames.QUESTION,
         "real": real.QUESTION,
+        "prediction": prediction.QUESTION,
     }
 )
 """Questions by name, in the order of the page."""

@@ -18,7 +18,8 @@ from octoreplay.io.output_file import writing
 from octoreplay.mapping import codec
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.records import CENTRAL, TEAM
-from octoreplay.replay.map_recorder import MAP_WRITES, MapRecorder, MapSink, MapTick, NumAveraged
+from octoreplay.replay.map_recorder import MAP_WRITES, MapRecorder, MapSink, MapTick
+from octoreplay.replay.num_averaged import NumAveraged
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.stage import TileFiles
 from octoreplay.study.tiles.work import StoredMap, read_maps, read_ticks
