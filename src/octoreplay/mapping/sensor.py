@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -59,7 +60,7 @@ class Increments:
             others = self._rounded(self.hit_other * strengths)
         if self.confidence_model == "mixture" and num_classes > 1:
             hits, others = map(self._rounded, self._mixtures(strengths, num_classes))
-        return hits.astype(np.float32), others.astype(np.float32)
+        return read_only(hits.astype(np.float32)), read_only(others.astype(np.float32))
 
     def _mixtures(self, strengths: Float64Array, num_classes: int) -> tuple[Float64Array, Float64Array]:
         """Log-odds of the class hit and of the others where the label is right with the probabilities ``strengths``.
@@ -342,6 +343,12 @@ def _boxes(frame: Frame) -> Float64Array:
     return boxes
 
 
+@functools.lru_cache(maxsize=16)
+def _by_strength(increments: Increments, num_classes: int) -> tuple[Float32Array, Float32Array]:
+    """Stored log-odds of ``Increments.by_strength``: making them would take a tenth of the time of a scan."""
+    return increments.by_strength(num_classes)
+
+
 def add_scan(
     octree: SemanticOctree, cells: TouchedCells, increments: Increments, revision: int, before: Snapshot | None = None
 ) -> None:
@@ -359,7 +366,7 @@ def add_scan(
     if before is not None:
         before.save(octree.codes[indices[changes & (octree.revisions[indices] < revision)]])
     octree.expand_bricks(indices, wanted, known, changes)
-    hits, others = increments.by_strength(octree.num_classes)
+    hits, others = _by_strength(increments, octree.num_classes)
     evidence.apply_marks(
         octree.bricks, indices, changes, cells.marks, cells.strengths.view(np.uint8), octree.num_classes, hits, others,
         miss, least, most, revision, np.empty((2, storage.BRICK_CELLS), np.float32),
