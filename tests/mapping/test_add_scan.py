@@ -6,12 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.mapping.kernels import storage
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.sensor import (
     COUNT_SCANS,
+    Increments,
     ScanCaster,
     add_scan,
     clamped_increments,
@@ -25,6 +28,8 @@ from reference.sensor import scan_update
 from support.long_suite import one_in
 from support.octree_factory import cells_of
 from support.scans import NUM_CLASSES, SENSOR, expected_cells, random_boxes, sum_of_scans, with_confidences
+
+MODELS = ("none", "hit", "tempered", "mixture")
 
 
 @pytest.mark.parametrize("increments", ["clamped", "unclamped", "count"])
@@ -64,9 +69,11 @@ def _mixed_scenario(confidence):
     return frames
 
 
-def test_full_confidence_equals_no_confidences():
+@pytest.mark.parametrize("model", MODELS)
+def test_full_confidence_equals_no_confidences(model):
     """Bit for bit, in evidence and in counts."""
-    sensor, region = SensorConfig(max_range=4.0, hit=0.85, miss=-0.41, hit_other=-0.13), MapConfig(0.4)
+    sensor = SensorConfig(max_range=4.0, hit=0.85, miss=-0.41, hit_other=-0.13, confidence_model=model)
+    region = MapConfig(0.4)
     plain, sure = _mixed_scenario(lambda _: None), _mixed_scenario(lambda shape: np.full(shape, 255))
     for num_classes, steps in (
         (NUM_CLASSES, clamped_increments(sensor)), (NUM_CLASSES, unclamped_increments(sensor)),
@@ -76,11 +83,15 @@ def test_full_confidence_equals_no_confidences():
         assert maps[0] == maps[1]
 
 
-@pytest.mark.parametrize(("num_classes", "hit_other"), one_in(4, [1, 3, 12], [None, -0.2]))
-def test_weighted_sums_of_many_scans_equal_the_reference(num_classes, hit_other):
+@pytest.mark.parametrize(
+    ("num_classes", "hit_other", "model"), one_in(4, [1, 3, 12], [None, -0.2, 0.0], ["hit", "tempered", "mixture"])
+)
+def test_weighted_sums_of_many_scans_equal_the_reference(num_classes, hit_other, model):
     """Clamped, unclamped and counted; scans with and without confidences in turn."""
     rng = np.random.default_rng(num_classes)
-    sensor = SensorConfig(max_range=4.0, hit=0.9, miss=-0.4, hit_other=hit_other, clamp_min=-2.0, clamp_max=1.5)
+    sensor = SensorConfig(
+        max_range=4.0, hit=0.9, miss=-0.4, hit_other=hit_other, clamp_min=-2.0, clamp_max=1.5, confidence_model=model
+    )
     region, frames = MapConfig(0.4), []
     for frame in _mixed_scenario(lambda shape: rng.integers(0, 256, shape) if rng.random() < 0.8 else None):
         labels = "class_ids" if isinstance(frame, CloudFrame) else "class_image"
@@ -109,6 +120,46 @@ def test_weighted_sums_of_many_scans_equal_the_reference(num_classes, hit_other)
     np.testing.assert_allclose(values[0], reference.clamped[:, 1:], atol=1e-5)
     np.testing.assert_allclose(values[1], reference.total[:, 1:], atol=1e-5)
     np.testing.assert_array_equal(values[2][:, 0], reference.num_touching_scans)
+
+
+def test_ignored_confidences_equal_no_confidences():
+    """Bit for bit, also of points with confidence 0."""
+    sensor, region = SensorConfig(max_range=4.0, confidence_model="none"), MapConfig(0.4)
+    rng = np.random.default_rng(0)
+    plain, unsure = _mixed_scenario(lambda _: None), _mixed_scenario(lambda shape: rng.integers(0, 256, shape))
+    maps = [
+        cells_of(sum_of_scans(frames, clamped_increments(sensor), NUM_CLASSES, sensor, region))
+        for frames in (plain, unsure)
+    ]
+    assert maps[0] == maps[1]
+
+
+@given(
+    st.sampled_from(MODELS), st.floats(0.01, 5.0), st.floats(-3.0, 0.0), st.integers(2, 254),
+    st.sampled_from([0.0, 2.0**-16]),
+)  # fmt: skip
+def test_increments_of_each_strength(model, hit, hit_other, num_classes, quantum):
+    hit, hit_other = (round(value * 2**16) / 2**16 for value in (hit, hit_other))
+    steps = Increments(hit, -0.3, hit_other, -5.0, 5.0, model, quantum)
+    hits, others = steps.by_strength(num_classes)
+    assert (hits.dtype, others.dtype) == (np.float32, np.float32)
+    assert (hits[255], others[255]) == (np.float32(hit), np.float32(hit_other))
+    # A surer label raises its class, against the others too.
+    assert (np.diff(hits) >= 0).all()
+    assert (np.diff(hits - others) >= -1e-6 - 2 * quantum).all()
+    if quantum:
+        assert not (np.concatenate([hits, others]).astype(float) % quantum).any()
+    if model == "tempered":
+        # The same ratios, as of a fraction of a hit.
+        np.testing.assert_allclose(others * hit, hits * hit_other, atol=1e-5 + 5 * quantum)
+    if model == "mixture":
+        # Only the class is uncertain: the likelihood of a surface stays.
+        total = np.exp(hits.astype(float)) + (num_classes - 1) * np.exp(others.astype(float))
+        np.testing.assert_allclose(total, total[255], rtol=1e-5 + quantum)
+        # With as much doubt as without any label, all classes are equal.
+        fair = 255 // num_classes
+        if 255 % num_classes == 0:
+            assert hits[fair] == pytest.approx(others[fair], abs=1e-5 + quantum)
 
 
 def test_one_class_and_254_classes():

@@ -40,7 +40,7 @@ class Evidence:
     def integrate(self, scan: IndexedScan, sensor: SensorConfig) -> None:
         """Add one scan: ``miss`` to freed cells, ``hit`` and ``hit_other`` to hit ones; clamp the touched cells.
 
-        ``hit`` is multiplied by strength / 255, and the product rounded to the quantum.
+        The increments of a hit depend on its strength and on the confidence model, and are rounded to the quantum.
         """
         for cells, increments in self._increments(scan, sensor):
             self.total[cells] += increments
@@ -52,9 +52,9 @@ class Evidence:
         """Yield (cells, increments (., K)) of the freed and of the hit cells; each cell occurs once in one of them."""
         num_columns = self.clamped.shape[1]
         freed = np.full((len(scan.freed), num_columns), sensor.miss)
-        hit = np.full((len(scan.hit), num_columns), sensor.miss if sensor.hit_other is None else sensor.hit_other)
-        strongest = rounded(sensor.hit * scan.hit_strengths / 255, self.quantum)
-        hit[np.arange(len(scan.hit)), scan.hit_classes] = strongest
+        hit = np.zeros((len(scan.hit), num_columns))
+        for row, class_id, strength in zip(hit, scan.hit_classes.tolist(), scan.hit_strengths.tolist(), strict=True):
+            row[1:] = rounded(_hit_increments(sensor, num_columns - 1, class_id, strength / 255), self.quantum)
         for cells, increments in ((scan.freed, freed), (scan.hit, hit)):
             increments[:, 0] = 0.0
             yield cells, increments
@@ -66,3 +66,22 @@ class Evidence:
         if reading == "time-average":
             return self.total / max(self.num_scans, 1)
         return self.total / np.maximum(self.num_touching_scans, 1)[:, None]
+
+
+def _hit_increments(sensor: SensorConfig, num_classes: int, class_id: int, strength: float) -> Float64Array:
+    """Return the increments (C,) of a cell that is hit with a label whose confidence is ``strength``."""
+    hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
+
+    def certain(label: int) -> Float64Array:
+        return np.where(np.arange(1, num_classes + 1) == label, sensor.hit, hit_other)
+
+    model = "none" if strength == 1.0 else sensor.confidence_model
+    if model == "hit":
+        return np.where(np.arange(1, num_classes + 1) == class_id, strength * sensor.hit, hit_other)
+    if model == "tempered":
+        return strength * certain(class_id)
+    if model == "mixture" and num_classes > 1:
+        others = [label for label in range(1, num_classes + 1) if label != class_id]
+        wrong = sum(np.exp(certain(label)) for label in others) / len(others)
+        return np.log(strength * np.exp(certain(class_id)) + (1.0 - strength) * wrong)
+    return certain(class_id)

@@ -126,6 +126,8 @@ def measurements(frame: Frame, sensor: SensorConfig) -> Measurements:
     used = no_return | ((distance >= sensor.min_range) & (distance > 0))
     points, class_ids, distance, no_return = points[used], class_ids[used], distance[used], no_return[used]
     confidences = confidences[used]
+    if sensor.confidence_model == "none":
+        confidences[:] = 255
     cut = no_return | (distance > sensor.max_range)
     points[cut] *= (sensor.max_range / distance[cut])[:, None]
     class_ids[cut | (confidences == 0)] = NO_CLASS

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from octoreplay.config.presets import PRESETS
+from octoreplay.records import CloudFrame
 from octoreplay.replay.robots import consensus as consensus_module
 from octoreplay.replay.session import Session
 from reference.hand_made import cloud, ray, team_config
 from reference.scenarios import TeamShape
 from support.long_suite import long, one_in
+from support.scans import with_confidences
 from support.sessions import sent_packets
 from support.twin_comparison import SMALL, compare, compare_frames, scenario_of, sources_of, unrounded
 
@@ -132,6 +134,20 @@ SENSOR_VARIANTS = {
 def test_sensor_models(variant, rule):
     outcome = compare(SMALL, rule=rule, settle=0, every=8, sensor_parameters=SENSOR_VARIANTS[variant])
     assert outcome.twin_tick.known.any()
+
+
+@pytest.mark.parametrize(
+    ("model", "rule", "evidence"),
+    one_in(3, ["none", "hit", "tempered", "mixture"], ["gradient", "bayes"], ["sum", "cell-average"]),
+)
+def test_confidence_models(model, rule, evidence):
+    scenario, rng = scenario_of(3, SMALL), np.random.default_rng(0)
+    frames = []
+    for frame in scenario.frames:
+        shape = frame.points.shape[:1] if isinstance(frame, CloudFrame) else frame.depth_image.shape
+        frames.append(with_confidences(frame, rng.integers(0, 256, shape)))
+    parameters = {"rule": rule, "evidence": evidence, "settle": 0, "confidence_model": model, **unrounded(rule)}
+    compare_frames(scenario.config(**parameters), frames, every=8)
 
 
 @pytest.mark.parametrize("sensors", ["depth16", "depth32", "cloud"])

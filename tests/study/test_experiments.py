@@ -29,7 +29,7 @@ NUM_RUNS = {
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
     "radio": {"radio": 4 * 6 * 2, "delay": 4 * 4 * 2},
     "noise": {"noise": 14 * 3 * 2},
-    "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2},
+    "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2, "confidences": 3 * 5 * 2, "confidences_prior": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
     "frames": {"conditions": 9 * 2, "lengths": 4 * 2},

@@ -59,11 +59,12 @@ def add_octet(target: int, source: int) -> None:
 
 
 def add_marked_octet(
-    target: int, marks: np.uint64, own_from: int, own_to: int, own_steps: int, miss: np.float32, other: np.float32,
-    least: np.float32, most: np.float32,
+    target: int, marks: np.uint64, own_from: int, own_to: int, own_steps: int, other_steps: int,
+    miss: np.float32, least: np.float32, most: np.float32,
 ) -> None:  # fmt: skip
     values, of_cells = float_array(target, OCTET), np.array([marks], "<u8").view(np.uint8)
-    steps = np.where((of_cells >= own_from) & (of_cells <= own_to), float_array(own_steps, OCTET), other)
+    is_own = (of_cells >= own_from) & (of_cells <= own_to)
+    steps = np.where(is_own, float_array(own_steps, OCTET), float_array(other_steps, OCTET))
     new = np.clip(values + np.where(of_cells == 1, miss, steps), least, most)
     values[:] = np.where(of_cells != 0, new, values)
 

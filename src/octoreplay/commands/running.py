@@ -283,6 +283,8 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
               help="share of the places, cubes of 2 m, that a robot always labels wrongly")  # fmt: skip
 @click.option("--similar-errors", is_flag=True,
               help="wrong labels are of the class that resembles the right one, such as roof for building")  # fmt: skip
+@click.option("--confidences", type=float, default=None, metavar="TEMPERATURE",
+              help="write confidences of the labels; 1: calibrated, less: too high")  # fmt: skip
 @click.option("--depth-noise", type=float, default=1.0, show_default=True, metavar="FACTOR",
               help="factor on the noise of a depth camera, which grows with depth, or of a LiDAR's ranges")  # fmt: skip
 @click.option("--pose-noise", type=float, default=0.0, show_default=True,

@@ -21,6 +21,12 @@ class SensorConfig:
     hit_other: float | None = parameter(
         None, "log-odds added to the other classes of the cell where a ray ends (default: miss)"
     )
+    confidence_model: str = parameter(
+        "hit",
+        "what the confidence of a label changes: nothing (none), hit (hit), hit and hit_other by the same factor"
+        " (tempered), or the class alone (mixture)",
+        choices=("none", "hit", "tempered", "mixture"),
+    )
     clamp_min: float = parameter(-5.0, "lower limit of a class's log-odds", maximum=0.0)
     clamp_max: float = parameter(5.0, "upper limit of a class's log-odds", minimum=0.0)
     min_range: float = parameter(0.0, "minimum range of a measured point; nearer points are ignored [m]", minimum=0.0)

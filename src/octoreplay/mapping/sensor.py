@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from octoreplay.config.sensor import MapConfig, SensorConfig
 from octoreplay.errors import ConfigError, InputError
 from octoreplay.mapping.kernels import casting, ends, evidence, storage
 from octoreplay.mapping.octree import SemanticOctree
+from octoreplay.mapping.scan_memory import BrickMemory, Runs
 from octoreplay.mapping.scan_points import range_of
 from octoreplay.mapping.snapshot import Snapshot
 from octoreplay.records import (
@@ -24,7 +26,6 @@ from octoreplay.records import (
     Int32Array,
     Int64Array,
     UInt8Array,
-    UInt32Array,
     UInt64Array,
     read_only,
 )
@@ -37,8 +38,8 @@ MAX_GRID_CELLS = 1 << 32
 class Increments:
     """Log-odds that one scan adds to a cell: ``hit`` to the class hit, ``hit_other`` to the others, ``miss`` if passed.
 
-    Sums are clamped to [``least``, ``most``]. With ``is_count``, hits ignore the labels' confidences. ``hit`` times a
-    confidence is rounded to a multiple of ``quantum``; 0 does not round.
+    Sums are clamped to [``least``, ``most``]. ``confidence_model`` is that of SensorConfig; the increments of a hit
+    that a confidence changes are rounded to multiples of ``quantum``, and 0 does not round.
     """
 
     hit: float
@@ -46,29 +47,55 @@ class Increments:
     hit_other: float
     least: float
     most: float
-    is_count: bool = False
+    confidence_model: str = "none"
     quantum: float = 0.0
 
-    def weighted_hits(self) -> Float32Array:
-        """Return ``hit`` times each confidence, (256,) float32 for 0 to 255."""
-        if self.quantum:
-            return np.asarray(np.rint(self.hit * np.arange(256) / 255 / self.quantum) * self.quantum, np.float32)
-        return np.float32(self.hit) * (np.arange(256, dtype=np.float32) / np.float32(255))
+    def by_strength(self, num_classes: int) -> tuple[Float32Array, Float32Array]:
+        """Return the log-odds of the class hit and of the others, each (256,) float32 for the strengths 0 to 255."""
+        strengths = np.arange(256) / 255
+        hits, others = np.full(256, self.hit), np.full(256, self.hit_other)
+        if self.confidence_model in ("hit", "tempered"):
+            hits = self._rounded(self.hit * strengths)
+        if self.confidence_model == "tempered":
+            others = self._rounded(self.hit_other * strengths)
+        if self.confidence_model == "mixture" and num_classes > 1:
+            hits, others = map(self._rounded, self._mixtures(strengths, num_classes))
+        return read_only(hits.astype(np.float32)), read_only(others.astype(np.float32))
+
+    def _mixtures(self, strengths: Float64Array, num_classes: int) -> tuple[Float64Array, Float64Array]:
+        """Log-odds of the class hit and of the others where the label is right with the probabilities ``strengths``.
+
+        Another class is the right one with equal probability. The likelihoods of both cases are added, relative to
+        that of the case without doubt, so that the log-odds of strength 1 are exact.
+        """
+        ratio = math.exp(self.hit - self.hit_other)
+        wrong = 1.0 - strengths
+        hits = self.hit + np.log(strengths + wrong / ratio)
+        others = self.hit_other + np.log(strengths + wrong * (ratio + num_classes - 2) / (num_classes - 1))
+        return hits, others
+
+    def _rounded(self, log_odds: Float64Array) -> Float64Array:
+        """Nearest multiples of the quantum."""
+        return np.rint(log_odds / self.quantum) * self.quantum if self.quantum else log_odds
 
 
 def clamped_increments(sensor: SensorConfig, quantum: float = 0.0) -> Increments:
     """Return the sensor model's increments with its clamping limits: evidence s of a robot."""
-    hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
-    return Increments(sensor.hit, sensor.miss, hit_other, sensor.clamp_min, sensor.clamp_max, quantum=quantum)
+    return _increments(sensor, sensor.clamp_min, sensor.clamp_max, quantum)
 
 
 def unclamped_increments(sensor: SensorConfig) -> Increments:
     """Return the sensor model's increments without limits: the sum behind the averages of the evidence."""
+    return _increments(sensor, -np.inf, np.inf, 0.0)
+
+
+def _increments(sensor: SensorConfig, least: float, most: float, quantum: float) -> Increments:
+    """Increments of a sensor model."""
     hit_other = sensor.miss if sensor.hit_other is None else sensor.hit_other
-    return Increments(sensor.hit, sensor.miss, hit_other, -np.inf, np.inf)
+    return Increments(sensor.hit, sensor.miss, hit_other, least, most, sensor.confidence_model, quantum)
 
 
-COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf, is_count=True)
+COUNT_SCANS = Increments(1.0, 1.0, 1.0, -np.inf, np.inf)
 """Increments that count the scans that touched a cell, in an octree with one class."""
 
 
@@ -123,17 +150,18 @@ class ScanCaster:
         self._marks = np.zeros(0, np.uint8)
         self._strengths = np.zeros(0, np.uint8)
         self._flags = np.zeros(0, np.uint8)
-        self._bricks = _BrickMemory(0, has_strengths=False)
+        self._bricks = BrickMemory(0, has_strengths=False)
         self._scratch = np.empty((0, 0), np.float32), np.empty((0, 0)), np.empty((0, 0), np.int32)
         self._scratch_rows(ends.BLOCK)
-        self._runs = _Runs(0, num_classes, sensor.rays)
+        self._runs = Runs(0, num_classes, sensor.rays)
 
     def cast(self, frame: Frame) -> TouchedCells:
         """Return the cells that a scan touches. A cell that is hit is not also passed.
 
         ``sensor.rays`` selects one ray for each distinct end cell, to its centre, or one for each point. Labels are
-        weighted by their confidences; points in robots' bodies hit nothing. Raises InputError where the scan leaves the
-        key space, and ConfigError where max_range is too long for the resolution.
+        weighted by their confidences, unless the sensor model ignores these; points in robots' bodies hit nothing.
+        Raises InputError where the scan leaves the key space, and ConfigError where max_range is too long for the
+        resolution.
         """
         # numpy takes longer than Python for three numbers.
         origin = [float(coord) / self._resolution for coord in frame.T_team_sensor[:3, 3]]
@@ -145,7 +173,7 @@ class ScanCaster:
         corner, num_blocks, marks, flags = self._grid(*self._box(frame, origin_key))
         tables = np.empty((6, casting.BLOCK_EDGE * num_blocks.max() + casting.VECTOR), np.uint32)
         casting.fill_tables(num_blocks, tables)
-        strengths = self._strength_plane(0 if _confidences(frame).size == 0 else marks.size)
+        strengths = self._strength_plane(0 if self._confidences(frame).size == 0 else marks.size)
         num_ends, end_marks = runs.reduce(corner, tables, marks, strengths)
         start = np.array([self._start(*coords) for coords in zip(origin, origin_key, corner.tolist(), strict=True)])
         casting.mark_free(start, *runs.rays(num_ends), self._resolution, corner, num_blocks, tables, marks, flags)
@@ -161,7 +189,7 @@ class ScanCaster:
         # One more than the bricks: the kernel writes bricks without a mark too, and overwrites them with the next.
         places, has_strengths = int(np.count_nonzero(flags)) * casting.BRICKS_PER_BLOCK + 1, strengths.size > 0
         if places > self._bricks.codes.size or has_strengths > (self._bricks.strengths.size > 0):
-            self._bricks = _BrickMemory(2 * places, has_strengths=has_strengths)
+            self._bricks = BrickMemory(2 * places, has_strengths=has_strengths)
         bricks = self._bricks
         brick_strengths = bricks.strengths if has_strengths else bricks.strengths[:0]
         num_bricks = casting.take_bricks(
@@ -174,7 +202,7 @@ class ScanCaster:
         """Write the ends of the scan's rays into the runs."""
         size = frame.depth_image.size if isinstance(frame, DepthFrame) else len(frame.points)
         if size > self._runs.capacity:
-            self._runs = _Runs(size, self._num_classes, self._sensor.rays)
+            self._runs = Runs(size, self._num_classes, self._sensor.rays)
         self._runs.counters[:] = 0
         pose = np.ascontiguousarray(frame.T_team_sensor, np.float64)
         if not np.isfinite(pose).all():
@@ -196,7 +224,7 @@ class ScanCaster:
         ends.depth_to_runs(
             depth, frame.depth_unit, np.ascontiguousarray(classes),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), pose, self._resolution,
-            *range_of(frame, self._sensor), *values, _confidences(frame), _boxes(frame),
+            *range_of(frame, self._sensor), *values, self._confidences(frame), _boxes(frame),
             *self._scratch_rows(depth.shape[1]), *self._runs.outputs,
         )  # fmt: skip
 
@@ -214,6 +242,14 @@ class ScanCaster:
         farthest = 2.0 * self._sensor.max_range
         ends.depth_to_points(depth, frame.depth_unit, read_only(slopes), farthest, *values, points)
         return points
+
+    def _confidences(self, frame: Frame) -> UInt8Array:
+        """Return the label confidences (P,) in 1 / 255; size 0 for full confidence, and where they change nothing."""
+        given = frame.confidence_image if isinstance(frame, DepthFrame) else frame.confidences
+        if self._sensor.confidence_model == "none":
+            given = None
+        # Read-only like frames from logs, so that kernels are compiled for one signature.
+        return read_only(np.empty(0, np.uint8) if given is None else given.ravel())
 
     def _depths(self, frame: DepthFrame) -> tuple[npt.NDArray[Any], float, Float64Array, Float64Array]:
         """Return a depth image as kernel arguments: image, largest value of its dtype, special values, meanings."""
@@ -233,7 +269,7 @@ class ScanCaster:
         classes = read_only(np.ones(len(points), np.uint8)) if class_ids is None else class_ids
         ends.points_to_runs(
             np.ascontiguousarray(points, kind), np.ascontiguousarray(classes), pose, self._resolution,
-            *range_of(frame, self._sensor), _confidences(frame), _boxes(frame),
+            *range_of(frame, self._sensor), self._confidences(frame), _boxes(frame),
             *self._scratch_rows(ends.BLOCK)[1:], *self._runs.outputs,
         )  # fmt: skip
 
@@ -298,82 +334,6 @@ class ScanCaster:
         return low, high
 
 
-class _BrickMemory:
-    """Memory for the bricks that a scan touches."""
-
-    def __init__(self, capacity: int, *, has_strengths: bool) -> None:
-        self.codes = np.empty(capacity, np.int64)
-        self.marks = np.empty((capacity, storage.OCTETS), np.uint64)
-        self.strengths = np.empty((capacity if has_strengths else 0, storage.OCTETS), np.uint64)
-
-
-class _Runs:
-    """Memory for the ends of a scan's rays: first as runs of neighbouring points, then as distinct end cells."""
-
-    def __init__(self, capacity: int, num_classes: int, rays: str) -> None:
-        self.capacity = capacity
-        self.counters = np.zeros(2, np.int64)
-        # One more than the points: kernels write points without information too, and overwrite them with the next.
-        places = capacity + 1
-        self.keys = np.empty((3, places), np.int32)
-        self.kinds = np.empty(places, np.uint8)
-        self.lengths = np.empty(places, np.int32)
-        self.end_keys = np.empty((capacity, 3), np.int32)
-        self.end_places = np.empty(capacity, np.uint32)
-        self._num_classes = num_classes
-        self._places = np.empty(capacity, np.uint32)
-        self._sums = np.empty(places, np.int32)
-        self._every = rays == "all"
-        self._points = np.empty((places if self._every else 0, 3))
-        self._point_keys = np.empty((places if self._every else 0, 3), np.int32)
-
-    @property
-    def num_runs(self) -> int:
-        """Number of runs."""
-        return int(self.counters[ends.NUM_RUNS])
-
-    @property
-    def outputs(self) -> tuple[npt.NDArray[Any], ...]:
-        """Output arrays of the kernels that find runs."""
-        return self.keys, self.kinds, self.lengths, self._sums, self._points, self._point_keys, self.counters
-
-    def reduce(
-        self, corner: Int64Array, tables: UInt32Array, marks: UInt8Array, strengths: UInt8Array
-    ) -> tuple[int, UInt8Array]:
-        """Mark the distinct end cells in the scratch grid; return their number n and their marks (n,).
-
-        With ``strengths``, labels are weighted by the points' confidences, and the cells get their strengths.
-        """
-        is_weighted = strengths.size > 0
-        runs, num_classes = (self.kinds, self.num_runs), self._num_classes
-        num_ends, num_open = ends.mark_ends(
-            self.keys, *runs, corner, tables, num_classes, is_weighted, marks, self._places, self.end_places,
-            self.end_keys,
-        )  # fmt: skip
-        end_marks = np.empty(num_ends, np.uint8)
-        ends.settle_ends(
-            self._places, self.kinds, self.lengths, self._sums if is_weighted else self.lengths,
-            self.num_runs if num_open else 0, num_classes, np.full(2 << (2 * num_open).bit_length(), -1, np.int32),
-            np.empty(num_open, np.uint32), np.zeros((num_open, num_classes), np.int32),
-            np.zeros((num_open, num_classes), np.int64), marks, strengths, self.end_places[:num_ends], end_marks,
-        )  # fmt: skip
-        return num_ends, end_marks
-
-    def rays(self, num_ends: int) -> tuple[Float64Array, Int32Array]:
-        """Return end points (n, 3) [m] and end cells (n, 3) of the rays; no end points if rays go to cell centres."""
-        if not self._every:
-            return self._points, self.end_keys[:num_ends]
-        num_points = int(self.counters[ends.NUM_POINTS])
-        return self._points[:num_points], self._point_keys[:num_points]
-
-
-def _confidences(frame: Frame) -> UInt8Array:
-    """Return the label confidences (P,) in 1 / 255; size 0 for full confidence."""
-    given = frame.confidence_image if isinstance(frame, DepthFrame) else frame.confidences
-    # Read-only like frames from logs, so that kernels are compiled for one signature.
-    return read_only(np.empty(0, np.uint8) if given is None else given.ravel())
-
-
 def _boxes(frame: Frame) -> Float64Array:
     """Return the boxes (b, 4, 6) of robots' bodies in the kernels' format."""
     boxes = np.zeros((len(frame.boxes), 4, 6))
@@ -381,6 +341,12 @@ def _boxes(frame: Frame) -> Float64Array:
         rows[:3, :4], rows[:3, 4], rows[:3, 5] = box.T_box_team[:3], box.low, box.high
         rows[ends.IS_OWN, 0] = box.is_own
     return boxes
+
+
+@functools.lru_cache(maxsize=16)
+def _by_strength(increments: Increments, num_classes: int) -> tuple[Float32Array, Float32Array]:
+    """Stored log-odds of ``Increments.by_strength``: making them would take a tenth of the time of a scan."""
+    return increments.by_strength(num_classes)
 
 
 def add_scan(
@@ -400,10 +366,8 @@ def add_scan(
     if before is not None:
         before.save(octree.codes[indices[changes & (octree.revisions[indices] < revision)]])
     octree.expand_bricks(indices, wanted, known, changes)
-    is_weighted = not increments.is_count and cells.strengths.size > 0
-    hits = increments.weighted_hits() if is_weighted else np.full(256, increments.hit, np.float32)
-    strengths = cells.strengths if is_weighted else cells.strengths[:0]
+    hits, others = _by_strength(increments, octree.num_classes)
     evidence.apply_marks(
-        octree.bricks, indices, changes, cells.marks, strengths.view(np.uint8), octree.num_classes, hits, miss,
-        np.float32(increments.hit_other), least, most, revision, np.empty(storage.BRICK_CELLS, np.float32),
+        octree.bricks, indices, changes, cells.marks, cells.strengths.view(np.uint8), octree.num_classes, hits, others,
+        miss, least, most, revision, np.empty((2, storage.BRICK_CELLS), np.float32),
     )  # fmt: skip

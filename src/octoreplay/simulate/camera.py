@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from octoreplay.records import BoolArray, CameraModel, Float32Array, Float64Array, UInt8Array
+from octoreplay.records import BoolArray, CameraModel, Float32Array, Float64Array, Int64Array, UInt8Array
 from octoreplay.simulate.scene import NO_LABEL, MeshScene
 from octoreplay.simulate.world import World
 
 _FAR = 1000.0
 _PATCH_EDGE = 2.0
-_PATCH_GRID = (64, 64, 16)
+PATCH_GRID = (64, 64, 16)
+"""Number of cubes along each axis in the grid of places with properties of their own."""
 
 
 class MeshCamera:
@@ -62,6 +63,12 @@ class MeshCamera:
         return points
 
 
+def patch_cells(points: Float64Array) -> tuple[Int64Array, ...]:
+    """Return the indices of the cubes in ``PATCH_GRID`` that hold ``points`` (H, W, 3) [m], three arrays (H, W)."""
+    # The grid repeats itself beyond its edges.
+    return tuple(np.moveaxis(np.mod(np.floor(points / _PATCH_EDGE).astype(np.int64), PATCH_GRID), -1, 0))
+
+
 class LabelPatches:
     """Places at which a robot's network gives a wrong class: cubes of space that keep their error in every image.
 
@@ -73,16 +80,14 @@ class LabelPatches:
     def __init__(
         self, share: float, num_classes: int, rng: np.random.Generator, similar: UInt8Array | None = None
     ) -> None:
-        wrong = rng.random(_PATCH_GRID) < share
-        self._shifts = np.where(wrong, rng.integers(1, num_classes, _PATCH_GRID), 0)
+        wrong = rng.random(PATCH_GRID) < share
+        self._shifts = np.where(wrong, rng.integers(1, num_classes, PATCH_GRID), 0)
         self._num_classes = num_classes
         self._similar = similar
 
     def apply(self, labels: UInt8Array, points: Float64Array) -> UInt8Array:
         """Return the label image (H, W) with the errors at ``points`` (H, W, 3), the pixels' world coordinates [m]."""
-        # The grid repeats itself beyond its edges.
-        cubes = np.mod(np.floor(points / _PATCH_EDGE).astype(np.int64), _PATCH_GRID)
-        shifts = self._shifts[cubes[..., 0], cubes[..., 1], cubes[..., 2]]
+        shifts = self._shifts[patch_cells(points)]
         if self._similar is not None:
             return np.where((labels == NO_LABEL) | (shifts == 0), labels, _similar_labels(labels, self._similar))
         shifted = (labels.astype(np.int64) - 1 + shifts) % self._num_classes + 1
@@ -113,11 +118,16 @@ def depth_to_millimetres(depth: Float32Array) -> npt.NDArray[np.uint16]:
 
 
 def add_label_noise(
-    labels: UInt8Array, share: float, num_classes: int, rng: np.random.Generator, similar: UInt8Array | None = None
+    labels: UInt8Array,
+    share: float | Float64Array,
+    num_classes: int,
+    rng: np.random.Generator,
+    similar: UInt8Array | None = None,
 ) -> UInt8Array:
     """Return the label image with this share of its measured pixels changed to another class.
 
-    The other class is drawn uniformly, or is the ``similar`` one of each class (C + 1,) uint8 where these are given.
+    ``share`` may also be the probability of each pixel (H, W). The other class is drawn uniformly, or is the
+    ``similar`` one of each class (C + 1,) uint8 where these are given.
     """
     wrong = (rng.random(labels.shape, dtype=np.float32) < share) & (labels != NO_LABEL)
     if similar is not None:

@@ -12,8 +12,10 @@ from octoreplay.records import Float64Array, Int64Array, UInt8Array
 from octoreplay.simulate.body_poses import T_BODY_CAMERA, T_BODY_LIDAR, body_poses, midway, pose_errors
 from octoreplay.simulate.camera import LabelPatches, MeshCamera, add_depth_noise, add_label_noise, depth_to_millimetres
 from octoreplay.simulate.colour import ColourCamera
+from octoreplay.simulate.confidences import LabelErrors, softmax_confidences
 from octoreplay.simulate.lidar import MeshLidar, add_range_noise
 from octoreplay.simulate.odometry import HEIGHT_FACTOR, drift_corrections, own_frame, position_fixes
+from octoreplay.simulate.scene import NO_LABEL
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.simulate.world import Terrain, similar_classes
 from octoreplay.transforms import inverse
@@ -98,6 +100,10 @@ class Recorder:
         if config.patchy_noise > 0:
             rng = np.random.default_rng([config.seed, 7, index])
             self._patches = LabelPatches(config.patchy_noise, config.class_table.num_classes, rng, self._similar)
+        self._errors: LabelErrors | None = None
+        if config.confidences is not None:
+            rng = np.random.default_rng([config.seed, 9, index])
+            self._errors = LabelErrors(config.label_noise, config.num_candidates, rng)
         self._colour: ColourCamera | None = None
         self.T_body_color: Float64Array | None = None
         if config.colour is not None and isinstance(sensor, MeshCamera):
@@ -137,8 +143,8 @@ class Recorder:
         depth = true_depth
         if config.depth_noise > 0:
             depth = add_depth_noise(depth, self._rng, config.depth_noise)
-        labels = self._with_errors(labels, lambda: camera.points(true_depth, T_map_camera))
-        log.write_frame(stamp_ns, depth_to_millimetres(depth), labels if config.has_labels else None)
+        labels, confidences = self._with_errors(labels, lambda: camera.points(true_depth, T_map_camera))
+        log.write_frame(stamp_ns, depth_to_millimetres(depth), labels if config.has_labels else None, confidences)
 
     def _write_scan(self, log: RobotLogWriter, lidar: MeshLidar, stamp_ns: int, T_map_lidar: Float64Array) -> None:
         """Measure and write one scan with the noise of a LiDAR and of a segmentation network."""
@@ -148,18 +154,30 @@ class Recorder:
         if config.depth_noise > 0:
             ranges = add_range_noise(ranges, self._rng, config.depth_noise)
         R, position = T_map_lidar[:3, :3], T_map_lidar[:3, 3]
-        labels = self._with_errors(labels, lambda: lidar.points(true_ranges) @ R.T + position)
+        labels, confidences = self._with_errors(labels, lambda: lidar.points(true_ranges) @ R.T + position)
         measured = ranges > 0
-        points = lidar.points(ranges)[measured]
-        log.write_cloud(stamp_ns, points, labels=labels[measured].astype(np.uint16) if config.has_labels else None)
+        log.write_cloud(
+            stamp_ns,
+            lidar.points(ranges)[measured],
+            labels=labels[measured].astype(np.uint16) if config.has_labels else None,
+            confidences=None if confidences is None else confidences[measured],
+        )
 
-    def _with_errors(self, labels: UInt8Array, points: Callable[[], Float64Array]) -> UInt8Array:
-        """Labels (H, W) with the errors of a segmentation network; ``points`` gives the points (H, W, 3) in the map."""
+    def _with_errors(
+        self, labels: UInt8Array, points: Callable[[], Float64Array]
+    ) -> tuple[UInt8Array, UInt8Array | None]:
+        """Labels (H, W) with the errors of a segmentation network, and their confidences, None for logs without.
+
+        ``points`` gives the points (H, W, 3) in the map.
+        """
         config = self._config
+        errors = None if self._errors is None else self._errors.probabilities(points(), self._rng)
         if self._patches is not None:
             labels = self._patches.apply(labels, points())
         if config.label_noise > 0:
-            labels = add_label_noise(
-                labels, config.label_noise, config.class_table.num_classes, self._rng, self._similar
-            )
-        return labels
+            share = config.label_noise if errors is None else errors
+            labels = add_label_noise(labels, share, config.class_table.num_classes, self._rng, self._similar)
+        if errors is None or config.confidences is None:
+            return labels, None
+        confidences = softmax_confidences(errors, config.num_candidates, config.confidences)
+        return labels, np.where(labels == NO_LABEL, np.uint8(0), confidences)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from octoreplay.errors import ConfigError
 from octoreplay.records import CameraModel, ClassTable
 from octoreplay.simulate.colour import COLOUR_FORMATS
+from octoreplay.simulate.confidences import largest_label_noise
 from octoreplay.simulate.lidar import LidarModel
 from octoreplay.simulate.world import MAX_KINDS, village_classes
 
@@ -48,6 +49,10 @@ class SimulationConfig:
     similar_errors : bool
         True where a wrong label is that of the class which resembles the right one: grass and road, building and roof,
         trunk and foliage, fence and car. False for any other class, each equally likely.
+    confidences : float or None
+        Temperature of the network whose confidences come with the labels: 1 for calibrated ones, less for too high
+        ones; None for logs without confidences. Labels are then wrong with probabilities that differ between places
+        and pixels, with the mean ``label_noise``.
     depth_noise : float
         Factor on the standard deviation of the noise of a depth camera, or of a LiDAR's ranges.
     pose_noise : float
@@ -93,6 +98,7 @@ class SimulationConfig:
     label_noise: float = 0.1
     patchy_noise: float = 0.0
     similar_errors: bool = False
+    confidences: float | None = None
     depth_noise: float = 1.0
     pose_noise: float = 0.0
     odometry_drift: tuple[float, float] = (0.0, 0.0)
@@ -123,6 +129,7 @@ class SimulationConfig:
             ("resolution", self.resolution, 0.02, 5.0),
             ("label_noise", self.label_noise, 0.0, 1.0),
             ("patchy_noise", self.patchy_noise, 0.0, 1.0),
+            ("confidences", 1.0 if self.confidences is None else self.confidences, 0.01, 100.0),
             ("depth_noise", self.depth_noise, 0.0, 100.0),
             ("pose_noise", self.pose_noise, 0.0, 10.0),
             ("odometry_drift in percent", self.odometry_drift[0], 0.0, 100.0),
@@ -146,7 +153,20 @@ class SimulationConfig:
             raise ConfigError("colour: a LiDAR takes no images; use the sensor 'camera'")
         if not self.scan_view[0] < self.scan_view[1]:
             raise ConfigError("scan_view: the lowest ring must be below the highest")
+        if self.confidences is not None:
+            self._check_confidences()
         self._check_paths()
+
+    def _check_confidences(self) -> None:
+        """Raise ConfigError for logs without labels, and for more label noise than confidences can say."""
+        most = largest_label_noise(self.num_candidates)
+        if not self.has_labels:
+            raise ConfigError("confidences: a log without labels has no confidences; leave one of the options out")
+        if self.label_noise > most:
+            raise ConfigError(
+                f"label_noise: {self.label_noise:g} is above {most:g}, the share of wrong labels among"
+                f" {self.num_candidates} classes at random; lower it, or leave out confidences"
+            )
 
     def _check_paths(self) -> None:
         """Raise ConfigError for another number of paths than robots, and for waypoints outside of the village."""
@@ -182,6 +202,11 @@ class SimulationConfig:
     def class_table(self) -> ClassTable:
         """Classes of the labels."""
         return village_classes(self.kinds_per_class)
+
+    @property
+    def num_candidates(self) -> int:
+        """Number of classes that a label may be: the right one, and those that an error can give."""
+        return 2 if self.similar_errors else self.class_table.num_classes
 
     @property
     def has_pose_truth(self) -> bool:

@@ -17,7 +17,14 @@ from octoreplay.config.team_file import dump_team
 from octoreplay.errors import OutputError
 from octoreplay.io import output_file
 from octoreplay.io.datasets.pose_files import write_tum
-from octoreplay.io.robots.robot_log_writer import MAP_FRAME, RobotLogWriter, cloud_topic, fix_topic, topics
+from octoreplay.io.robots.robot_log_writer import (
+    MAP_FRAME,
+    RobotLogWriter,
+    cloud_topic,
+    confidence_topic,
+    fix_topic,
+    topics,
+)
 from octoreplay.records import FilePath, Float64Array
 from octoreplay.simulate.body_poses import T_BODY_CAMERA, T_BODY_LIDAR
 from octoreplay.simulate.camera import MeshCamera
@@ -188,6 +195,7 @@ def _team(folder: Path, config: SimulationConfig) -> RunConfig:
                 logs=(folder / f"{robot_id}.mcap",),
                 depth_topic=depth if has_images else None,
                 label_topic=labels if has_images and config.has_labels else None,
+                confidence_topic=confidence_topic(robot_id) if has_images and config.confidences is not None else None,
                 camera_info_topic=camera_info if has_images else None,
                 cloud_topic=None if has_images else cloud_topic(robot_id),
                 pose_topic=odometry,

@@ -31,9 +31,10 @@ class RobotLogWriter:
     """Writes one robot's log as MCAP; a context manager that finishes the file.
 
     Topics of robot R: ``/R/camera/depth/image_raw`` (16UC1 in millimetres or 32FC1 in metres),
-    ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16), ``/R/labels/label_info`` (once),
-    ``/R/odom``, ``/tf`` (``map_frame`` to R/base_link), ``/tf_static`` (R/base_link to R/camera_optical_frame) and
-    ``/R/fix``, ``/R/camera/color/image_raw`` (rgb8) or ``/R/camera/color/image_raw/compressed`` (JPEG or PNG), and
+    ``/R/camera/depth/camera_info``, ``/R/camera/labels/image_raw`` (mono8 or mono16),
+    ``/R/camera/label_confidence/image_raw`` (mono8), ``/R/labels/label_info`` (once), ``/R/odom``, ``/tf``
+    (``map_frame`` to R/base_link), ``/tf_static`` (R/base_link to R/camera_optical_frame) and ``/R/fix``,
+    ``/R/camera/color/image_raw`` (rgb8) or ``/R/camera/color/image_raw/compressed`` (JPEG or PNG), and
     ``/R/camera/color/camera_info``.
     Without a ``camera`` the log is a lidar's: ``/R/lidar/points`` in the frame R/lidar replaces the images.
 
@@ -62,6 +63,7 @@ class RobotLogWriter:
         self._distortion = np.zeros(5) if distortion is None else np.array(distortion, np.float64)
         self._depth_topic, self._label_topic, self._info_topic, self._pose_topic, label_info = topics(robot_id)
         self._map_frame, self._body_frame = map_frame, f"{robot_id}/base_link"
+        self._confidence_topic = confidence_topic(robot_id)
         self._cloud_topic = cloud_topic(robot_id)
         self._fix_topic = fix_topic(robot_id)
         self._sensor_frame = f"{robot_id}/lidar" if camera is None else f"{robot_id}/camera_optical_frame"
@@ -131,12 +133,17 @@ class RobotLogWriter:
         self._writer.write(self._fix_topic, "sensor_msgs/msg/NavSatFix", value, stamp_ns)
 
     def write_frame(
-        self, stamp_ns: int, depth_image: npt.NDArray[Any], label_image: npt.NDArray[Any] | None = None
+        self,
+        stamp_ns: int,
+        depth_image: npt.NDArray[Any],
+        label_image: npt.NDArray[Any] | None = None,
+        confidence_image: UInt8Array | None = None,
     ) -> None:
-        """Append one depth image with its CameraInfo, and its label image.
+        """Append one depth image with its CameraInfo, its label image, and the confidences of the labels.
 
         ``depth_image`` is (H, W) uint16 in millimetres or float32 in metres; ``label_image`` (H, W) uint8 or uint16
-        raw labels. Raises InputError for another type or a size other than the camera's, and in a lidar's log.
+        raw labels; ``confidence_image`` (H, W) uint8 in 1 / 255. Raises InputError for another type or a size other
+        than the camera's, and in a lidar's log.
         """
         camera = self._camera
         if camera is None:
@@ -146,6 +153,8 @@ class RobotLogWriter:
         self._writer.write(self._info_topic, "sensor_msgs/msg/CameraInfo", info, stamp_ns)
         if label_image is not None:
             self._write_image(self._label_topic, stamp_ns, label_image, {"u1": "mono8", "u2": "mono16"}, camera)
+        if confidence_image is not None:
+            self._write_image(self._confidence_topic, stamp_ns, confidence_image, {"u1": "mono8"}, camera)
 
     def write_color(self, stamp_ns: int, image: UInt8Array, form: str) -> None:
         """Append one colour image (H, W, 3) uint8 red, green, blue with its CameraInfo.
@@ -174,14 +183,16 @@ class RobotLogWriter:
         points: npt.NDArray[Any],
         *,
         labels: npt.NDArray[Any] | None = None,
+        confidences: UInt8Array | None = None,
         rgb: npt.NDArray[Any] | None = None,
         intensity: npt.NDArray[Any] | None = None,
     ) -> None:
         """Append one point cloud.
 
         ``points`` is (P, 3) float in the sensor's frame, metres, written as float32; ``labels`` (P,) uint16 or uint32
-        raw labels; ``rgb`` (P,) uint32 0x00RRGGBB, declared as float32 as in PCL, which viewers expect;
-        ``intensity`` (P,) float. Raises InputError for other types or lengths, and in a camera's log.
+        raw labels; ``confidences`` (P,) uint8 those of the labels in 1 / 255; ``rgb`` (P,) uint32 0x00RRGGBB, declared
+        as float32 as in PCL, which viewers expect; ``intensity`` (P,) float. Raises InputError for other types or
+        lengths, and in a camera's log.
         """
         columns = {name: points[:, axis].astype("<f4") for axis, name in enumerate("xyz")}
         if intensity is not None:
@@ -190,12 +201,15 @@ class RobotLogWriter:
             columns["rgb"] = rgb.astype("<u4").view("<f4")
         if labels is not None:
             columns["label"] = labels
+        if confidences is not None:
+            columns["label_confidence"] = confidences
         num_points = len(points)
         fit = all(c.shape == (num_points,) and c.dtype.str[1:] in _POINT_TYPES for c in columns.values())
         if self._camera is not None or not fit:
             raise InputError(
                 f"{self.path}: topic '{self._cloud_topic}': takes clouds in a lidar's log only; labels must be "
-                "uint16 or uint32, and labels, colours and intensities must be given for every point or for none"
+                "uint16 or uint32, and labels, confidences, colours and intensities must be given for every point or"
+                " for none"
             )
         value = cloud_message(columns, stamp_ns, self._sensor_frame)
         self._writer.write(self._cloud_topic, "sensor_msgs/msg/PointCloud2", value, stamp_ns)
@@ -313,6 +327,11 @@ def topics(robot_id: str) -> tuple[str, str, str, str, str]:
         f"/{robot_id}/odom",
         f"/{robot_id}/labels/label_info",
     )
+
+
+def confidence_topic(robot_id: str) -> str:
+    """Return the topic of the confidences of a robot's label images."""
+    return f"/{robot_id}/camera/label_confidence/image_raw"
 
 
 def cloud_topic(robot_id: str) -> str:

@@ -84,32 +84,32 @@ def _prefetch_block(bricks, rows_at, index):
 
 @kernel
 def apply_marks(
-    bricks, indices, changes, marks, strengths, num_classes, hits, miss, hit_other, clamp_min, clamp_max, revision,
-    own_steps,
+    bricks, indices, changes, marks, strengths, num_classes, hits, others, miss, clamp_min, clamp_max, revision, steps,
 ):  # fmt: skip
     """Add one scan's log-odds to bricks that were expanded by the rows of ``wanted_rows``.
 
-    A free cell gets ``miss`` in all classes. A hit cell gets a hit in its class and ``hit_other`` in the others; in a
-    map of one class, every hit is one of this class. The sums are clamped.
+    A free cell gets ``miss`` in all classes. A hit cell gets the increments of its strength: one in its class,
+    another in the other classes; in a map of one class, every hit is one of this class. The sums are clamped.
 
     - ``bricks``: Bricks, in place.
     - ``indices`` (n,) int64: brick indices.
     - ``changes`` (n,) bool: as left by wanted_rows; the other bricks are skipped.
     - ``marks`` (n, 8) uint64, ``num_classes``: as for wanted_rows.
     - ``strengths`` (n, 64) uint8: strength of each hit; size 0 for the strength 255 everywhere.
-    - ``hits`` (256,) float32: log-odds increment of the hit class for each strength.
-    - ``miss``, ``hit_other``: float32 log-odds increments.
+    - ``hits``, ``others`` (256,) float32: log-odds increments of the hit class and of the others for each strength.
+    - ``miss``: float32 log-odds increment.
     - ``clamp_min``, ``clamp_max``: float32 limits of the log-odds.
     - ``revision``: revision of the bricks.
-    - ``own_steps`` (64,) float32: scratch, increment of each cell's hit.
+    - ``steps`` (2, 64) float32: scratch, increments of each cell's hit in its class and in the others.
     """
     for k in range(BRICK_CELLS):
-        own_steps[k] = hits[255]
+        steps[0, k], steps[1, k] = hits[255], others[255]
     # Marks of the hits that the shared rows get with the strength; a mark of 0 changes nothing.
     shared_from, shared_to = np.uint8(0), np.uint8(0)
     if num_classes == 1:
         shared_from, shared_to = np.uint8(2), np.uint8(255)
-    steps_at, rows_at = np.int64(own_steps.ctypes.data), np.int64(bricks.rows.ctypes.data)
+    own_at, rows_at = np.int64(steps.ctypes.data), np.int64(bricks.rows.ctypes.data)
+    other_at = own_at + OCTETS * ROW_BYTES
     for t in range(indices.size):
         index = indices[t]
         _prefetch_block(bricks, rows_at, indices[min(t + PREFETCH_AHEAD, indices.size - 1)])
@@ -117,15 +117,15 @@ def apply_marks(
             continue
         if strengths.size > 0:
             for k in range(BRICK_CELLS):
-                own_steps[k] = hits[strengths[t, k]]
+                steps[0, k], steps[1, k] = hits[strengths[t, k]], others[strengths[t, k]]
         block = np.int64(bricks.blocks[index])
         place = rows_at + block * ROW_BYTES
         octets = octets_of(bricks.known[index])
         while octets:
             e = lowest_one(octets) >> 3
             add_marked_octet(
-                place, marks[t, e], shared_from, shared_to, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min,
-                clamp_max,
+                place, marks[t, e], shared_from, shared_to, own_at + e * ROW_BYTES, other_at + e * ROW_BYTES, miss,
+                clamp_min, clamp_max,
             )  # fmt: skip
             place += ROW_BYTES
             octets &= octets - np.uint64(1)
@@ -137,8 +137,9 @@ def apply_marks(
                 bit = lowest_one(bits)
                 e, own = bit >> 3, np.uint8(8 * w + (bit & 7) + 2)
                 add_marked_octet(
-                    place, marks[t, e], own, own, steps_at + e * ROW_BYTES, miss, hit_other, clamp_min, clamp_max
-                )
+                    place, marks[t, e], own, own, own_at + e * ROW_BYTES, other_at + e * ROW_BYTES, miss, clamp_min,
+                    clamp_max,
+                )  # fmt: skip
                 place += ROW_BYTES
                 bits &= bits - np.uint64(1)
         bricks.revisions[index] = revision

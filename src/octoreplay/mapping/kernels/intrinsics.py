@@ -137,19 +137,19 @@ def add_octet(typing_context: Any, target: Any, source: Any) -> Any:
 
 @intrinsic
 def add_marked_octet(
-    typing_context: Any, target: Any, marks: Any, own_from: Any, own_to: Any, own_steps: Any, miss: Any, other: Any,
-    least: Any, most: Any,
+    typing_context: Any, target: Any, marks: Any, own_from: Any, own_to: Any, own_steps: Any, other_steps: Any,
+    miss: Any, least: Any, most: Any,
 ) -> Any:  # fmt: skip
     """Add the log-odds of eight marks (kernels/evidence.py) to eight float32, clamped to [``least``, ``most``].
 
     A cell without a mark keeps its value. A mark of 1 adds ``miss``, one in ``own_from`` to ``own_to`` the cell's own
-    step, and every other mark ``other``.
+    step, and every other mark the cell's other step.
 
     - ``target``: integer address of the values, changed in place.
     - ``marks`` uint64: a mark in each byte.
     - ``own_from``, ``own_to`` uint8.
-    - ``own_steps``: integer address of eight float32.
-    - ``miss``, ``other``, ``least``, ``most``: float32.
+    - ``own_steps``, ``other_steps``: integer addresses of eight float32.
+    - ``miss``, ``least``, ``most``: float32.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -161,13 +161,13 @@ def add_marked_octet(
             first = builder.insert_element(empty, number, ir.IntType(32)(0))
             return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), 8), [0] * 8))
 
-        target, own_steps = _octets(builder, (arguments[0], arguments[4]))
+        target, own_steps, other_steps = _octets(builder, (arguments[0], arguments[4], arguments[5]))
         marks = builder.bitcast(arguments[1], octet)
-        own_from, own_to, miss, other, least, most = (repeat(arguments[n]) for n in (2, 3, 5, 6, 7, 8))
+        own_from, own_to, miss, least, most = (repeat(arguments[n]) for n in (2, 3, 6, 7, 8))
         is_own = builder.and_(builder.icmp_unsigned(">=", marks, own_from), builder.icmp_unsigned("<=", marks, own_to))
         is_miss = builder.icmp_unsigned("==", marks, ir.Constant(octet, [1] * 8))
         is_marked = builder.icmp_unsigned("!=", marks, ir.Constant(octet, [0] * 8))
-        step = builder.select(is_own, builder.load(own_steps, align=4), other)
+        step = builder.select(is_own, builder.load(own_steps, align=4), builder.load(other_steps, align=4))
         old = builder.load(target, align=4)
         new = builder.fadd(old, builder.select(is_miss, miss, step))
         new = builder.select(builder.fcmp_ordered(">", least, new), least, new)
@@ -177,7 +177,7 @@ def add_marked_octet(
 
     number = types.float32
     signature = types.void(
-        types.int64, types.uint64, types.uint8, types.uint8, types.int64, number, number, number, number
+        types.int64, types.uint64, types.uint8, types.uint8, types.int64, types.int64, number, number, number
     )
     return signature, generate
 
