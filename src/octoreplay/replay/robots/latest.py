@@ -56,9 +56,6 @@ class LatestRobot(ForwardingRobot):
             return new.octree, SemanticOctree(self.map.resolution, self.map.num_classes), new.octree.codes
         return new.octree, old.octree, new.octree.codes[new.octree.revisions >= old.version]
 
-    def _octrees(self) -> list[SemanticOctree]:
-        return [*super()._octrees(), *(held.octree for held in self._taken.values())]
-
 
 class LatestTeam(Team[LatestRobot]):
     """Robots that forward evidence and overwrite their maps with its changes."""
