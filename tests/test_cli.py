@@ -109,7 +109,7 @@ def test_the_help_shows_the_common_options_and_help_all_the_rest() -> None:
         (["run", "--resolutoin", 1], "No such option '--resolutoin'; did you mean '--resolution'?"),
         (["rnu"], "No such command 'rnu'; did you mean 'run'?"),
         (["experiment", "papr"], "No such command 'papr'; did you mean 'paper'?"),
-        (["run", "--rule", "baies"], "flood, merge, local; did you mean 'bayes'?"),
+        (["run", "--rule", "baies"], "flood, merge, weighted, latest, local; did you mean 'bayes'?"),
         (["export", "r.mcap", "-o", "x.ply", "--what", "voxel"], "points, voxels; did you mean 'voxels'?"),
         (["run", "team.yaml", "-o", "x.mcap"], "resolutoin: unknown key; did you mean 'resolution'?"),
         (["run", "word.yaml", "-o", "x.mcap"], "rule: 'baies' is not one of"),

@@ -71,8 +71,8 @@ class StoredMap:
     A map on which robots agree is the mean over ``num_robots`` robots, N: those that reached it over links at the time,
     or all with rule 'flood'. ``map_kind`` 'posterior' (the default of all methods) gives h_0 + N (h - h_0), the
     posterior of the evidence of these robots, and 'mean' the map h as the robot holds it. Both are the same where N is
-    1: for a robot without links, for the centralised map, for evidence, for rules whose map is no mean ('local',
-    'merge'), and where ``evidence`` is an average. ``octree`` holds h - h_0.
+    1: for a robot without links, for the centralised map, for evidence, for the baseline rules, whose map is no mean,
+    and where ``evidence`` is an average. ``octree`` holds h - h_0.
     """
 
     def __init__(

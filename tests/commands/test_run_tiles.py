@@ -127,6 +127,7 @@ def test_a_worker_that_cannot_write_ends_the_run_with_one_sentence(tmp_path: Pat
         (["--tiles", "20", "--prune-tolerance", "0.1"], "tiles: cannot be used with prune_tolerance"),
         (["--tiles", "20", "--keep-packets"], "tiles: cannot be used with keep_packets"),
         (["--tiles", "20", "--rule", "flood", "--loss", "0.1"], "tiles: cannot be used with rule flood with losses"),
+        (["--tiles", "20", "--rule", "latest", "--loss", "0.1"], "tiles: cannot be used with rule latest with losses"),
         (["--tiles", "20", "--bounds", "500,500,0,600,600,10"], "bounds: no ray of any frame passes them"),
     ],
 )

@@ -20,7 +20,7 @@ TEAM = RunConfig(robots=(RobotConfig("a", (Path("a.mcap"),)),))
 @pytest.mark.parametrize(
     ("rule", "quantum"),
     [("bayes", 2.0**-16), ("gradient", 2.0**-10), ("natural", 2.0**-10), ("ratio", 0.0), ("flood", 0.0),
-     ("merge", 0.0), ("local", 0.0)],
+     ("merge", 0.0), ("weighted", 2.0**-10), ("latest", 0.0), ("local", 0.0)],
 )  # fmt: skip
 def test_default_quantum_of_every_rule(rule: str, quantum: float) -> None:
     assert ConsensusConfig(rule=rule).effective_quantum == quantum
@@ -30,7 +30,7 @@ def test_default_quantum_of_every_rule(rule: str, quantum: float) -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_a_given_quantum_applies_to_the_rules_that_have_one(rule: str) -> None:
-    has_one = rule in ("bayes", "gradient", "natural")
+    has_one = rule in ("bayes", "gradient", "natural", "weighted")
     assert ConsensusConfig(rule=rule, quantum=2.0**-12).effective_quantum == (2.0**-12 if has_one else 0.0)
     assert ConsensusConfig(rule=rule, quantum=0.0).effective_quantum == 0.0
 

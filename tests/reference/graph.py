@@ -72,8 +72,8 @@ def team_graph(
     directed = directed_links(network, robot_ids, active, elapsed_s, history)
     weights = link_weights(network, directed, robot_ids)
     epsilon = step_size(consensus, network, weights)
-    if consensus.rule in ("gradient", "bayes", "natural"):
-        check_step_size(epsilon, weights)
+    if consensus.rule in ("gradient", "bayes", "natural", "weighted"):
+        check_step_size(epsilon, _bound(consensus, weights))
     return TeamGraph(directed, weights, epsilon)
 
 
@@ -207,7 +207,17 @@ def step_size(consensus: ConsensusConfig, network: NetworkConfig, weights: Float
         return consensus.epsilon
     if network.weights in ("metropolis", "max-degree"):
         return 0.5
-    return min(0.5, 0.9 * step_size_bound(weights))
+    return min(0.5, 0.9 * _bound(consensus, weights))
+
+
+def _bound(consensus: ConsensusConfig, weights: Float64Array) -> float:
+    """Return the bound of the rule's step size."""
+    return mean_bound(weights) if consensus.rule == "weighted" else step_size_bound(weights)
+
+
+def mean_bound(weights: Float64Array) -> float:
+    """Return the epsilon at which the largest sum of a robot's step weights 2 epsilon A_ij is 1."""
+    return min((0.5 / total for total in weights.sum(axis=1) if total > 0.0), default=math.inf)
 
 
 def step_size_bound(weights: Float64Array) -> float:
@@ -243,21 +253,21 @@ def simulated_bound(weights: Float64Array, num_steps: int = 1 << 17) -> float:
     return low
 
 
-def check_step_size(epsilon: float, weights: Float64Array) -> None:
+def check_step_size(epsilon: float, bound: float) -> None:
     """Raise ConfigError where epsilon is not below the bound."""
-    bound = step_size_bound(weights)
     if not epsilon < bound * (1.0 - _ROUNDING):
         raise ConfigError(f"epsilon: {epsilon:g} is not below the bound {bound:g} of this graph")
 
 
-def second_eigenvalue(graph: TeamGraph) -> float:
-    """Return lambda_2, the second largest |eigenvalue| of I - 2 epsilon L.
+def second_eigenvalue(graph: TeamGraph, share: float = 1.0) -> float:
+    """Return lambda_2, the second largest |eigenvalue| of I - 2 epsilon L, with ``share`` of epsilon.
 
     It is the largest |1 - 2 epsilon mu| over the non-zero eigenvalues mu of L, 0 without any. In a graph of several
     components, it is the rate of the slowest one.
     """
     values = np.linalg.eigvals(laplacian(graph.weights))
-    return max((float(abs(1.0 - 2.0 * graph.epsilon * mu)) for mu in values if abs(mu) > _ROUNDING), default=0.0)
+    step = 2.0 * share * graph.epsilon
+    return max((float(abs(1.0 - step * mu)) for mu in values if abs(mu) > _ROUNDING), default=0.0)
 
 
 def default_settle_max(num_ramp_ticks: int, lambda_2: float) -> int:

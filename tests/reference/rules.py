@@ -31,6 +31,14 @@ def mix(own: Float64Array, differences: Sequence[tuple[float, Float64Array]], ep
     return own + 2.0 * epsilon * total
 
 
+def weighted_difference(own: Float64Array, other: Float64Array) -> Float64Array:
+    """Return c_j / (c_i + c_j) (h_j - h_i); c is the largest |h| over a cell's classes. 0 where both c are 0."""
+    c_i, c_j = (np.abs(values).max(axis=-1, keepdims=True) for values in (own, other))
+    total = c_i + c_j
+    share: Float64Array = np.divide(c_j, total, out=np.zeros_like(total), where=total > 0.0)
+    return share * (other - own)
+
+
 def gradient_step(mixed: Float64Array, log_likelihood: Float64Array, gamma: float) -> Float64Array:
     """Return h~ + gamma g, g_c = sigma_c (sum_m sigma_m D_m - D_c), D = h~ - log q. Alg. 1, lines 7 to 12."""
     delta = mixed - log_likelihood

@@ -13,7 +13,7 @@ from reference.scenarios import TeamShape, make_scenario
 from reference.twin import STOPPED_CONVERGED, STOPPED_MAX, STOPPED_OFF, Twin, record
 
 HIT_CELL = (2, 0, 0)
-ALL_RULES = ("gradient", "bayes", "natural", "local")
+ALL_RULES = ("gradient", "bayes", "natural", "local", "weighted")
 
 
 def _run(frames, robot_ids="ab", **parameters):

@@ -218,7 +218,9 @@ class Twin:
         num_finer = flows.num_finer_ticks(self.maps, self.flow_bits, self.quantum)
         most = consensus.settle_max
         if most is None:
-            most = graph.default_settle_max(consensus.settle, graph.second_eigenvalue(team))
+            # Maps that agree have equal certainties, so that 'weighted' mixes them with half the step size.
+            share = 0.5 if consensus.rule == "weighted" else 1.0
+            most = graph.default_settle_max(consensus.settle, graph.second_eigenvalue(team, share))
             most += max(flows.EXTRA_SETTLING_TICKS, num_finer) if self.flow_bits else 0
         # Every flow is at least the quantum, so that no flow is below this tolerance.
         tolerance = min(consensus.settle_tolerance, self.quantum) if self.flow_bits else consensus.settle_tolerance
@@ -305,7 +307,7 @@ class Twin:
     def _integrate_before(self, stamp_ns: int) -> None:
         """Integrate the remaining scans with stamps before ``stamp_ns``, in order of (stamp, robot).
 
-        With rule 'bayes' every robot's new evidence enters its map, active or not.
+        With rules 'bayes' and 'weighted' every robot's new evidence enters its map, active or not.
         """
         changed = set()
         while self.num_integrated < len(self.scans) and self.scans[self.num_integrated].stamp_ns < stamp_ns:
@@ -317,7 +319,7 @@ class Twin:
             self.num_integrated += 1
         for robot in changed:
             self.log_q[robot] = self.sums[robot].log_likelihood(self.config.consensus.evidence)
-            if self.config.consensus.rule == "bayes":
+            if self.config.consensus.rule in ("bayes", "weighted"):
                 self._add_evidence(robot)
 
     def _add_evidence(self, robot: int) -> None:
@@ -382,6 +384,8 @@ class Twin:
             own = exchange.published[robot] if is_mutual else self._base(current)
             if is_mutual and stage.flow_bits:
                 amounts += self._flow(own, other, 2.0 * team.epsilon * weight, stage)
+            elif self.config.consensus.rule == "weighted":
+                differences.append((weight, rules.weighted_difference(own, other)))
             else:
                 differences.append((weight, other - own))
         return rules.mix(current, differences, team.epsilon) + amounts
@@ -414,6 +418,9 @@ class Twin:
             self.maps[robot] = result if stage.settling else rules.rounded(result, self.quantum)
         elif consensus.rule == "bayes":
             self.maps[robot] = rules.free_is_zero(mixed)
+        elif consensus.rule == "weighted":
+            result = rules.free_is_zero(mixed)
+            self.maps[robot] = result if stage.settling else rules.rounded(result, self.quantum)
         elif consensus.rule == "merge":
             self.maps[robot] = rules.merge_step(
                 mixed, log_q, self.log_q_used[robot], self.sensor.clamp_min, self.sensor.clamp_max
@@ -425,8 +432,7 @@ class Twin:
 
     def _count_averaged(self, team: TeamGraph, active: tuple[bool, ...]) -> None:
         """Update the number of robots that each active robot's map is the mean of: those that reach it, and itself."""
-        consensus = self.config.consensus
-        if consensus.rule in ("local", "merge") or consensus.evidence != "sum":
+        if not self.config.consensus.map_is_mean:
             return
         for robot in np.flatnonzero(active).tolist():
             reaching = {robot}

@@ -31,6 +31,8 @@ CONFIGURATIONS = {
     "ratio, loss": {"rule": "ratio", "loss": 0.2, "packets": "full"},
     "flood, late": {"rule": "flood", "loss": 0.2, "latency": 0.7, "grid_every": 1.0, "octomap_every": 2.0},
     "merge": {"rule": "merge"},
+    "weighted, loss": {"rule": "weighted", "loss": 0.2},
+    "latest, late": {"rule": "latest", "loss": 0.2, "latency": 0.7},
     "on arrival, late": {"mode": "on-arrival", "latency": 1.5, "jitter": 0.5},
     "rate": {"rate": 20_000.0, "queue": "newest"},
     "budget": {"budget": 20_000},

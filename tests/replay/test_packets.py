@@ -45,7 +45,9 @@ def test_rounding_in_packets_conserves_the_evidence_of_the_team(name, packets):
     assert all(robot.agreement > 0.99 and robot.agreement_occupied > 0.99 for robot in tick.metrics.robots)
 
 
-@pytest.mark.parametrize(("rule", "mode"), one_in(5, ["gradient", "bayes", "natural", "merge"], ["sync", "on-arrival"]))
+@pytest.mark.parametrize(
+    ("rule", "mode"), one_in(5, ["gradient", "bayes", "natural", "merge", "weighted"], ["sync", "on-arrival"])
+)
 def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
     parameters = {"rule": rule, "mode": mode, "topology": "ring", "settle": 3, "settle_max": 4}
     sessions = [
@@ -63,7 +65,7 @@ def test_deltas_give_the_same_maps_as_whole_packets(rule, mode):
 @pytest.mark.parametrize(
     ("rule", "radio"),
     one_in(
-        4, ["flood", "gradient", "bayes", "merge"],
+        4, ["flood", "gradient", "bayes", "merge", "weighted", "latest"],
         [{"latency": 1.5, "loss": 0.3, "network_seed": 2}, {"content": "int8"}],
     ),
     ids=str,

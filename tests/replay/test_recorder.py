@@ -64,6 +64,7 @@ def test_a_map_is_the_mean_of_the_robots_of_its_component(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("parameters", "expected"),
     [({"rule": "flood"}, 3), ({"rule": "local"}, 1), ({"rule": "merge"}, 1),
+     ({"rule": "weighted"}, 1), ({"rule": "latest"}, 1),
      ({"rule": "gradient", "evidence": "time-average"}, 1)],
     ids=str,
 )  # fmt: skip

@@ -19,7 +19,7 @@ from support.scans import with_confidences
 from support.sessions import sent_packets
 from support.twin_comparison import SMALL, compare, compare_frames, scenario_of, sources_of, unrounded
 
-RULES = ("gradient", "bayes", "natural", "local")
+RULES = ("gradient", "bayes", "natural", "local", "weighted")
 MODES = ("sync", "on-arrival")
 TOPOLOGIES = ("complete", "ring", "line", "star", "edges")
 FOUR = TeamShape(num_robots=4, sensors="mixed")

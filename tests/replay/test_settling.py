@@ -50,7 +50,7 @@ def _ticks(rate):
 # --- without faults ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "ratio", "flood", "merge"])
+@pytest.mark.parametrize("rule", ["gradient", "bayes", "natural", "ratio", "flood", "merge", "weighted", "latest"])
 @pytest.mark.parametrize("topology", ["complete", "ring", "line", "star"])
 def test_without_faults_settling_needs_one_quiet_tick_and_the_graph_limits_its_ticks(topology, rule):
     graph, config = _team(topology=topology, rule=rule)
@@ -97,7 +97,7 @@ def test_given_numbers_override_the_links():
         assert num_settle_ticks(*_team(settle=0, loss=loss, latency=3.0)) == 0
 
 
-@pytest.mark.parametrize("rule", ["ratio", "flood", "merge", "local"])
+@pytest.mark.parametrize("rule", ["ratio", "flood", "merge", "latest", "local"])
 def test_an_unused_step_size_changes_nothing(rule):
     expected = num_settle_ticks(*_team(rule=rule, topology="line"))
     assert num_settle_ticks(*_team(rule=rule, topology="line", epsilon=5.0)) == expected

@@ -28,6 +28,8 @@ from support.fixture_paths import PAIR_TEAM
         ),
         ({"rule": "bayes", "packets": "delta", "budget": 9000}, "drifts from the mean; use --rule flood"),
         ({"rule": "merge"}, "rule 'merge' counts received evidence again in every tick"),
+        ({"rule": "weighted"}, "rule 'weighted' does not keep the sum of the team's evidence"),
+        ({"rule": "latest"}, "rule 'latest' keeps the evidence of one robot in each cell"),
     ],
 )
 def test_a_run_warns_of_faults_that_its_rule_does_not_tolerate(parameters, sentence):

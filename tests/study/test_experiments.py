@@ -24,10 +24,10 @@ pytestmark = pytest.mark.long
 
 
 NUM_RUNS = {
-    "rules": {"rules": 8 * 2 * 2},
+    "rules": {"rules": 10 * 2 * 2},
     "forgetting": {"cut": 9 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
-    "radio": {"radio": 4 * 6 * 2, "delay": 4 * 4 * 2},
+    "radio": {"radio": 6 * 6 * 2, "delay": 6 * 4 * 2},
     "noise": {"noise": 14 * 3 * 2},
     "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2, "confidences": 3 * 5 * 2, "confidences_prior": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},

@@ -79,7 +79,7 @@ def unrounded(rule):
 
     Where float32 and float64 are on different sides of the middle of a quantum, their maps differ by the quantum.
     """
-    return {"quantum": 0.0} if RULES[rule].has_gamma else {}
+    return {"quantum": 0.0} if RULES[rule].default_quantum and not RULES[rule].has_flows else {}
 
 
 def compare(

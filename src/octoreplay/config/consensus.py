@@ -23,7 +23,8 @@ class ConsensusConfig:
         "bayes",
         "consensus rule: bayes (Bayes' rule with averaging), gradient (Alg. 1 of the paper), natural (natural"
         " gradient), ratio and flood (exact in spite of lost packets), merge (baseline that counts evidence"
-        " repeatedly), local (no exchange)",
+        " repeatedly), weighted (baseline that weighs cells by certainty), latest (baseline in which the last change"
+        " of a cell wins), local (no exchange)",
         choices=tuple(RULES),
         is_common=True,
     )
@@ -68,8 +69,8 @@ class ConsensusConfig:
     )
     quantum: float | None = parameter(
         None,
-        "smallest step of log-odds, a power of two, for evidence sum and the rules bayes, gradient and natural; 0: none"
-        " (default: 2^-16 for bayes, 2^-10 for gradient and natural)",
+        "smallest step of log-odds, a power of two, for evidence sum and the rules bayes, gradient, natural and"
+        " weighted; 0: none (default: 2^-16 for bayes, 2^-10 for the others)",
         minimum=0.0,
     )
     merge_weight: float | None = parameter(

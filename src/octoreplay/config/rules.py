@@ -42,6 +42,9 @@ class Rule:
         Default step of log-odds with evidence 'sum', a power of two; 0 where the rule has none.
     adds_evidence_first : bool
         True where new evidence enters the map before it is published, in every tick.
+    weighs_certainty : bool
+        True where a neighbour's cell counts by its certainty relative to the receiver's. Maps that agree then mix with
+        half the step size, and epsilon is bounded so that the mixed map stays a weighted mean of maps.
     mixes_differences : bool
         True where neighbours' maps enter as differences h_j - h_i, False where they are added whole.
     map_is_mean : bool
@@ -71,6 +74,7 @@ class Rule:
     has_flows: bool = False
     default_quantum: float = 0.0
     adds_evidence_first: bool = False
+    weighs_certainty: bool = False
     mixes_differences: bool = True
     map_is_mean: bool = True
     needs_symmetric_links: bool = False
@@ -114,6 +118,27 @@ _RULES = (
         keeps_last_evidence=True,
         warning="rule 'merge' counts received evidence again in every tick; it is a baseline, not a map to trust;"
         " --rule bayes counts it once",
+    ),
+    Rule(
+        name="weighted",
+        exchanges=Exchanged.MAP,
+        has_step_size=True,
+        default_quantum=2.0**-10,
+        adds_evidence_first=True,
+        weighs_certainty=True,
+        map_is_mean=False,
+        keeps_last_evidence=True,
+        warning="rule 'weighted' does not keep the sum of the team's evidence, because robots that are sure count more;"
+        " it is a baseline, not a map to trust; --rule bayes and --rule flood keep the sum",
+    ),
+    Rule(
+        name="latest",
+        exchanges=Exchanged.EVIDENCE,
+        map_is_mean=False,
+        keeps_last_evidence=True,
+        modes=("sync",),
+        warning="rule 'latest' keeps the evidence of one robot in each cell and drops that of the others; it is a"
+        " baseline, not a map to trust; --rule flood sums the evidence of all robots",
     ),
     Rule(name="local", exchanges=Exchanged.NOTHING, map_is_mean=False),
 )

@@ -31,6 +31,7 @@ class Update(IntEnum):
     ADD = consensus_kernels.ADD
     MERGE = consensus_kernels.MERGE
     COPY = consensus_kernels.COPY
+    WEIGHTED = consensus_kernels.WEIGHTED
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +129,12 @@ def team_step(
     - ``MIX``: h_i = h~;
     - ``ADD``: h_i = h~ + log q_i - log q_i at the last iteration;
     - ``MERGE``: as ``ADD``, then clamped to ``clamp``; with an empty ``base`` it adds w_ij h_j at every arrival;
-    - ``COPY``: h_i = log q_i.
+    - ``COPY``: h_i = log q_i;
+    - ``WEIGHTED``: h_i = h~ with f_ij = w_ij c_j / (c_i + c_j) (h_j - b_i), where the certainty c of a cell is its
+      largest |log-odds| over the classes in h_j and b_i, after the consensus of RAMEN (Zhao, Ivanovic and Mehr,
+      arXiv:2502.19592). It takes no flows.
 
-    ``GRADIENT`` and ``NATURAL`` round the new values to multiples of ``quantum``; 0 does not round.
+    ``GRADIENT``, ``NATURAL`` and ``WEIGHTED`` round the new values to multiples of ``quantum``; 0 does not round.
 
     h_i[0] stays 0. Changed bricks get ``revision``. The result equals that of the same steps done cell by cell and
     robot by robot, and does not depend on ``threads``. No robot's ``own`` may be among another robot's neighbours.

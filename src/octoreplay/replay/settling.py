@@ -150,12 +150,14 @@ def settle_ticks_max(graph: CommunicationGraph, consensus: ConsensusConfig, epsi
     """Largest number of settling ticks on a graph without losses and delays; 0 without settling.
 
     It is ``settle_max``, or ``settle`` + 12 / -log10 lambda_2 rounded up: so many ticks after gamma's ramp shrink the
-    disagreement by 1e12.
+    disagreement by 1e12. Rules that weigh certainty mix maps that agree with half of epsilon.
     """
     if consensus.settle == 0:
         return 0
     if consensus.settle_max is not None:
         return consensus.settle_max
+    if consensus.traits.weighs_certainty:
+        epsilon *= 0.5
     rate = min(max(graph.lambda_2(epsilon), 1e-12), 1.0 - 1e-9)  # keeps the number of ticks above 0 and finite
     return consensus.settle + math.ceil(12.0 / -math.log10(rate))
 

@@ -74,7 +74,7 @@ def _graph(tick, consensus=None):
 @given(
     _ticks(),
     st.none() | st.floats(0.05, 1.2),
-    st.sampled_from(["gradient", "bayes", "local", "flood"]),
+    st.sampled_from(["gradient", "bayes", "local", "flood", "weighted"]),
     st.integers(1, 30),
 )
 def test_every_graph_equals_the_reference(tick, epsilon, rule, settle):
@@ -109,7 +109,8 @@ def test_every_graph_equals_the_reference(tick, epsilon, rule, settle):
     assert graph.epsilon_bound == pytest.approx(reference.step_size_bound(expected.weights), rel=1e-6)
     lambda_2 = reference.second_eigenvalue(expected)
     assert graph.lambda_2(expected.epsilon) == pytest.approx(lambda_2, rel=1e-12, abs=1e-14)
-    most = reference.default_settle_max(settle, lambda_2)
+    rate = reference.second_eigenvalue(expected, 0.5) if rule == "weighted" else lambda_2
+    most = reference.default_settle_max(settle, rate)
     assert settle_ticks_max(graph, consensus, expected.epsilon) == most
 
 

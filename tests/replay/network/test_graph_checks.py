@@ -25,7 +25,7 @@ def test_a_step_size_at_the_bound_is_refused_with_the_bound_and_the_remedy():
     )
 
 
-@pytest.mark.parametrize("rule", ["local", "ratio", "flood", "merge"])
+@pytest.mark.parametrize("rule", ["local", "ratio", "flood", "merge", "latest"])
 def test_rules_without_a_step_size_have_no_bound(rule):
     assert step_size(built(3), ConsensusConfig(epsilon=50.0, rule=rule)) == 50.0
 
@@ -35,6 +35,19 @@ def test_the_whole_team_is_checked_before_a_run(rule):
     check_team_graph(NetworkConfig(), ConsensusConfig(epsilon=0.99, rule=rule), NAMES)
     with pytest.raises(ConfigError, match="7 of 7 robots active"):
         check_team_graph(NetworkConfig(), ConsensusConfig(epsilon=1.0, rule=rule), NAMES)
+
+
+def test_the_rule_that_weighs_certainty_has_the_bound_of_a_weighted_mean():
+    """On a star the weights at the centre sum to 6/7, the largest eigenvalue is 1, and bayes takes epsilon up to 1."""
+    star = built(7, "star")
+    weighted = ConsensusConfig(epsilon=0.58, rule="weighted")
+    assert step_size(star, weighted) == 0.58
+    assert star.mean_bound == pytest.approx(7 / 12)
+    with pytest.raises(ConfigError, match=r"epsilon: 0\.59 is not below 0\.583333, the bound of this graph"):
+        step_size(star, ConsensusConfig(epsilon=0.59, rule="weighted"))
+    assert step_size(star, ConsensusConfig(epsilon=0.99, rule="bayes")) == 0.99
+    assert step_size(built(7, weights="degree"), ConsensusConfig(rule="weighted")) == pytest.approx(0.45)
+    assert built(1).mean_bound == math.inf
 
 
 def test_every_state_of_the_schedule_is_checked_before_a_run():

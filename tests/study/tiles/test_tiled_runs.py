@@ -24,7 +24,8 @@ OF_TILES = {"packet_bytes", "sent_bytes", "delivered_bytes", "memory_bytes", "un
             "bytes_per_second"}  # fmt: skip
 """Numbers that are sums over tiles, not those of the whole map."""
 OF_PACKETS = {"num_sent", "num_delivered", "num_late", "num_stale"}
-"""Numbers of the packets of rule 'flood', which sends a tile's evidence only where that changed."""
+"""Numbers of the packets of rules 'flood' and 'latest', which send a tile's evidence only where that changed."""
+FORWARDS_EVIDENCE = ("flood", "latest")
 CONFIGURATIONS = {
     "defaults": {},
     "gradient": {"rule": "gradient", "packets": "full"},
@@ -34,6 +35,8 @@ CONFIGURATIONS = {
     "ratio, loss": {"rule": "ratio", "loss": 0.2, "packets": "full"},
     "flood": {"rule": "flood", "latency": 0.7},
     "merge": {"rule": "merge"},
+    "weighted, loss, late": {"rule": "weighted", "loss": 0.3, "latency": 0.7, "jitter": 0.3},
+    "latest, range": {"rule": "latest", "latency": 0.7, "topology": "range", "radio_range": 4.0},
     "on arrival": {"mode": "on-arrival", "latency": 1.5, "jitter": 0.5},
     "int8": {"content": "int8"},
     "time average": {"rule": "gradient", "evidence": "time-average"},
@@ -112,7 +115,7 @@ def test_tiles_give_the_result_of_the_whole_run(tmp_path: Path, parameters, cut_
         metrics = one.metrics()
         assert len(metrics) == len(other.metrics())
         for before, now in zip(metrics, other.metrics(), strict=True):
-            check_metrics(before, now, OF_TILES | (OF_PACKETS if config.consensus.rule == "flood" else set()))
+            check_metrics(before, now, OF_TILES | (OF_PACKETS if config.consensus.rule in FORWARDS_EVIDENCE else set()))
         assert one.topics == other.topics
     assert messages_of(tmp_path / "whole.mcap") == messages_of(tmp_path / "tiled.mcap")
     assert (tiled.stop_reason, tiled.num_settling_ticks) == (whole.stop_reason, whole.num_settling_ticks)

@@ -33,7 +33,7 @@ from octoreplay.mapping.kernels.storage import (
     prune_brick,
 )
 
-GRADIENT, NATURAL, MIX, ADD, MERGE, COPY = 0, 1, 2, 3, 4, 5
+GRADIENT, NATURAL, MIX, ADD, MERGE, COPY, WEIGHTED = 0, 1, 2, 3, 4, 5, 6
 """Updates; octoreplay.mapping.consensus.team_step gives their equations."""
 
 
@@ -190,6 +190,61 @@ def _add_differences(mixed_at, base_at, a_at, b_at, c_at, a_weight, b_weight, c_
 
 
 @kernel
+def _largest_over_classes(values_at, terms_at, octets, num_shared, rows, num_classes):
+    """Write the largest value over all classes of each cell into the shared rows of non-negative values.
+
+    - ``values_at``: address of the values (rows, 8), in place; class rows are kept.
+    - ``terms_at``: address of 64 float32, output: number of classes of each shared row's cells without a class row.
+    - ``octets``, ``num_shared``, ``rows``, ``num_classes``: as for ``_add_gradient``.
+    """
+    shared_size = num_shared * OCTETS
+    values, terms = float_array(values_at, (shared_size,)), float_array(terms_at, (shared_size,))
+    for i in range(shared_size):
+        terms[i] = np.float32(num_classes)
+    for r in range(num_shared, rows):
+        for k in range(OCTETS):
+            terms[octets[r] * OCTETS + k] -= np.float32(1.0)
+    for i in range(shared_size):
+        # Where every class has a row of its own, the shared row stands for none.
+        values[i] = values[i] if terms[i] > np.float32(0.0) else np.float32(0.0)
+    for r in range(num_shared, rows):
+        max_octet(values_at + octets[r] * ROW_BYTES, values_at + r * ROW_BYTES)
+
+
+@kernel
+def _write_certainties(certainty_at, map_at, terms_at, octets, num_shared, rows, num_classes):
+    """Write each cell's largest |log-odds| over the classes into all its rows.
+
+    - ``certainty_at``, ``map_at``: addresses of the output and the map (rows, 8).
+    - ``terms_at``, ``octets``, ``num_shared``, ``rows``, ``num_classes``: as for ``_largest_over_classes``.
+    """
+    size = rows * OCTETS
+    certainty, values = float_array(certainty_at, (size,)), float_array(map_at, (size,))
+    for i in range(size):
+        certainty[i] = abs(values[i])
+    _largest_over_classes(certainty_at, terms_at, octets, num_shared, rows, num_classes)
+    for r in range(num_shared, rows):
+        copy_octet(certainty_at + r * ROW_BYTES, certainty_at + octets[r] * ROW_BYTES)
+
+
+@kernel
+def _add_weighted(mixed_at, base_at, map_at, own_certainty_at, certainty_at, weight, size):
+    """Add weight x c_map / (c_base + c_map) x (map - base) to the mixed map, all (size,) float32.
+
+    - ``mixed_at``, ``base_at``, ``map_at``: addresses of the mixed map, in place, the base and the map.
+    - ``own_certainty_at``, ``certainty_at``: addresses of the certainties of the base and of the map.
+    - ``weight``: float32.
+    - ``size``: number of values.
+    """
+    mixed, base, other = float_array(mixed_at, (size,)), float_array(base_at, (size,)), float_array(map_at, (size,))
+    own_certainty, certainty = float_array(own_certainty_at, (size,)), float_array(certainty_at, (size,))
+    for i in range(size):
+        # Where both are 0, so are both maps.
+        total = max(own_certainty[i] + certainty[i], np.float32(1e-30))
+        mixed[i] += weight * (certainty[i] / total) * (other[i] - base[i])
+
+
+@kernel
 def _is_at_rest(base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, gate):
     """Return True where the gate holds a link's flow back in all cells of a brick.
 
@@ -260,19 +315,10 @@ def _add_flows(
     """
     size, shared_size = rows * OCTETS, num_shared * OCTETS
     mixed, base, other = float_array(mixed_at, (size,)), float_array(base_at, (size,)), float_array(map_at, (size,))
-    steps, terms = float_array(scratch_at, (size,)), float_array(terms_at, (shared_size,))
+    steps = float_array(scratch_at, (size,))
     for i in range(size):
         steps[i] = max(abs(base[i]), abs(other[i]))
-    for i in range(shared_size):
-        terms[i] = np.float32(num_classes)
-    for r in range(num_shared, rows):
-        for k in range(OCTETS):
-            terms[octets[r] * OCTETS + k] -= np.float32(1.0)
-    for i in range(shared_size):
-        # Where every class has a row of its own, the shared row stands for none.
-        steps[i] = steps[i] if terms[i] > np.float32(0.0) else np.float32(0.0)
-    for r in range(num_shared, rows):
-        max_octet(scratch_at + octets[r] * ROW_BYTES, scratch_at + r * ROW_BYTES)
+    _largest_over_classes(scratch_at, terms_at, octets, num_shared, rows, num_classes)
     if gate > np.float32(0.0) and _is_at_rest(
         base_at, map_at, scratch_at, spare_at, terms_at, octets, num_shared, rows, room, gate
     ):
@@ -311,9 +357,10 @@ def team_step(
     - ``flow_shares`` float32: largest power of two in a cell to the step of its flow, parallel to ``columns``.
     - ``flow_gates`` (R,) float32: least difference of a moving cell, relative to its largest |log-odds|; 0 for none.
     - ``has_plain`` (R,) bool: True where any of a robot's ``weights`` is not 0.
-    - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT and NATURAL; 0 for none.
+    - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT, NATURAL and
+      WEIGHTED; 0 for none.
     - ``gammas`` (R,) float32: gradient step sizes.
-    - ``update``: GRADIENT, NATURAL, MIX, ADD, MERGE or COPY.
+    - ``update``: GRADIENT, NATURAL, MIX, ADD, MERGE, COPY or WEIGHTED.
     - ``num_classes``: C.
     - ``clamp_min``, ``clamp_max``: float32, limits of the log-odds, used by MERGE alone.
     - ``layouts`` (R n, W) uint64, ``known`` (R n,) uint64: class rows and known cells of the own bricks.
@@ -361,7 +408,13 @@ def team_step(
                         mixed_at, base_at, places[k], gradient_at, delta_at, terms_at, octets, num_shared, rows, room,
                         num_classes, flow_weights[first + k], flow_shares[first + k], flow_gates[robot], least_step,
                     )  # fmt: skip
-            for k in range(FIRST_NEIGHBOUR, num_columns if has_plain[robot] else 0, 3):
+            if update == WEIGHTED:
+                _write_certainties(delta_at, base_at, terms_at, octets, num_shared, rows, num_classes)
+                for k in range(FIRST_NEIGHBOUR, num_columns):
+                    _write_certainties(gradient_at, places[k], terms_at, octets, num_shared, rows, num_classes)
+                    _add_weighted(mixed_at, base_at, places[k], delta_at, gradient_at, weights[first + k], size)
+            is_plain = has_plain[robot] and update != WEIGHTED
+            for k in range(FIRST_NEIGHBOUR, num_columns if is_plain else 0, 3):
                 b_at, b_weight, c_at, c_weight = base_at, np.float32(0.0), base_at, np.float32(0.0)
                 if k + 1 < num_columns:
                     b_at, b_weight = places[k + 1], weights[first + k + 1]
@@ -372,7 +425,7 @@ def team_step(
             if update == COPY:
                 for i in range(size):
                     mixed[i] = evidence[i]
-            elif update == MIX:
+            elif update in (MIX, WEIGHTED):
                 for i in range(size):
                     mixed[i] += own[i]
             elif update in (ADD, MERGE):
@@ -393,9 +446,9 @@ def team_step(
                     _add_gradient(
                         mixed_at, delta_at, gradient_at, room, octets, num_shared, rows, num_classes, gammas[robot]
                     )
-                if quantum > np.float32(0.0):
-                    for i in range(size):
-                        mixed[i] = np.rint(mixed[i] / quantum) * quantum
+            if update in (GRADIENT, NATURAL, WEIGHTED) and quantum > np.float32(0.0):
+                for i in range(size):
+                    mixed[i] = np.rint(mixed[i] / quantum) * quantum
             # The bits of non-negative floats have the order of the floats.
             largest = np.int32(0)
             for i in range(size):

@@ -100,6 +100,19 @@ class CommunicationGraph:
         values = self._non_zero_eigenvalues
         return max(0.5, float((values.real / np.abs(values) ** 2).min(initial=math.inf)))
 
+    @cached_property
+    def mean_bound(self) -> float:
+        """Step size up to which h_i + 2 epsilon sum_j A_ij r_ij (h_j - h_i) is a weighted mean of maps for r_ij <= 1.
+
+        The weight of h_i is at least 1 - 2 epsilon sum_j A_ij. The bound is at least 0.5, and infinite without links.
+        """
+        largest = float(self.weights.sum(axis=1).max(initial=0.0))
+        return max(0.5, 0.5 / largest) if largest else math.inf
+
+    def bound(self, consensus: ConsensusConfig) -> float:
+        """Step size below which a rule with a step size converges."""
+        return self.mean_bound if consensus.traits.weighs_certainty else self.epsilon_bound
+
     def lambda_2(self, epsilon: float) -> float:
         """Second largest |eigenvalue| of I - 2 epsilon L: the largest |1 - 2 epsilon mu| over non-zero mu.
 
@@ -224,14 +237,15 @@ def step_size(graph: CommunicationGraph, consensus: ConsensusConfig) -> float:
     """
     if consensus.epsilon is None:
         always_stable = graph.network.weights in ("metropolis", "max-degree")
-        return 0.5 if always_stable else min(0.5, 0.9 * graph.epsilon_bound)
+        return 0.5 if always_stable else min(0.5, 0.9 * graph.bound(consensus))
     # Bounds are at least 0.5, so smaller steps need no eigenvalues.
     has_bound = consensus.traits.has_step_size and consensus.epsilon >= 0.5 * (1.0 - _ROUNDING)
-    if has_bound and not consensus.epsilon < graph.epsilon_bound * (1.0 - _ROUNDING):
+    if has_bound and not consensus.epsilon < graph.bound(consensus) * (1.0 - _ROUNDING):
+        bound = graph.bound(consensus)
         raise ConfigError(
-            f"epsilon: {consensus.epsilon} is not below {graph.epsilon_bound:.6g}, the bound of this graph (topology"
+            f"epsilon: {consensus.epsilon} is not below {bound:.6g}, the bound of this graph (topology"
             f" '{graph.network.topology}', {len(graph.active)} of {len(graph.robot_ids)} robots active, weights"
-            f" '{graph.network.weights}'); use {0.9 * graph.epsilon_bound:.3g} or leave epsilon out"
+            f" '{graph.network.weights}'); use {0.9 * bound:.3g} or leave epsilon out"
         )
     return consensus.epsilon
 

@@ -1,4 +1,4 @@
-"""Rules gradient, natural, bayes, merge and local: robots that mix their neighbours' maps into their own."""
+"""Rules gradient, natural, bayes, merge, weighted and local: robots that mix their neighbours' maps into their own."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Rule flood: robots that forward the evidence of all robots.
+"""Rule flood: robots that forward the evidence of all robots and sum it.
 
-Neighbours pass on versions of every robot's evidence, and each robot sums the evidence that it holds. The sum is exact
-on every connected graph, in spite of lost, repeated and reordered packets. It takes N maps in memory and in packets,
-where the consensus rules take one.
+The sum is exact on every connected graph, in spite of lost, repeated and reordered packets.
 """
 
 from __future__ import annotations
@@ -16,40 +14,18 @@ from octoreplay.config.resolved import ResolvedRun
 from octoreplay.mapping.consensus import Evidence, sum_of_evidence
 from octoreplay.mapping.octree import SemanticOctree
 from octoreplay.mapping.snapshot import Snapshot
-from octoreplay.replay.exchange.messages import HeldMap, MapMessage, Source
+from octoreplay.replay.exchange.messages import Source
 from octoreplay.replay.exchange.packet_codec import PacketCodec
-from octoreplay.replay.exchange.public_map import PublicMap
-from octoreplay.replay.robots.robot import Arrival, Phase, Robot, Team, Turn
+from octoreplay.replay.robots.forwarding import ForwardingRobot
+from octoreplay.replay.robots.robot import Arrival, Phase, Team, Turn
 
 
-class FloodRobot(Robot):
-    """Robot that publishes all evidence that it holds; h_i is the sum over the robots divided by N.
-
-    After a restart without memory, the robot receives the evidence of its earlier epochs from the others.
-    """
+class FloodRobot(ForwardingRobot):
+    """Robot that forwards evidence; h_i is the sum over the robots divided by N."""
 
     def __init__(self, index: int, config: ResolvedRun, packet_codec: PacketCodec, epoch: int = 0) -> None:
         super().__init__(index, config, packet_codec, epoch)
-        self._public = PublicMap(config, packet_codec, self.source)
         self._summed: dict[Source, int] = {}
-
-    def advance_map(self, tick: int) -> None:
-        """Advance the published evidence to this tick."""
-        self._update_log_likelihood(tick)
-        mine = self.exchange.held.get(self.source)
-        if not self._is_behind(mine):
-            return
-        # The scans of a tick precede its publication.
-        new = self._public.advance(
-            self._log_likelihood, (self._public.version or 0) + 1, tick, num_shares=max(len(self.exchange.held), 1)
-        )
-        if mine is None or (new.octree.revisions >= mine.version).any():
-            self.exchange.hold(self.source, new)
-
-    def publish(self, receivers: Sequence[int], tick: int) -> list[tuple[tuple[int, ...], MapMessage]]:
-        """Evidence, by origin, that the neighbours are not known to hold."""
-        del tick
-        return self.exchange.outbox(receivers, sorted(self.exchange.held), keep_alive=False)
 
     def sum_up(self, arrived: Sequence[Arrival], tick: int) -> float:
         """Update the sum where evidence changed; the largest change of a log-odds."""
@@ -71,12 +47,6 @@ class FloodRobot(Robot):
         self.num_iterations += 1
         self._measure_map(tick)
         return self._change_since(before.saved, tick)
-
-    def _is_behind(self, mine: HeldMap | None) -> bool:
-        """True when some of the evidence is not published, because it is new or held back by the budget."""
-        if mine is None or not self._public.is_exact:
-            return True
-        return bool((self._log_likelihood.revisions >= mine.version + 1).any())
 
     def _octrees(self) -> list[SemanticOctree]:
         return [*super()._octrees(), *(held.octree for held in self.exchange.held.values())]

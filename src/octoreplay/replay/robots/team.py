@@ -12,6 +12,7 @@ from octoreplay.mapping.consensus import Update
 from octoreplay.replay.exchange.packet_codec import PacketCodec
 from octoreplay.replay.robots.consensus import ConsensusTeam
 from octoreplay.replay.robots.flood import FloodTeam
+from octoreplay.replay.robots.latest import LatestTeam
 from octoreplay.replay.robots.ratio import RatioTeam
 from octoreplay.replay.robots.robot import Robot, Team
 
@@ -21,9 +22,11 @@ TEAMS: Mapping[str, Callable[[ResolvedRun, PacketCodec], Team[Any]]] = MappingPr
         "bayes": partial(ConsensusTeam, update=Update.MIX),
         "natural": partial(ConsensusTeam, update=Update.NATURAL),
         "merge": partial(ConsensusTeam, update=Update.MERGE),
+        "weighted": partial(ConsensusTeam, update=Update.WEIGHTED),
         "local": partial(ConsensusTeam, update=Update.COPY),
         "ratio": RatioTeam,
         "flood": FloodTeam,
+        "latest": LatestTeam,
     }
 )
 """Team of every rule in ``config.rules.RULES``."""

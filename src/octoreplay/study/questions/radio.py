@@ -32,7 +32,10 @@ _DELAYS = {
     ("0.2", "0.2"): "ticks of 0.2 s, 0.2 s delay",
 }
 """Names by the length of a tick, which is called publish_period, and latency; all robots publish once a second."""
-_RULES = ("gradient+int8+0.02", "bayes+int8+0.02", "ratio+-+-", "flood+int8+0.05")
+_RULES = (
+    "gradient+int8+0.02", "bayes+int8+0.02", "weighted+int8+0.02", "ratio+-+-", "flood+int8+0.05", "latest+int8+0.05",
+)  # fmt: skip
+"""Rule, content and int8_step. 'weighted' has the packets of 'bayes', and 'latest' those of 'flood'."""
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:

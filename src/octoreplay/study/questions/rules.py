@@ -7,7 +7,7 @@ from octoreplay.report.experiment_plots import Dots
 from octoreplay.study.experiments import Experiment, Plan, Question
 from octoreplay.study.questions.settings import AGREEMENTS, LAST_MAPS, RADIO_RANGE, villages
 
-_RULES = ("local", "gradient", "natural", "bayes", "ratio", "flood", "merge")
+_RULES = ("local", "gradient", "natural", "bayes", "ratio", "flood", "merge", "weighted", "latest")
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:
