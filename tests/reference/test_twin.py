@@ -63,11 +63,12 @@ def test_hit_other_applies_to_the_other_classes_of_a_hit_cell():
     assert _at(ticks[-1], 0, key=(1, 0, 0)) == [-0.2, -0.2]
 
 
-def test_hits_are_weighted_by_their_strength():
+@pytest.mark.parametrize(("model", "of_others"), [("hit", -0.7), ("tempered", -0.7 * 0.2)])
+def test_hits_are_weighted_by_their_strength(model, of_others):
     sure = np.array([[51]], np.uint8)
     frames = [dataclasses.replace(ray("a", 0.0, 2), confidence_image=sure), ray("a", 0.1, 2)]
-    ticks, twin = _run(frames, "a", rule="local", settle=0, hit=1.5, hit_other=-0.7)
-    np.testing.assert_allclose(_at(ticks[-1], 0), [-1.4, 1.5 + 0.3])
+    ticks, twin = _run(frames, "a", rule="local", settle=0, hit=1.5, hit_other=-0.7, confidence_model=model)
+    np.testing.assert_allclose(_at(ticks[-1], 0), [-0.7 + of_others, 1.5 + 0.3])
     assert twin.sums[0].num_touching_scans.tolist() == [2, 2, 2]
 
 

@@ -22,7 +22,7 @@ class SensorConfig:
         None, "log-odds added to the other classes of the cell where a ray ends (default: miss)"
     )
     confidence_model: str = parameter(
-        "hit",
+        "tempered",
         "what the confidence of a label changes: nothing (none), hit (hit), hit and hit_other by the same factor"
         " (tempered), or the class alone (mixture)",
         choices=("none", "hit", "tempered", "mixture"),

@@ -400,7 +400,7 @@ class ResultReader:
 _WITHOUT_CHECKSUMS = "2"
 """Result format whose metadata have no checksums."""
 
-_FORMER_DEFAULTS = {"packets": "full", "flow_bits": 4}
+_FORMER_DEFAULTS = {"packets": "full", "flow_bits": 4, "confidence_model": "hit"}
 """Parameters of results that do not name all of them, and were written before these defaults changed."""
 
 _DAMAGE = (McapError, ZstdError, SerdeError, TypesysError, AssertionError, struct.error, LookupError, ValueError,
