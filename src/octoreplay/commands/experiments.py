@@ -114,8 +114,15 @@ def _folder_argument(name: str) -> Callable[[Any], Any]:
     return click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False)
 
 
+_SIMULATED: dict[str, tuple[float, int]] = {}
+"""Length of the logs [s] and number of villages of the experiments with simulated teams, by name."""
+_RECORDED: list[str] = []
+"""Names of the experiments with recorded teams."""
+
+
 def _add_experiment(name: str, duration: float, num_villages: int, question: str, *, is_timed: bool = False) -> None:
     """Add the command of one experiment with simulated teams; ``is_timed`` if it measures time."""
+    _SIMULATED[name] = (duration, num_villages)
 
     def run_and_report(
         folder: Path,
@@ -169,6 +176,7 @@ _add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and whic
 
 def _add_recorded(name: str, question: str, runs: str) -> None:
     """Add the command of one experiment with recorded teams; ``runs`` says what is done with each team."""
+    _RECORDED.append(name)
 
     def run_and_report(
         folder: Path, data: tuple[Path, ...], teams: Path | None, jobs: int | None, scheduler: str | None
@@ -209,6 +217,32 @@ _add_recorded(
     "Measure how well maps of each sensor model predict what another robot measures.",
     "Each team is replayed with right frames and every sensor model.",
 )
+
+
+@experiment.command("all", short_help="Repeat all experiments with several villages, in one night.")
+@_folder_argument("all")
+@click.option(
+    "--data",
+    type=existing_path,
+    multiple=True,
+    metavar="FOLDER",
+    help="recording, as of 'real' and 'prediction', which are left out without one; may be repeated",
+)
+@_parallel_options[0]
+@prints
+def everything(folder: Path, data: tuple[Path, ...], jobs: int | None) -> int:
+    """Repeat all experiments but 'paper', with their default settings, one after the other.
+
+    Each gets a folder in DIR (default: octoreplay-all); they share the simulated teams in DIR/teams. The same command
+    continues after an interruption.
+    """
+    from octoreplay.study.questions import QUESTIONS
+
+    lock_folder(folder)
+    for name in (*_SIMULATED, *(_RECORDED if data else ())):
+        teams = QUESTIONS[name].experiment(*((data,) if name in _RECORDED else _SIMULATED[name]))
+        _answer(name, teams, folder / name, teams_folder=folder / "teams", num_jobs=jobs)
+    return 0
 
 
 def team_with_bar(folder: Path, simulation: SimulationConfig, *, replaces_others: bool = False) -> Path:
