@@ -3,9 +3,10 @@
 import itertools
 
 import numpy as np
+import pytest
 
 from octoreplay.report.comparisons import Comparison, Measure
-from octoreplay.report.experiment_plots import Curves, Dots, Squares
+from octoreplay.report.experiment_plots import Contrasts, Curves, Dots, Squares
 
 SCORE = Measure("score", "score", 2)
 BYTES = Measure("kB", "bytes", None, 1e-3, is_ratio=True)
@@ -64,6 +65,32 @@ def test_curves_have_bands_and_theory_as_a_curve() -> None:
     assert not axes.collections
     plain.canvas.draw()
     with_theory.canvas.draw()
+
+
+def test_contrasts_have_a_curve_for_every_measure_and_a_panel_for_every_group() -> None:
+    panels = {"scores": {"one": SCORE, "other": Measure("", "bytes")}, "bytes": {"one": BYTES}}
+    figure = Contrasts("runs", "step", "step", panels, "graph").draw({"runs": rows()})
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["ring\nscores", "ring\nbytes", "line\nscores", "line\nbytes"]
+    assert [len(axes.lines) for axes in figure.axes] == [2, 1, 2, 1]
+    one, other = figure.axes[0].lines
+    np.testing.assert_allclose(one.get_ydata(), [0.125, 0.525])
+    np.testing.assert_allclose(other.get_ydata(), [3500.0, 3500.0])
+    # A label has one colour in all panels.
+    assert figure.axes[1].lines[0].get_color() == one.get_color() != other.get_color()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "other"]
+    figure.canvas.draw()
+
+
+@pytest.mark.parametrize(("least", "scale"), [("0", "symlog"), ("0.01", "log")])
+def test_a_logarithmic_axis_shows_zero(least: str, scale: str) -> None:
+    found = [{**row, "step": {"0.1": least, "0.5": "2"}[row["step"]]} for row in rows()]
+    (axes,) = Contrasts("runs", "step", "step", {"scores": {"one": SCORE}}, is_log=True).draw({"runs": found}).axes
+    assert axes.get_xscale() == scale
+    assert [text.get_text() for text in axes.get_xticklabels()] == [least, "2"]
+    # Numbers have different places on the axis, that of 0 too.
+    (first, _), (second, _) = axes.transData.transform([(float(least), 0.0), (2.0, 0.0)])
+    assert second - first > 100.0
 
 
 def test_squares_have_a_colour_bar_and_the_number_of_every_pair() -> None:
