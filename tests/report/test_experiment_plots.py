@@ -84,13 +84,16 @@ def test_contrasts_have_a_curve_for_every_measure_and_a_panel_for_every_group() 
 
 @pytest.mark.parametrize(("least", "scale"), [("0", "symlog"), ("0.01", "log")])
 def test_a_logarithmic_axis_shows_zero(least: str, scale: str) -> None:
-    found = [{**row, "step": {"0.1": least, "0.5": "2"}[row["step"]]} for row in rows()]
-    (axes,) = Contrasts("runs", "step", "step", {"scores": {"one": SCORE}}, is_log=True).draw({"runs": found}).axes
+    steps = {("0.1", "1"): least, ("0.1", "2"): "0.05", ("0.5", "1"): "0.5", ("0.5", "2"): "2"}
+    found = [{**row, "step": steps[row["step"], row["gain"]]} for row in rows()]
+    figure = Contrasts("runs", "step", "step", {"scores": {"one": SCORE}}, is_log=True).draw({"runs": found})
+    figure.canvas.draw()
+    (axes,) = figure.axes
     assert axes.get_xscale() == scale
-    assert [text.get_text() for text in axes.get_xticklabels()] == [least, "2"]
-    # Numbers have different places on the axis, that of 0 too.
-    (first, _), (second, _) = axes.transData.transform([(float(least), 0.0), (2.0, 0.0)])
-    assert second - first > 100.0
+    assert [text.get_text() for text in axes.get_xticklabels()] == list(steps.values())
+    # The numbers have different places on the axis, that of 0 too.
+    places = axes.transData.transform([(float(step), 0.0) for step in steps.values()])[:, 0]
+    assert np.diff(places).min() > 0.1 * (places[-1] - places[0])
 
 
 def test_squares_have_a_colour_bar_and_the_number_of_every_pair() -> None:
