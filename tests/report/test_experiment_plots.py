@@ -69,10 +69,11 @@ def test_curves_have_bands_and_theory_as_a_curve() -> None:
 
 def test_contrasts_have_a_curve_for_every_measure_and_a_panel_for_every_group() -> None:
     panels = {"scores": {"one": SCORE, "other": Measure("", "bytes")}, "bytes": {"one": BYTES}}
-    figure = Contrasts("runs", "step", "step", panels, "graph").draw({"runs": rows()})
+    figure = Contrasts("runs", "step", "step", panels, "graph", {"bytes": 2.0}).draw({"runs": rows()})
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == ["ring\nscores", "ring\nbytes", "line\nscores", "line\nbytes"]
-    assert [len(axes.lines) for axes in figure.axes] == [2, 1, 2, 1]
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2, 2]
+    assert [list(axes.lines[-1].get_ydata()) for axes in figure.axes[1::2]] == [[2.0, 2.0]] * 2
     one, other = figure.axes[0].lines
     np.testing.assert_allclose(one.get_ydata(), [0.125, 0.525])
     np.testing.assert_allclose(other.get_ydata(), [3500.0, 3500.0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -111,8 +111,8 @@ class Curves:
 class Contrasts:
     """One panel for each group of measures and section, one curve for each measure over a column with numbers.
 
-    ``panels`` are the measures by the label of their curve, by the heading of the panel. ``is_log`` is for numbers
-    from 0 on.
+    ``panels`` are the measures by the label of their curve, by the heading of the panel. ``limits`` are lines across
+    panels, by heading. ``is_log`` is for numbers from 0 on.
     """
 
     plan: str
@@ -120,6 +120,7 @@ class Contrasts:
     x_label: str
     panels: Mapping[str, Mapping[str, Measure]]
     section: str | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
     is_log: bool = False
 
     def draw(self, found: Tables) -> Figure:
@@ -133,6 +134,8 @@ class Contrasts:
                 style(axes, f"{section}\n{heading}" if section else heading)
                 for label, measure in measures.items():
                     _draw_curve(axes, rows, self.x, measure, label, labels.index(label))
+                if heading in self.limits:
+                    axes.axhline(self.limits[heading], color="#222222", linestyle="--", linewidth=1.0)
                 if self.is_log:
                     _make_logarithmic(axes, rows, self.x)
         for axes in panels[-1]:

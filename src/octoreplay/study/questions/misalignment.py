@@ -7,8 +7,9 @@ from statistics import fmean
 from typing import Any
 
 from octoreplay.evaluate.morton_intervals import Region
+from octoreplay.mapping.contradiction import CLEAR_LIMIT
 from octoreplay.records import CENTRAL
-from octoreplay.report.comparisons import Comparison, Measure, Row
+from octoreplay.report.comparisons import Comparison, Label, Measure, Row
 from octoreplay.report.experiment_plots import Contrasts
 from octoreplay.result import open_result
 from octoreplay.simulate.settings import SimulationConfig
@@ -83,25 +84,34 @@ _MEASURES = tuple(
         Measure("gain", f"{name}_gain", 3),
     )
 )
-_OF_SHIFTS = Comparison(
-    "shifts", "shift", lambda row: f"{float(row['shift']):g} m", (*_MEASURES, _CLEAR), section="frames"
-)
-_OF_TURNS = Comparison(
-    "turns", "rotation", lambda row: f"{float(row['angle']):g}°", (*_MEASURES, _CLEAR), section="frames"
-)
 _PANELS = {
     **{
         heading: {_ALONE: Measure("", f"{name}_alone"), _TOGETHER: Measure("", f"{name}_together")}
         for name, heading in _REGIONS.items()
     },
-    _CLEAR.heading: {"largest of a pair": _CLEAR},
+    f"{_CLEAR.heading}, and its limit": {"largest of a pair": _CLEAR},
 }
+
+
+def _comparison(plan: str, name: Label) -> Comparison:
+    """Table of one kind of error for each case."""
+    return Comparison(plan, "error of a frame", name, (*_MEASURES, _CLEAR), section="frames")
+
+
+def _figure(plan: str, x: str, x_label: str) -> Contrasts:
+    """Figure of one kind of error."""
+    limits = {f"{_CLEAR.heading}, and its limit": 100.0 * CLEAR_LIMIT}
+    return Contrasts(plan, x, x_label, _PANELS, "frames", limits, is_log=True)
+
 
 QUESTION = Question(
     experiment,
-    (_OF_SHIFTS, _OF_TURNS),
+    (
+        _comparison("shifts", lambda row: f"{float(row['shift']):g} m"),
+        _comparison("turns", lambda row: f"{float(row['angle']):g}°"),
+    ),
     {
-        "shifts.png": Contrasts("shifts", "shift", "shift of a wrong frame [m]", _PANELS, "frames", is_log=True),
-        "turns.png": Contrasts("turns", "angle", "rotation of a wrong frame [degrees]", _PANELS, "frames", is_log=True),
+        "shifts.png": _figure("shifts", "shift", "shift of a wrong frame [m]"),
+        "turns.png": _figure("turns", "angle", "rotation of a wrong frame [degrees]"),
     },
 )
