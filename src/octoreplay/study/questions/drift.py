@@ -108,7 +108,7 @@ _PANELS = {
         "refined": Measure(heading, f"{name}_{REFINED}", None, factor),
     }
     for name, heading, factor in (
-        *((name, heading, 1.0) for name, heading in _NUMBERS.items()),
+        *((name, _NUMBERS[name], 1.0) for name in ("error", "iou", "occupied")),
         ("clear", _CLEAR, 100.0),
     )
 }
