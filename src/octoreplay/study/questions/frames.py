@@ -93,7 +93,10 @@ def _outcome(team: SimulatedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
 
 
 def _outcome_with_age(team: SimulatedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
-    """Age of a run's maps at the end of the logs, and the outcomes of each with the last map of every other robot."""
+    """Age of a run's maps, and the outcomes of each with the last map of every other robot.
+
+    The map of a robot some time ago is that of a run whose logs end so much earlier.
+    """
     whole = {**row, "duration": f"{team.simulation.duration:g}"}
     with open_result(sweep.result(whole)) as result, open_result(sweep.result(dict(row))) as earlier:
         (maps, T_map_own), (aged, _) = stored_maps(result), stored_maps(earlier)
