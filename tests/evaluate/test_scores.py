@@ -31,13 +31,17 @@ def truth_of(classes):
     return Truth(Path("truth.ply"), codes[order], numbers[order])
 
 
-def scores_of(cells, classes, *, prior=0.0, team=None, observed=None):
-    """Scores of a map of some cells; the team knows the cells ``team``, and ``observed`` at the end."""
+def counts_of(cells, classes, *, prior=0.0, team=None, observed=None):
+    """Counts of a map of some cells; the team knows the cells ``team``, and ``observed`` at the end."""
     octree, truth = octree_of(cells), truth_of(classes)
     region = Region([octree_of(cells if team is None else team).spans()])
     at_end = region if observed is None else Region([octree_of(observed).spans()])
-    counts = truth_counts(octree.spans(), prior, truth, region, at_end.holds(truth.codes))
-    return counts.scores(int(truth.is_class.sum()))
+    return truth_counts(octree.spans(), prior, truth, region, at_end.holds(truth.codes))
+
+
+def scores_of(cells, classes, **known):
+    """Scores of a map of some cells, as ``counts_of``."""
+    return counts_of(cells, classes, **known).scores(int(truth_of(classes).is_class.sum()))
 
 
 @st.composite
@@ -56,6 +60,18 @@ def scenes(draw):
     places = draw(st.lists(st.one_of(st.sampled_from(known), key), min_size=1, max_size=40))
     classes = {place: draw(st.sampled_from((1, 1, 2, 2, -1))) for place in places}
     return cells, team, observed, classes
+
+
+@examples(80)
+@given(scenes(), st.sampled_from((0.0, -0.8)))
+def test_the_iou_of_occupied_cells_is_that_of_scikit_learn(scene, prior):
+    cells, team, observed, classes = scene
+    counts = counts_of(cells, classes, prior=prior, team=team, observed=observed)
+    expected = dense_scores.occupied_iou(cells, team, classes, prior)
+    np.testing.assert_allclose(counts.occupied_iou, expected, equal_nan=True)
+    assert counts.mean_iou == pytest.approx(
+        scores_of(cells, classes, prior=prior, team=team, observed=observed).mean_iou, nan_ok=True
+    )
 
 
 def mean_of_true_classes(iou, region, classes):

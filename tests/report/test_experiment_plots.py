@@ -3,9 +3,10 @@
 import itertools
 
 import numpy as np
+import pytest
 
 from octoreplay.report.comparisons import Comparison, Measure
-from octoreplay.report.experiment_plots import Curves, Dots, Squares
+from octoreplay.report.experiment_plots import Contrasts, Curves, Dots, Squares
 
 SCORE = Measure("score", "score", 2)
 BYTES = Measure("kB", "bytes", None, 1e-3, is_ratio=True)
@@ -64,6 +65,36 @@ def test_curves_have_bands_and_theory_as_a_curve() -> None:
     assert not axes.collections
     plain.canvas.draw()
     with_theory.canvas.draw()
+
+
+def test_contrasts_have_a_curve_for_every_measure_and_a_panel_for_every_group() -> None:
+    panels = {"scores": {"one": SCORE, "other": Measure("", "bytes")}, "bytes": {"one": BYTES}}
+    figure = Contrasts("runs", "step", "step", panels, "graph", {"bytes": 2.0}).draw({"runs": rows()})
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["ring\nscores", "ring\nbytes", "line\nscores", "line\nbytes"]
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2, 2]
+    assert [list(axes.lines[-1].get_ydata()) for axes in figure.axes[1::2]] == [[2.0, 2.0]] * 2
+    one, other = figure.axes[0].lines
+    np.testing.assert_allclose(one.get_ydata(), [0.125, 0.525])
+    np.testing.assert_allclose(other.get_ydata(), [3500.0, 3500.0])
+    # A label has one colour in all panels.
+    assert figure.axes[1].lines[0].get_color() == one.get_color() != other.get_color()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "other"]
+    figure.canvas.draw()
+
+
+@pytest.mark.parametrize(("least", "scale"), [("0", "symlog"), ("0.01", "log")])
+def test_a_logarithmic_axis_shows_zero(least: str, scale: str) -> None:
+    steps = {("0.1", "1"): least, ("0.1", "2"): "0.05", ("0.5", "1"): "0.5", ("0.5", "2"): "2"}
+    found = [{**row, "step": steps[row["step"], row["gain"]]} for row in rows()]
+    figure = Contrasts("runs", "step", "step", {"scores": {"one": SCORE}}, is_log=True).draw({"runs": found})
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    assert axes.get_xscale() == scale
+    assert [text.get_text() for text in axes.get_xticklabels()] == list(steps.values())
+    # The numbers have different places on the axis, that of 0 too.
+    places = axes.transData.transform([(float(step), 0.0) for step in steps.values()])[:, 0]
+    assert np.diff(places).min() > 0.1 * (places[-1] - places[0])
 
 
 def test_squares_have_a_colour_bar_and_the_number_of_every_pair() -> None:

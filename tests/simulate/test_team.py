@@ -203,6 +203,9 @@ def test_pose_noise_changes_the_recorded_poses_only(small, tmp_path):
     pairs = zip(exact["/husky_1/odom"], noisy["/husky_1/odom"], strict=True)
     moved = [abs(one.pose.pose.position.x - other.pose.pose.position.x) for (_, one), (_, other) in pairs]
     assert 0.01 < np.mean(moved) < 1.5
+    # The true poses are those of the team without noise.
+    np.testing.assert_allclose(logged_poses(exact, "husky_1"), true_poses(tmp_path / "team", "husky_1"), atol=1e-9)
+    assert load_frames_file(tmp_path / "team" / "frames.yaml")["husky_1"] == (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def test_fixes_are_at_the_true_positions_each_second(small, tmp_path):

@@ -32,7 +32,9 @@ NUM_RUNS = {
     "confidence": {"sensor_models": 17 * 2, "calibration": 5 * 2, "confidences": 3 * 5 * 2, "confidences_prior": 5 * 2},
     "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
-    "frames": {"conditions": 9 * 2, "lengths": 4 * 2},
+    "frames": {"conditions": 15 * 2, "lengths": 4 * 2, "ages": 4 * 2},
+    "drift": {"drift": 5 * 2 * 2, "noise": 3 * 2 * 2},
+    "misalignment": {"shifts": 3 * 7 * 2, "turns": 3 * 5 * 2},
     "real": {"real": 9 * 3 * 3},
     "prediction": {"prediction": 17 * 9},
 }

@@ -37,3 +37,22 @@ def test_the_pairs_of_a_team_are_found_refused_or_wrong(tmp_path: Path) -> None:
     assert row["frame_shift"] < 1.0
     assert row["connected"] == 0.5
     assert 0.0 < row["overlap"] < 0.5
+
+
+@pytest.mark.long
+def test_maps_of_now_are_aligned_with_old_ones_of_the_others(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    question = frames.experiment(12.0, 1)
+    plan = dataclasses.replace(
+        next(plan for plan in question.plans if plan.name == "ages"), teams=("0_0",), vary=("duration=12,6",)
+    )
+    now, old = run_experiment(
+        dataclasses.replace(question, teams={"0_0": question.teams["0_0"]}, plans=(plan,)), tmp_path
+    )["ages"]
+    assert (now["age"], old["age"]) == (0.0, 6.0)
+    # Each map is aligned with those of the three other robots.
+    assert now["num_pairs"] == old["num_pairs"] == 12
+    assert old["overlap"] != now["overlap"]
+    # Without age each pair is aligned twice.
+    assert now["num_overlapping"] % 2 == 0
+    assert now["num_found"] >= 2

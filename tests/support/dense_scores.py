@@ -35,6 +35,14 @@ def iou(cells, classes, truth, prior):
     return scores
 
 
+def occupied_iou(cells, keys, truth, prior):
+    """The Jaccard index of the occupied cells, of any class, among ``keys``; NaN where no cell is occupied."""
+    judged = [key for key in sorted(keys) if truth.get(key, 0) >= 0]
+    true = np.array([truth.get(key, 0) > 0 for key in judged], np.bool_)
+    found = np.array([key in cells and np.argmax(probabilities(cells[key], prior, 1)) > 0 for key in judged], np.bool_)
+    return jaccard_score(true, found) if (true | found).any() else np.nan
+
+
 def accuracies(cells, truth, prior):
     """The recall of occupied and of free cells among the known ones; NaN where there are none."""
     known = [key for key in sorted(cells) if truth.get(key, 0) >= 0]

@@ -172,6 +172,8 @@ _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of se
 _add_experiment("steps", 60.0, 10, "Vary the step sizes epsilon and gamma.")
 _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
 _add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and which wrong ones it accepts.")
+_add_experiment("drift", 40.0, 10, "Measure what wrong poses cost, and what 'refine' repairs.")
+_add_experiment("misalignment", 40.0, 10, "Measure from which errors of the frames on an exchange of maps does harm.")
 
 
 def _add_recorded(name: str, question: str, runs: str) -> None:

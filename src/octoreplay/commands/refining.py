@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,11 +13,10 @@ from octoreplay.commands.exit_codes import EXIT_DATA_LOST
 from octoreplay.commands.options import check_new_folder, check_output, existing_path, force_option, numbers
 from octoreplay.commands.progress import lost_data, progress_bar
 from octoreplay.commands.team_options import is_team_file, save_team_file
-from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
 
 if TYPE_CHECKING:
-    from octoreplay.replay.refinement import Refinement, RobotTrajectory
+    from octoreplay.replay.refinement import Refinement
 
 
 @click.command(short_help="Repair the drift of a team's poses.")
@@ -94,29 +92,12 @@ def _check_outputs(team: Path, output: Path, poses: Path, plot: Path | None) -> 
 
 def _write(config: RunConfig, refinement: Refinement, output: Path, folder: Path) -> None:
     """Write the trajectories of the corrected robots, then the team file that names them."""
-    from octoreplay.io.datasets.pose_files import write_tum
     from octoreplay.io.output_file import new_folder
+    from octoreplay.replay.refinement import refined_config, write_trajectories
 
-    corrected = {trajectory.robot_id: trajectory for trajectory in refinement.trajectories if trajectory.is_accepted}
-    robots = tuple(
-        _with_trajectory(robot, corrected[robot.robot_id], folder) if robot.robot_id in corrected else robot
-        for robot in config.robots
-    )
     with new_folder(folder) as new:
-        for robot_id, trajectory in corrected.items():
-            write_tum(new.path / f"{robot_id}.tum", trajectory.stamps_ns, trajectory.map_poses)
+        write_trajectories(refinement, new.path)
         # Both or none: a team file must not name the trajectories of another run.
         with interrupts.deferred():
             new.put()
-            save_team_file(dataclasses.replace(config, robots=robots), output)
-
-
-def _with_trajectory(robot: RobotConfig, trajectory: RobotTrajectory, folder: Path) -> RobotConfig:
-    """Return a robot with its corrected trajectory, or with a corrected frame where its sensor stands still."""
-    robot = dataclasses.replace(
-        robot, T_team_map=trajectory.T_team_map, T_team_map_sigma=None, T_team_map_from="refined"
-    )
-    if robot.pose is not None:
-        return robot
-    robot = robot.with_poses(pose_file=folder / f"{robot.robot_id}.tum", pose_format="tum")
-    return dataclasses.replace(robot, T_body_sensor=trajectory.T_body_sensor)
+            save_team_file(refined_config(config, refinement, folder), output)

@@ -310,8 +310,8 @@ def _found_frames(given: RunConfig, config: ResolvedRun) -> Iterator[str]:
 def simulate(folder: Path, robots: int | None, paths: Path | None, no_labels: bool, **options: Any) -> int:
     """Simulate a team that drives through a village and write its logs into DIR.
 
-    Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply; with own frames or drift
-    also frames.yaml and truth/ROBOT.tum). Equal options give equal bytes.
+    Writes one MCAP log per robot, team.yaml and the ground truth (world.npz, world.ply; with own frames, noise of
+    poses or drift also frames.yaml and truth/ROBOT.tum). Equal options give equal bytes.
     """
     from octoreplay.config.paths_file import load_paths_file
 

@@ -46,12 +46,23 @@ class TruthCounts(NamedTuple):
         """Return the counts of the cells of both."""
         return TruthCounts(**{name: value + getattr(other, name) for name, value in self._asdict().items()})
 
+    @property
+    def mean_iou(self) -> float:
+        """Mean IoU over the classes that the truth has in the team's region; NaN where it has none."""
+        return _mean(_intersections_over_unions(self.of_team), self.of_team)
+
+    @property
+    def occupied_iou(self) -> float:
+        """IoU of the occupied cells, of any class, in the team's region; NaN without such a cell."""
+        num_hits = self.of_team[1:, 1:-1].sum()
+        return _ratio(num_hits, self.of_team[1:].sum() + self.of_team[0, 1:-1].sum())
+
     def scores(self, num_surface: int) -> TruthScores:
         """Return the scores against a truth with ``num_surface`` cells of the result's classes."""
-        known, iou = self.known, _intersections_over_unions(self.of_team)
+        known = self.known
         return TruthScores(
-            tuple(iou.tolist()),
-            _mean(iou, self.of_team),
+            tuple(_intersections_over_unions(self.of_team).tolist()),
+            self.mean_iou,
             _mean(_intersections_over_unions(known), known),
             _ratio(known[1:, 1:].sum(), known[1:].sum()),
             _ratio(known[0, 0], known[0].sum()),

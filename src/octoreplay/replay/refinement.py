@@ -9,11 +9,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from octoreplay.config.resolved import ResolvedRobot, ResolvedRun
+from octoreplay.config.robot import RobotConfig
+from octoreplay.config.run import RunConfig
 from octoreplay.errors import ConfigError, InputError
+from octoreplay.io.datasets.pose_files import write_tum
 from octoreplay.io.messages.decoders import DamagedMessageError
 from octoreplay.io.messages.sensor_messages import Transforms
 from octoreplay.io.robots.pose_source import PoseSource
@@ -162,6 +166,34 @@ def refine_team(
         trajectories = tuple(threads.map(trajectory, range(len(logs))))
         show(1.0)
     return Refinement(trajectories, len(submaps), len(repair.edges), repair.num_rejected, scores, counts)
+
+
+def write_trajectories(refinement: Refinement, folder: Path) -> None:
+    """Write ROBOT.tum for each corrected robot, its corrected poses in its map frame, into an existing folder."""
+    for trajectory in refinement.trajectories:
+        if trajectory.is_accepted:
+            write_tum(folder / f"{trajectory.robot_id}.tum", trajectory.stamps_ns, trajectory.map_poses)
+
+
+def refined_config(config: RunConfig, refinement: Refinement, folder: Path) -> RunConfig:
+    """Return the configuration with the corrected trajectories that ``write_trajectories`` writes into a folder."""
+    corrected = {trajectory.robot_id: trajectory for trajectory in refinement.trajectories if trajectory.is_accepted}
+    robots = tuple(
+        _refined_robot(robot, corrected[robot.robot_id], folder) if robot.robot_id in corrected else robot
+        for robot in config.robots
+    )
+    return dataclasses.replace(config, robots=robots)
+
+
+def _refined_robot(robot: RobotConfig, trajectory: RobotTrajectory, folder: Path) -> RobotConfig:
+    """Return a robot with its corrected trajectory, or with a corrected frame where its sensor stands still."""
+    robot = dataclasses.replace(
+        robot, T_team_map=trajectory.T_team_map, T_team_map_sigma=None, T_team_map_from="refined"
+    )
+    if robot.pose is not None:
+        return robot
+    robot = robot.with_poses(pose_file=folder / f"{robot.robot_id}.tum", pose_format="tum")
+    return dataclasses.replace(robot, T_body_sensor=trajectory.T_body_sensor)
 
 
 def _check_frames(config: ResolvedRun) -> None:

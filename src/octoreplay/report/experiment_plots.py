@@ -1,10 +1,10 @@
-"""Figures of experiments: dots with intervals, curves with bands and theory, and squares (docs/experiments.md)."""
+"""Figures of experiments: dots with intervals, curves with bands, contrasts, and squares (docs/experiments.md)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -97,25 +97,51 @@ class Curves:
     def _panel(self, axes: Axes, rows: Sequence[Row], measure: Measure) -> None:
         """Draw the curves of one measure."""
         for index, (label, part) in enumerate(_by(rows, self.label).items()):
-            color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
-            points = sorted((float(x), mean_over_teams(own, measure)) for x, own in _by_column(part, self.x).items())
-            places = [x for x, _ in points]
-            values = [mean.mean for _, mean in points]
-            line = "" if self.theory else "-"
-            axes.plot(places, values, marker + line, color=color, markersize=5, linewidth=1.4, label=label)
-            if not any(math.isnan(mean.low) for _, mean in points):
-                lows, highs = [mean.low for _, mean in points], [mean.high for _, mean in points]
-                axes.fill_between(places, lows, highs, color=color, alpha=0.25, linewidth=0)
+            _draw_curve(axes, part, self.x, measure, label, index, "" if self.theory else "-")
             if self.theory is not None:
-                axes.plot(*self.theory(label), "-", color=color, linewidth=1.0)
+                axes.plot(*self.theory(label), "-", color=COLORS[index % len(COLORS)], linewidth=1.0)
         if self.is_log:
-            axes.set_xscale("log")
-            ticks = sorted({float(row[self.x]) for row in rows})
-            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
-            axes.set_xticks([], minor=True)
+            _make_logarithmic(axes, rows, self.x)
         if measure.is_ratio:
             axes.set_yscale("log")
             label_plainly(axes.yaxis)
+
+
+@dataclass(frozen=True)
+class Contrasts:
+    """One panel for each group of measures and section, one curve for each measure over a column with numbers.
+
+    ``panels`` are the measures by the label of their curve, by the heading of the panel. ``limits`` are lines across
+    panels, by heading. ``is_log`` is for numbers from 0 on.
+    """
+
+    plan: str
+    x: str
+    x_label: str
+    panels: Mapping[str, Mapping[str, Measure]]
+    section: str | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
+    is_log: bool = False
+
+    def draw(self, found: Tables) -> Figure:
+        """Return the figure: means over the teams with bands of their intervals."""
+        parts = _by(found[self.plan], lambda row: "" if self.section is None else str(row[self.section]))
+        labels = list(dict.fromkeys(label for measures in self.panels.values() for label in measures))
+        figure = new_figure(1.5 + 3.8 * len(self.panels), 0.8 + 3.0 * len(parts))
+        panels = figure.subplots(len(parts), len(self.panels), sharex=True, sharey="col", squeeze=False)
+        for line, (section, rows) in zip(panels, parts.items(), strict=True):
+            for axes, (heading, measures) in zip(line, self.panels.items(), strict=True):
+                style(axes, f"{section}\n{heading}" if section else heading)
+                for label, measure in measures.items():
+                    _draw_curve(axes, rows, self.x, measure, label, labels.index(label))
+                if heading in self.limits:
+                    axes.axhline(self.limits[heading], color="#222222", linestyle="--", linewidth=1.0)
+                if self.is_log:
+                    _make_logarithmic(axes, rows, self.x)
+        for axes in panels[-1]:
+            axes.set_xlabel(self.x_label)
+        legend_below(figure, panels[0][0])
+        return figure
 
 
 @dataclass(frozen=True)
@@ -154,6 +180,32 @@ class Squares:
         axes.set_yticks(range(len(down)), down)
         axes.set_xlabel(self.x)
         axes.set_ylabel(self.y)
+
+
+def _draw_curve(
+    axes: Axes, rows: Sequence[Row], x: str, measure: Measure, label: str, index: int, line: str = "-"
+) -> None:
+    """Draw the means of a measure over a column with numbers, and the band of their intervals."""
+    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    points = sorted((float(value), mean_over_teams(part, measure)) for value, part in _by_column(rows, x).items())
+    places = [place for place, _ in points]
+    axes.plot(
+        places, [mean.mean for _, mean in points], marker + line, color=color, markersize=5, linewidth=1.4, label=label
+    )
+    if not any(math.isnan(mean.low) for _, mean in points):
+        lows, highs = [mean.low for _, mean in points], [mean.high for _, mean in points]
+        axes.fill_between(places, lows, highs, color=color, alpha=0.25, linewidth=0)
+
+
+def _make_logarithmic(axes: Axes, rows: Sequence[Row], x: str) -> None:
+    """Make the axis of a column logarithmic, with its numbers as ticks; linear from 0 to the least positive number."""
+    ticks = sorted({float(row[x]) for row in rows})
+    if ticks[0] > 0:
+        axes.set_xscale("log")
+    else:
+        axes.set_xscale("symlog", linthresh=ticks[1], linscale=0.5)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
+    axes.set_xticks([], minor=True)
 
 
 def _by(rows: Sequence[Row], label: Label) -> dict[str, list[Row]]:

@@ -211,7 +211,7 @@ class SimulationConfig:
     @property
     def has_pose_truth(self) -> bool:
         """True if the true frames and trajectories are written, because the recorded ones differ from them."""
-        return self.own_frames or any(self.odometry_drift)
+        return self.own_frames or self.pose_noise > 0 or any(self.odometry_drift)
 
     @property
     def robot_ids(self) -> tuple[str, ...]:

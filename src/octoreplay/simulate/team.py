@@ -56,8 +56,8 @@ def simulate_team(
 ) -> SimulationSummary:
     """Simulate a team and write one log per robot, ``team.yaml``, ``world.npz`` and ``world.ply`` into a folder.
 
-    With own frames or drift, ``frames.yaml`` holds the true T_team_map of each robot, from the frame of its recorded
-    poses to the village's (``load_frames_file``), and ``truth/ROBOT.tum`` its true poses in the village's frame.
+    With own frames, noise of poses or drift, ``frames.yaml`` holds the true T_team_map of each robot, from the frame of
+    its recorded poses to the village's (``load_frames_file``), and ``truth/ROBOT.tum`` its true poses in that frame.
     Equal settings give equal bytes. ``progress`` is called with the finished share, 0 to 1. Files get their names only
     when all of them are complete. Raises OutputError if the folder is not empty or cannot be written, InputError if
     Open3D cannot be loaded.

@@ -8,8 +8,10 @@ from types import MappingProxyType
 from octoreplay.study.experiments import Question
 from octoreplay.study.questions import (
     confidence,
+    drift,
     forgetting,
     frames,
+    misalignment,
     noise,
     packets,
     prediction,
@@ -31,6 +33,8 @@ QUESTIONS: Mapping[str, Question] = MappingProxyType(
         "steps": steps.QUESTION,
         "scale": scale.QUESTION,
         "frames": frames.QUESTION,
+        "drift": drift.QUESTION,
+        "misalignment": misalignment.QUESTION,
         "real": real.QUESTION,
         "prediction": prediction.QUESTION,
     }

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from octoreplay.evaluate.evaluation import truth_beside_logs
+from octoreplay.evaluate.morton_intervals import Region
+from octoreplay.evaluate.scores import TruthCounts, truth_counts
 from octoreplay.evaluate.truth import Truth, load_truth
 from octoreplay.report.comparisons import KILOBYTES, Measure, Row
 from octoreplay.result import Result
 from octoreplay.simulate.settings import SimulationConfig
+from octoreplay.stored_map import StoredMap
 from octoreplay.study.experiments import SimulatedTeam
 
 RADIO_RANGE = 25.0
@@ -34,11 +38,27 @@ def villages(duration: float, num_villages: int, **settings: Any) -> dict[str, S
     }
 
 
+def small_village(duration: float, seed: int, **settings: Any) -> SimulationConfig:
+    """Four robots in a village of 32 m, in which their ways cross within 40 s, with frames of their own by default."""
+    usual = {"num_robots": 4, "world_size": 32.0, "rate": 2.0, "own_frames": True}
+    return SimulationConfig(duration=duration, seed=seed, **{**usual, **settings})
+
+
 def village_of(result: Result) -> Truth:
     """Truth of a result of a simulated team: the world beside its logs."""
     world = truth_beside_logs(result.path)
     assert world is not None
     return load_truth(world, result.class_table, result.config.map.resolution)
+
+
+def folder_of_logs(result: Result) -> Path:
+    """Folder of a result's logs."""
+    return Path(result.config.robots[0].logs[0].parent)
+
+
+def counts_of(stored: StoredMap, truth: Truth, region: Region) -> TruthCounts:
+    """Counts of a map's posterior against the truth in a region."""
+    return truth_counts(stored.shown_octree().spans(), stored.prior, truth, region, region.holds(truth.codes))
 
 
 def rule_name(row: Row) -> str:
