@@ -344,7 +344,8 @@ def test_uncertain_hits_are_rounded_to_the_quantum():
     sums.integrate(scan, config.effective_sensor)
     # 1.3 is 21 / 16; 21 x 200 / 255 = 16.5 - 0.03, 21 x 100 / 255 = 8.2, 21 / 255 = 0.1.
     assert (16 * sums.clamped[:, 1]).tolist() == [21.0, 16.0, 8.0, 0.0]
-    assert (16 * sums.clamped[:, 2]).tolist() == [-5.0] * 4
+    # -0.3 is -5 / 16; 5 x 200 / 255 = 3.9, 5 x 100 / 255 = 2.0, 5 / 255 = 0.02.
+    assert (16 * sums.clamped[:, 2]).tolist() == [-5.0, -4.0, -2.0, 0.0]
 
 
 # --- settling --------------------------------------------------------------------------------------------------------
