@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from octoreplay.evaluate.scores import calibration_bins, calibration_error
-from octoreplay.evaluate.temperature import fitted_temperature
+from octoreplay.evaluate.temperature import distinct_rows, fitted_temperature
 from octoreplay.log_odds import best_labels, label_probabilities
 from octoreplay.mapping.contradiction import StateLimits
 from octoreplay.mapping.octree import SemanticOctree
@@ -55,7 +55,7 @@ def prediction(
     states = np.concatenate([own for _, own in found])
     if not (states > 0).any():
         raise ValueError("no robot measured an occupied cell that another robot knows")
-    rows, row_of_cell = np.unique(log_odds, axis=0, return_inverse=True)
+    rows, row_of_cell = distinct_rows(log_odds)
     counts = np.zeros((len(rows), rows.shape[1] + 1))
     np.add.at(counts, (row_of_cell, states), 1.0)
     labels = best_labels(rows)

@@ -8,7 +8,7 @@ import numpy as np
 
 from octoreplay.evaluate.truth import Truth
 from octoreplay.log_odds import class_probabilities
-from octoreplay.records import Float64Array
+from octoreplay.records import Float32Array, Float64Array, Int64Array
 from octoreplay.stored_map import StoredMap
 
 _LARGEST = 100.0
@@ -56,11 +56,21 @@ def fitted_temperature(log_odds: Float64Array, counts: Float64Array) -> Calibrat
     return Calibration(loss(0.0), float(np.exp(best.x)), float(best.fun))
 
 
+def distinct_rows(rows: Float32Array) -> tuple[Float32Array, Int64Array]:
+    """Return the distinct rows (U, C) of ``rows`` (P, C), and the place (P,) of each row among them.
+
+    Rows are compared byte by byte, which is several times as fast as number by number.
+    """
+    whole = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, first, places = np.unique(whole, return_index=True, return_inverse=True)
+    return rows[first], places
+
+
 def _distinct_cells(stored: StoredMap, truth: Truth) -> tuple[Float64Array, Float64Array]:
     """Distinct rows of log-odds (P, C) in a map, and the number of their cells by true class (P, C + 1)."""
     spans = stored.octree.spans()
     num_classes = spans.deviations.shape[1]
-    rows, row_of_leaf = np.unique(spans.deviations, axis=0, return_inverse=True)
+    rows, row_of_leaf = distinct_rows(spans.deviations)
     leaves = spans.leaves_at(truth.codes)
     is_known = leaves >= 0
     num_free = spans.num_cells.astype(np.float64)
