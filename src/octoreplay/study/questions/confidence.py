@@ -14,7 +14,7 @@ from octoreplay.result import open_result
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
 from octoreplay.study.questions.sensor_models import PREDICTION, VARY_MODELS, model_name, predicted
-from octoreplay.study.questions.settings import LAST_MAPS, MEAN_IOU, rule_name, village_of, villages
+from octoreplay.study.questions.settings import AGREEMENTS, LAST_MAPS, MEAN_IOU, rule_name, village_of, villages
 from octoreplay.study.sweep import Sweep
 
 _NETWORKS: dict[str, dict[str, Any]] = {
@@ -35,6 +35,11 @@ _CALIBRATED = {"prob_free": 0.7, "hit": 3.0}
 """Prior and hit with calibrated probabilities (``prior 0.7, hit 3``)."""
 
 
+_LABELS = {"defaults": ("-", "-"), "prior 0.5, hit 3": ("0.5", "3"), "prior 0.7, hit 3": ("0.7", "3")}
+"""Values of ``prob_free`` and ``hit`` by name, for labels while the logs last."""
+_VARY_LABELS = f"prob_free+hit={','.join('+'.join(values) for values in _LABELS.values())}"
+
+
 def experiment(duration: float, num_villages: int) -> Experiment:
     """Sensor models with the default rule, rules with the default sensor model, and confidence models."""
     teams = villages(duration, num_villages)
@@ -47,6 +52,7 @@ def experiment(duration: float, num_villages: int) -> Experiment:
                 extra_columns=_fits,
             ),
             Plan("calibration", tuple(teams), ("rule=local,gradient,bayes,flood,merge",), LAST_MAPS),
+            Plan("labels", tuple(teams), ("rule=gradient,natural,bayes,flood", _VARY_LABELS), LAST_MAPS),
             *_confidence_plans(tuple(unsure)),
         ),
     )  # fmt: skip
@@ -95,6 +101,12 @@ def _confidence_model(row: Row) -> str:
     return next(name for name, values in _CONFIDENCES.items() if values == wanted)
 
 
+def _label_model(row: Row) -> str:
+    """Name of a prior and a hit."""
+    wanted = (str(row["prob_free"]), str(row["hit"]))
+    return next(name for name, values in _LABELS.items() if values == wanted)
+
+
 _OF_MODELS = Comparison(
     "sensor_models",
     "sensor model",
@@ -120,6 +132,7 @@ _OF_RULES = Comparison(
     ),
     "bayes",
 )
+_OF_LABELS = Comparison("labels", "sensor model", _label_model, AGREEMENTS, "defaults", "rule")
 _OF_CONFIDENCES = Comparison("confidences", "confidences", _confidence_model, _OF_MODELS.measures, "hit", "network")
 _OF_CONFIDENCES_WITH_PRIOR = dataclasses.replace(
     _OF_CONFIDENCES, plan="confidences_prior", heading="confidences, prior 0.7, hit 3"
@@ -127,10 +140,11 @@ _OF_CONFIDENCES_WITH_PRIOR = dataclasses.replace(
 
 QUESTION = Question(
     experiment,
-    (_OF_MODELS, _PREDICTED, _OF_RULES, _OF_CONFIDENCES, _OF_CONFIDENCES_WITH_PRIOR),
+    (_OF_MODELS, _PREDICTED, _OF_RULES, _OF_LABELS, _OF_CONFIDENCES, _OF_CONFIDENCES_WITH_PRIOR),
     {
         "sensor_models.png": Dots(_OF_MODELS),
         "calibration.png": Dots(_OF_RULES, 9.0),
+        "labels.png": Dots(_OF_LABELS),
         "confidences.png": Dots(_OF_CONFIDENCES),
         "confidences_prior.png": Dots(_OF_CONFIDENCES_WITH_PRIOR),
     },
