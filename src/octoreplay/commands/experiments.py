@@ -72,8 +72,11 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     return 0
 
 
-def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> int:
-    """Run the experiment of a question, and write its tables and figures; ``run`` are options of run_experiment."""
+def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> list[Path]:
+    """Run the experiment of a question, and write its tables and figures; return the written files.
+
+    ``run`` are options of run_experiment.
+    """
     from octoreplay.io.output_file import mark_written, write_whole
     from octoreplay.report.comparisons import latex, markdown
     from octoreplay.report.figures import save_figures
@@ -96,8 +99,7 @@ def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> int:
     }
     mark_written(folder)
     terminal().show(made_files(written))
-    terminal().give(written=list(written))
-    return 0
+    return list(written)
 
 
 _parallel_options = (
@@ -136,7 +138,9 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
 
         lock_folder(folder)
         simulated = QUESTIONS[name].experiment(duration, villages)
-        return _answer(name, simulated, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        written = _answer(name, simulated, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        terminal().give(written=written)
+        return 0
 
     # Parallel runs would disturb time measurements, and run times hardly depend on the village.
     sweep_options = (
@@ -187,7 +191,9 @@ def _add_recorded(name: str, question: str, runs: str) -> None:
 
         lock_folder(folder)
         recorded = QUESTIONS[name].experiment(data)
-        return _answer(name, recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        written = _answer(name, recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        terminal().give(written=written)
+        return 0
 
     options = (
         _folder_argument(name),
@@ -221,7 +227,7 @@ _add_recorded(
 )
 
 
-@experiment.command("all", short_help="Repeat all experiments with several villages, in one night.")
+@experiment.command("all", short_help="Repeat all experiments but 'paper', in one night.")
 @_folder_argument("all")
 @click.option(
     "--data",
@@ -241,9 +247,11 @@ def everything(folder: Path, data: tuple[Path, ...], jobs: int | None) -> int:
     from octoreplay.study.questions import QUESTIONS
 
     lock_folder(folder)
+    written: list[Path] = []
     for name in (*_SIMULATED, *(_RECORDED if data else ())):
         teams = QUESTIONS[name].experiment(*((data,) if name in _RECORDED else _SIMULATED[name]))
-        _answer(name, teams, folder / name, teams_folder=folder / "teams", num_jobs=jobs)
+        written += _answer(name, teams, folder / name, teams_folder=folder / "teams", num_jobs=jobs)
+    terminal().give(written=written)
     return 0
 
 
