@@ -36,6 +36,8 @@ _RULES = (
     "gradient+int8+0.02", "bayes+int8+0.02", "weighted+int8+0.02", "ratio+-+-", "flood+int8+0.05", "latest+int8+0.05",
 )  # fmt: skip
 """Rule, content and int8_step. 'weighted' has the packets of 'bayes', and 'latest' those of 'flood'."""
+_DELAYED = ("gradient+int8+0.02", "bayes+int8+0.02", "flood+int8+0.05")
+"""Rules that are compared with delays."""
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:
@@ -47,7 +49,10 @@ def experiment(duration: float, num_villages: int) -> Experiment:
     )
     settings = {"radio_range": RADIO_RANGE, **SHORT_SETTLING, **LAST_MAPS}
     each_second = {f"fine_{label}": dataclasses.replace(team, publish_period=1.0) for label, team in teams.items()}
-    delays = (vary[0], f"publish_period+latency={','.join('+'.join(values) for values in _DELAYS)}")
+    delays = (
+        f"rule+content+int8_step={','.join(_DELAYED)}",
+        f"publish_period+latency={','.join('+'.join(values) for values in _DELAYS)}",
+    )
     return Experiment(
         {**teams, **each_second},
         (
