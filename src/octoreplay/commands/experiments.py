@@ -171,6 +171,7 @@ _add_experiment(
 )
 _add_experiment("packets", 60.0, 10, "Compare packet formats.")
 _add_experiment("radio", 60.0, 10, "Measure what each fault of a radio costs.")
+_add_experiment("delay", 60.0, 10, "Measure what a delay costs with ticks of two lengths.")
 _add_experiment("noise", 60.0, 10, "Measure which wrong labels, poses and depths the exchange repairs and spreads.")
 _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
 _add_experiment("steps", 60.0, 10, "Vary the step sizes epsilon and gamma.")

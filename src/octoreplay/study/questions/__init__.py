@@ -8,6 +8,7 @@ from types import MappingProxyType
 from octoreplay.study.experiments import Question
 from octoreplay.study.questions import (
     confidence,
+    delay,
     drift,
     forgetting,
     frames,
@@ -28,6 +29,7 @@ QUESTIONS: Mapping[str, Question] = MappingProxyType(
         "forgetting": forgetting.QUESTION,
         "packets": packets.QUESTION,
         "radio": radio.QUESTION,
+        "delay": delay.QUESTION,
         "noise": noise.QUESTION,
         "confidence": confidence.QUESTION,
         "steps": steps.QUESTION,

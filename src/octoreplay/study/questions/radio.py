@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from octoreplay.report.comparisons import KILOBYTES, Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.study.experiments import Experiment, Plan, Question
-from octoreplay.study.questions.settings import (
-    DURING,
-    LAST_MAPS,
-    RADIO_RANGE,
-    SETTLED,
-    SHORT_SETTLING,
-    villages,
-)
+from octoreplay.study.questions.settings import DURING, LAST_MAPS, RADIO_RANGE, SHORT_SETTLING, villages
 
 _FAULTS = {
     ("complete", "0", "0", "none"): "none",
@@ -25,19 +16,10 @@ _FAULTS = {
     ("range", "0.3", "0.2", "50000"): "all",
 }
 """Names by topology, loss, latency and rate."""
-_DELAYS = {
-    ("1", "0"): "ticks of 1 s, no delay",
-    ("1", "0.2"): "ticks of 1 s, 0.2 s delay",
-    ("0.2", "0"): "ticks of 0.2 s, no delay",
-    ("0.2", "0.2"): "ticks of 0.2 s, 0.2 s delay",
-}
-"""Names by the length of a tick, which is called publish_period, and latency; all robots publish once a second."""
 _RULES = (
     "gradient+int8+0.02", "bayes+int8+0.02", "weighted+int8+0.02", "ratio+-+-", "flood+int8+0.05", "latest+int8+0.05",
 )  # fmt: skip
 """Rule, content and int8_step. 'weighted' has the packets of 'bayes', and 'latest' those of 'flood'."""
-_DELAYED = ("gradient+int8+0.02", "bayes+int8+0.02", "flood+int8+0.05")
-"""Rules that are compared with delays."""
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:
@@ -48,18 +30,7 @@ def experiment(duration: float, num_villages: int) -> Experiment:
         f"topology+loss+latency+rate={','.join('+'.join(values) for values in _FAULTS)}",
     )
     settings = {"radio_range": RADIO_RANGE, **SHORT_SETTLING, **LAST_MAPS}
-    each_second = {f"fine_{label}": dataclasses.replace(team, publish_period=1.0) for label, team in teams.items()}
-    delays = (
-        f"rule+content+int8_step={','.join(_DELAYED)}",
-        f"publish_period+latency={','.join('+'.join(values) for values in _DELAYS)}",
-    )
-    return Experiment(
-        {**teams, **each_second},
-        (
-            Plan("radio", tuple(teams), vary, settings, has_truth=False),
-            Plan("delay", tuple(each_second), delays, {**SHORT_SETTLING, **LAST_MAPS}, has_truth=False),
-        ),
-    )
+    return Experiment(teams, (Plan("radio", tuple(teams), vary, settings, has_truth=False),))
 
 
 def _fault(row: Row) -> str:
@@ -67,15 +38,7 @@ def _fault(row: Row) -> str:
     return _FAULTS[row["topology"], str(row["loss"]), str(row["latency"]), str(row["rate"])]
 
 
-def _delay(row: Row) -> str:
-    """Name of a tick and a delay."""
-    return _DELAYS[str(row["publish_period"]), str(row["latency"])]
-
-
 _CONNECTED = Measure("agreement at the last tick with a connected graph, occupied", "agreement_occupied_connected")
 _OF_FAULTS = Comparison("radio", "fault", _fault, (DURING, _CONNECTED, KILOBYTES), "none", "rule")
-_OF_DELAYS = Comparison("delay", "ticks and delay", _delay, (DURING, SETTLED), "ticks of 1 s, no delay", "rule")
 
-QUESTION = Question(
-    experiment, (_OF_FAULTS, _OF_DELAYS), {"radio.png": Dots(_OF_FAULTS), "delay.png": Dots(_OF_DELAYS, 9.0)}
-)
+QUESTION = Question(experiment, (_OF_FAULTS,), {"radio.png": Dots(_OF_FAULTS)})
