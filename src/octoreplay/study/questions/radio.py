@@ -38,7 +38,7 @@ def _fault(row: Row) -> str:
     return _FAULTS[row["topology"], str(row["loss"]), str(row["latency"]), str(row["rate"])]
 
 
-_CONNECTED = Measure("agreement at the last tick with a connected graph, occupied", "agreement_occupied_connected")
+_CONNECTED = Measure("agreement when last connected", "agreement_occupied_connected")
 _OF_FAULTS = Comparison("radio", "fault", _fault, (DURING, _CONNECTED, KILOBYTES), "none", "rule")
 
 QUESTION = Question(experiment, (_OF_FAULTS,), {"radio.png": Dots(_OF_FAULTS)})
