@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,6 +116,16 @@ def _folder_argument(name: str) -> Callable[[Any], Any]:
     return click.argument("folder", type=existing_path, metavar="[DIR]", default=default, required=False)
 
 
+def _add_command(
+    name: str, question: str, text: str, run_and_report: Callable[..., int], options: Sequence[Callable[[Any], Any]]
+) -> None:
+    """Add a command with its help text and its options in their order."""
+    command = prints(run_and_report)
+    for option in reversed(options):
+        command = option(command)
+    experiment.command(name, help=text, short_help=question)(command)
+
+
 _SIMULATED: dict[str, tuple[float, int]] = {}
 """Length of the logs [s] and number of villages of the experiments with simulated teams, by name."""
 _RECORDED: list[str] = []
@@ -138,8 +148,9 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
 
         lock_folder(folder)
         simulated = QUESTIONS[name].experiment(duration, villages)
-        written = _answer(name, simulated, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
-        terminal().give(written=written)
+        terminal().give(
+            written=_answer(name, simulated, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
+        )
         return 0
 
     # Parallel runs would disturb time measurements, and run times hardly depend on the village.
@@ -159,10 +170,7 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
         f"{question}\n\nSimulates teams, runs sweeps and writes tables and figures into DIR (default:"
         f" octoreplay-{name}). The same command continues after an interruption."
     )
-    command = prints(run_and_report)
-    for option in reversed(options):
-        command = option(command)
-    experiment.command(name, help=text, short_help=question)(command)
+    _add_command(name, question, text, run_and_report, options)
 
 
 _add_experiment("rules", 300.0, 10, "Compare the consensus rules.")
@@ -192,8 +200,7 @@ def _add_recorded(name: str, question: str, runs: str) -> None:
 
         lock_folder(folder)
         recorded = QUESTIONS[name].experiment(data)
-        written = _answer(name, recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler)
-        terminal().give(written=written)
+        terminal().give(written=_answer(name, recorded, folder, teams_folder=teams, num_jobs=jobs, scheduler=scheduler))
         return 0
 
     options = (
@@ -210,10 +217,7 @@ def _add_recorded(name: str, question: str, runs: str) -> None:
         f" one team. {runs} Writes tables and figures into DIR (default: octoreplay-{name}). The same command continues"
         " after an interruption."
     )
-    command = prints(run_and_report)
-    for option in reversed(options):
-        command = option(command)
-    experiment.command(name, help=text, short_help=question)(command)
+    _add_command(name, question, text, run_and_report, options)
 
 
 _add_recorded(
@@ -248,9 +252,11 @@ def everything(folder: Path, data: tuple[Path, ...], jobs: int | None) -> int:
     from octoreplay.study.questions import QUESTIONS
 
     lock_folder(folder)
+    inputs = {**_SIMULATED, **{name: (data,) for name in _RECORDED if data}}
+    # A recording that cannot be used is refused before the first run.
+    experiments = {name: QUESTIONS[name].experiment(*values) for name, values in inputs.items()}
     written: list[Path] = []
-    for name in (*_SIMULATED, *(_RECORDED if data else ())):
-        teams = QUESTIONS[name].experiment(*((data,) if name in _RECORDED else _SIMULATED[name]))
+    for name, teams in experiments.items():
         written += _answer(name, teams, folder / name, teams_folder=folder / "teams", num_jobs=jobs)
     terminal().give(written=written)
     return 0

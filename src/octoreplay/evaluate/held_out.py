@@ -41,20 +41,20 @@ class Prediction(NamedTuple):
 
 def prediction(
     evidence: Sequence[SemanticOctree], prior: float, measured: Sequence[SemanticOctree], limits: StateLimits
-) -> Prediction:
+) -> Prediction | None:
     """Leave each robot out, and compare the posterior of the others' evidence with what it measured.
+
+    None where no robot measured an occupied cell that another one knows.
 
     ``evidence`` are the octrees s_i of the sensor model that is tested, and ``prior`` its h_0. ``measured`` are those
     of one fixed sensor model, so that all models are compared with the same states: a cell is occupied with its most
     probable class from ``limits.occupied_from`` on, and free up to ``limits.firm_to``; others are not counted.
-
-    Raises ValueError where no robot measured an occupied cell that another one knows.
     """
     found = [_predicted([*evidence[:robot], *evidence[robot + 1 :]], own, limits) for robot, own in enumerate(measured)]
     log_odds = np.concatenate([values for values, _ in found]) + np.float32(prior)
     states = np.concatenate([own for _, own in found])
     if not (states > 0).any():
-        raise ValueError("no robot measured an occupied cell that another robot knows")
+        return None
     rows, row_of_cell = distinct_rows(log_odds)
     counts = np.zeros((len(rows), rows.shape[1] + 1))
     np.add.at(counts, (row_of_cell, states), 1.0)

@@ -33,8 +33,6 @@ _CONFIDENCES = {
 """Values of ``confidence_model`` and ``hit_other`` by name."""
 _CALIBRATED = {"prob_free": 0.7, "hit": 3.0}
 """Prior and hit with calibrated probabilities (``prior 0.7, hit 3``)."""
-
-
 _LABELS = {"defaults": ("-", "-"), "prior 0.5, hit 3": ("0.5", "3"), "prior 0.7, hit 3": ("0.7", "3")}
 """Values of ``prob_free`` and ``hit`` by name, for labels while the logs last."""
 _VARY_LABELS = f"prob_free+hit={','.join('+'.join(values) for values in _LABELS.values())}"
@@ -47,10 +45,7 @@ def experiment(duration: float, num_villages: int) -> Experiment:
     return Experiment(
         {**teams, **unsure},
         (
-            Plan(
-                "sensor_models", tuple(teams), (VARY_MODELS,), LAST_MAPS, keep=True,
-                extra_columns=_fits,
-            ),
+            Plan("sensor_models", tuple(teams), (VARY_MODELS,), LAST_MAPS, keep=True, extra_columns=_fits),
             Plan("calibration", tuple(teams), ("rule=local,gradient,bayes,flood,merge",), LAST_MAPS),
             Plan("labels", tuple(teams), ("rule=gradient,natural,bayes,flood", _VARY_LABELS), LAST_MAPS),
             *_confidence_plans(tuple(unsure)),

@@ -51,7 +51,10 @@ def model_name(row: Row) -> str:
 
 
 def predicted(_: ExperimentTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
-    """Return ``held_out_`` columns: fit of the others' maps to what each robot measured with the default model."""
+    """Return ``held_out_`` columns: fit of the others' maps to what each robot measured with the default model.
+
+    A team without a cell in common has none.
+    """
     with open_result(sweep.result(dict(row))) as own:
         evidence = [own.evidence(robot_id) for robot_id in own.robots]
         prior = own.config.map.prior(own.class_table.num_classes)
@@ -59,4 +62,4 @@ def predicted(_: ExperimentTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
         measured = [default.evidence(robot_id).octree for robot_id in default.robots]
         limits = state_limits(default.config.sensor)
     found = prediction([stored.octree for stored in evidence], prior, measured, limits)
-    return {f"held_out_{name}": value for name, value in found._asdict().items()}
+    return {} if found is None else {f"held_out_{name}": value for name, value in found._asdict().items()}
