@@ -128,7 +128,7 @@ _RULES = (
         weighs_certainty=True,
         map_is_mean=False,
         keeps_last_evidence=True,
-        warning="rule 'weighted' does not keep the sum of the team's evidence, because robots that are sure count more;"
+        warning="rule 'weighted' does not keep the sum of the team's evidence, because certain cells count more;"
         " it is a baseline, not a map to trust; --rule bayes and --rule flood keep the sum",
     ),
     Rule(

@@ -354,7 +354,7 @@ def team_step(
     - ``first_columns`` (R + 1,) int64: robot r has the entries ``first_columns[r]`` to ``first_columns[r + 1]``.
     - ``weights`` float32: 2 epsilon A_ij at the entries of neighbours without flows, parallel to ``columns``.
     - ``flow_weights`` float32: 2 epsilon A_ij at the entries of neighbours with flows, parallel to ``columns``.
-    - ``flow_shares`` float32: largest power of two in a cell to the step of its flow, parallel to ``columns``.
+    - ``flow_shares`` float32: step of a flow divided by the cell's largest power of two, parallel to ``columns``.
     - ``flow_gates`` (R,) float32: least difference of a moving cell, relative to its largest |log-odds|; 0 for none.
     - ``has_plain`` (R,) bool: True where any of a robot's ``weights`` is not 0.
     - ``quantum``: float32, least step of flows, and grid of the new values of GRADIENT, NATURAL and
