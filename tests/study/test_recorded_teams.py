@@ -17,7 +17,8 @@ from octoreplay.io.robots.discover import resolve
 from octoreplay.io.robots.robot_log import RobotLog
 from octoreplay.records import Float64Array
 from octoreplay.study import recorded_teams
-from octoreplay.study.recorded_teams import ALIGNED, RIGHT, UNALIGNED, Part, RecordedTeam, frame_errors, recorded_parts
+from octoreplay.study.recorded_teams import Part, RecordedTeam, recorded_parts
+from octoreplay.study.team_frames import ALIGNED, MAX_SHIFT, RIGHT, UNALIGNED, frame_errors
 from support.command_line import assert_fails, octoreplay_process
 from support.long_suite import examples
 from support.poses import pose
@@ -116,7 +117,7 @@ def test_right_frames_give_the_recordings_poses_and_own_frames_do_not(tmp_path: 
         T = own[robot_id] @ np.linalg.inv(true)
         np.testing.assert_allclose(T, np.broadcast_to(T[0], T.shape), atol=1e-7)
         np.testing.assert_allclose(T[0, 2, :3], [0.0, 0.0, 1.0], atol=1e-7)
-        assert 0.0 < abs(T[0, :3, 3]).max() <= recorded_teams.MAX_SHIFT
+        assert 0.0 < abs(T[0, :3, 3]).max() <= MAX_SHIFT
     first, second = (own[robot_id][0] @ np.linalg.inv(right[robot_id][0]) for robot_id in own)
     assert not np.allclose(first, second, atol=0.01)
 

@@ -205,17 +205,17 @@ def _add_recorded(name: str, question: str, runs: str) -> None:
 
     options = (
         _folder_argument(name),
-        click.option("--data", type=existing_path, multiple=True, required=True, metavar="FOLDER",
+        click.option("--data", type=existing_path, multiple=True, required=True, metavar="FOLDER|TEAM.yaml",
                      help="recording: a folder of depth images with poses that import-rgbd reads, or a folder of such"
-                          " folders; may be repeated"),
+                          " folders; or a team file with right frames; may be repeated"),
         click.option("--teams", type=existing_path, metavar="DIR",
                      help="folder of the teams' logs, which experiments can share  [default: DIR/teams]"),
         *_parallel_options,
     )  # fmt: skip
     text = (
         f"{question}\n\nA recording is split into teams of 2, 3 and 4 robots; the recordings of a folder of folders are"
-        f" one team. {runs} Writes tables and figures into DIR (default: octoreplay-{name}). The same command continues"
-        " after an interruption."
+        f" one team, and so is a team file. {runs} Writes tables and figures into DIR (default: octoreplay-{name}). The"
+        " same command continues after an interruption."
     )
     _add_command(name, question, text, run_and_report, options)
 
@@ -238,8 +238,8 @@ _add_recorded(
     "--data",
     type=existing_path,
     multiple=True,
-    metavar="FOLDER",
-    help="recording, as of 'real' and 'prediction', which are left out without one; may be repeated",
+    metavar="FOLDER|TEAM.yaml",
+    help="recording or team, as of 'real' and 'prediction', which are left out without one; may be repeated",
 )
 @_parallel_options[0]
 @prints

@@ -23,6 +23,9 @@ Theory = Callable[[str], tuple[Float64Array, Float64Array]]
 _SPREAD = 0.7
 """Share of the distance of two labels over which the markers of one label are spread."""
 
+_NUM_STEPS = 5
+"""Largest number of steps between the numbers of an axis, which keeps them apart in narrow panels."""
+
 
 class Drawing(Protocol):
     """Figure of an experiment."""
@@ -57,6 +60,8 @@ class Dots:
             if measure.is_ratio:
                 axes.set_xscale("log")
                 label_plainly(axes.xaxis)
+            else:
+                axes.locator_params(axis="x", nbins=_NUM_STEPS)
         panels[0].set_yticks(range(len(labels)), labels, fontsize=9)
         panels[0].invert_yaxis()
         if len(sections) > 1:

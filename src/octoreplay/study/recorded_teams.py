@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +12,14 @@ import numpy as np
 from octoreplay._version import __version__
 from octoreplay.config.robot import RobotConfig
 from octoreplay.config.run import RunConfig
-from octoreplay.config.team_file import dump_team
+from octoreplay.config.team_file import load_team_file
 from octoreplay.errors import InputError
 from octoreplay.io.datasets.rgbd_folder import import_rgbd
 from octoreplay.io.datasets.rgbd_layouts import find_layout, find_sequences
-from octoreplay.io.output_file import new_folder, write_whole, writing
+from octoreplay.io.output_file import new_folder, writing
 from octoreplay.io.text_files import json_text
-from octoreplay.records import Float64Array
-from octoreplay.replay.alignment import align_logs, aligned_config
-from octoreplay.transforms import inverse, numbers_of, pose_difference, pose_matrix, transform_of
-
-RIGHT, UNALIGNED, ALIGNED = "right", "unaligned", "aligned"
-FRAMES = (RIGHT, UNALIGNED, ALIGNED)
-"""Frames of a team: the recording's, one of each robot's own, and those that ``align`` finds."""
+from octoreplay.study.team_frames import RIGHT, own_frame, team_file, without_frames, write_team_files
+from octoreplay.transforms import inverse, numbers_of
 
 RATE = 1.0
 """Images per second of every log [Hz]: a robot maps one image between two published maps."""
@@ -34,9 +27,6 @@ RESOLUTION, MAX_RANGE = 0.1, 4.0
 """Edge of a cell, and the range of a depth camera that is mapped [m]."""
 ALIGNED_RESOLUTION = 0.05
 """Edge of a cell of the maps that are aligned [m]; those of a room need finer cells than a run."""
-MAX_SHIFT = 1.0
-"""Largest shift of a robot's own frame along each axis [m], so that the maps still share space."""
-
 _NUM_IMAGES = 50
 """Number of images that a whole recording is thinned to, unless the parts of a split need more."""
 _TEAM_SIZES = (2, 3, 4)
@@ -93,28 +83,28 @@ class RecordedTeam:
             config = RunConfig(tuple(self._robots(new.path))).with_parameters(
                 {"resolution": RESOLUTION, "max_range": MAX_RANGE}
             )
-            _write_team(new.path, RIGHT, config)
-            config = dataclasses.replace(
-                config, robots=tuple(dataclasses.replace(robot, T_team_map=None) for robot in config.robots)
-            )
-            _write_team(new.path, UNALIGNED, config)
-            fine = config.with_parameters({"resolution": ALIGNED_RESOLUTION})
-            team = align_logs(fine, dof=6, progress=progress).teams[0]
-            if len(team) > 1:
-                _write_team(new.path, ALIGNED, aligned_config(config, team))
+            write_team_files(new.path, config, without_frames(config), 6, ALIGNED_RESOLUTION, progress)
             new.put()
 
     def team_file(self, label: str, folder: Path) -> Path | None:
         """Return the team file with the team's frames; None where ``align`` connected no two robots."""
         del label
-        path = folder / f"{self.frames}.yaml"
-        return path if path.exists() else None
+        return team_file(folder, self.frames)
+
+    def right_config(self, run: RunConfig) -> RunConfig:
+        """Return the configuration with right frames of the team of a run, beside its logs."""
+        return load_team_file(Path(run.robots[0].logs[0].parent) / f"{RIGHT}.yaml")
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots."""
+        return len(self.parts)
 
     def _robots(self, folder: Path) -> Iterator[RobotConfig]:
         """Write the log of each robot in a frame of its own, and yield the robots with the right frames."""
         rng = np.random.default_rng(self.seed)
         for number, part in enumerate(self.parts, start=1):
-            T_map_given, log = _own_frame(rng), folder / f"robot_{number}.mcap"
+            T_map_given, log = own_frame(rng), folder / f"robot_{number}.mcap"
             import_rgbd(
                 part.folder, log, rate=RATE, first=part.first, last=part.last, every=part.every,
                 map_frame=f"{log.stem}/odom", T_map_given=T_map_given,
@@ -166,37 +156,8 @@ def _split(sequence: Path, num_images: int, num_robots: int, overlap: float) -> 
         yield Part(sequence.resolve(), first, max(first, end - 1), every)
 
 
-def frame_errors(right: RunConfig, found: RunConfig) -> tuple[float, float]:
-    """Return the largest errors of the frames of ``found`` against the right ones: shift [m] and angle [degrees].
-
-    They are errors between each robot and the first one of ``found``, whose frame is the reference.
-    """
-    true, given = (
-        {robot.robot_id: transform_of(robot.T_team_map_or_identity) for robot in config.robots}
-        for config in (right, found)
-    )
-    first = found.robots[0].robot_id
-    errors = [
-        pose_difference(inverse(true[first]) @ true[robot_id], inverse(given[first]) @ given[robot_id])
-        for robot_id in given
-    ]
-    shifts, angles = zip(*errors, strict=True)
-    return max(shifts), math.degrees(max(angles))
-
-
 def _files(part: Part) -> list[tuple[str, int, int]]:
     """Names, sizes and times of change of a part's depth images."""
     frames = find_layout(part.folder).frames[part.first : part.last + 1 : part.every]
     stats = [(frame.depth_file, frame.depth_file.stat()) for frame in frames]
     return [(path.name, stat.st_size, stat.st_mtime_ns) for path, stat in stats]
-
-
-def _own_frame(rng: np.random.Generator) -> Float64Array:
-    """Random transform (4, 4) from a recording's frame: any rotation about z, and a shift."""
-    yaw = rng.uniform(-math.pi, math.pi)
-    return pose_matrix(rng.uniform(-MAX_SHIFT, MAX_SHIFT, 3).tolist(), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
-
-
-def _write_team(folder: Path, name: str, config: RunConfig) -> None:
-    """Write a team file beside the logs."""
-    write_whole(folder / f"{name}.yaml", dump_team(config, folder.resolve()))

@@ -27,8 +27,8 @@ _VARIANTS = {
 """Names by rule, gamma, gamma_power and anchor_after."""
 _VARY = f"rule+gamma+gamma_power+anchor_after={','.join('+'.join(values) for values in _VARIANTS)}"
 
-_IDLE_TICKS = (1, 100, 300)
-"""Numbers of idle ticks, ascending, after which the maps are compared."""
+_IDLE_TICKS = (0, 100, 300)
+"""Numbers of idle ticks after the logs, ascending, after which the maps are compared."""
 _CONSTANT_GAMMA = 100_000
 """Number of settling ticks over which gamma falls to 0: it is constant within 1 % over the idle ticks."""
 _CUT = 1.5
@@ -61,9 +61,10 @@ def _kept(_: ExperimentTeam, row: Row, sweep: Sweep) -> dict[str, float]:
     A team that came to rest stays as it is.
     """
     with open_result(sweep.result(dict(row))) as result:
-        idle = [tick for tick in result.metrics if tick.settling]
+        ticks = result.metrics
+    log_end = sum(not tick.settling for tick in ticks) - 1
     return {
-        f"agreement_occupied_idle_{count}": worst(idle[min(count, len(idle)) - 1], "agreement_occupied")
+        f"agreement_occupied_idle_{count}": worst(ticks[min(log_end + count, len(ticks) - 1)], "agreement_occupied")
         for count in _IDLE_TICKS
     }
 
@@ -78,7 +79,7 @@ _CUT_OFF = Comparison(
     "rule",
     _variant,
     tuple(
-        Measure(f"agreement after {count} idle {'tick' if count == 1 else 'ticks'}", f"agreement_occupied_idle_{count}")
+        Measure(f"agreement after {count} idle ticks", f"agreement_occupied_idle_{count}")
         for count in _IDLE_TICKS
     ),
     "bayes",

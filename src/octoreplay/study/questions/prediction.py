@@ -10,14 +10,13 @@ from octoreplay.report.experiment_plots import Dots
 from octoreplay.study.experiments import Experiment, Plan, Question
 from octoreplay.study.questions.sensor_models import PREDICTION, VARY_MODELS, model_name, predicted
 from octoreplay.study.questions.settings import LAST_MAPS
-from octoreplay.study.recorded_teams import RIGHT, RecordedTeam, recorded_parts
+from octoreplay.study.real_teams import teams_of
+from octoreplay.study.team_frames import RIGHT
 
 
-def experiment(recordings: Sequence[Path]) -> Experiment:
-    """Sensor models on each team of the recordings, with right frames and without exchange."""
-    teams = {
-        f"{RIGHT}_{seed}": RecordedTeam(parts, RIGHT, seed) for seed, parts in enumerate(recorded_parts(recordings))
-    }
+def experiment(data: Sequence[Path]) -> Experiment:
+    """Sensor models on each team of the data, with right frames and without exchange."""
+    teams = teams_of(data, (RIGHT,))
     settings = {"rule": "local", "settle": 0, **LAST_MAPS}
     return Experiment(
         teams,

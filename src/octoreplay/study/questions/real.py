@@ -7,24 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from octoreplay.config.team_file import load_team_file
 from octoreplay.evaluate.repairs import erased_cells
 from octoreplay.report.comparisons import KILOBYTES, Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.result import open_result
 from octoreplay.study.experiments import Experiment, Plan, Question
 from octoreplay.study.questions.settings import DURING, LAST_MAPS, SETTLED, rule_name
-from octoreplay.study.recorded_teams import FRAMES, RIGHT, RecordedTeam, frame_errors, recorded_parts
+from octoreplay.study.real_teams import RealTeam, teams_of
 from octoreplay.study.sweep import Sweep
+from octoreplay.study.team_frames import FRAMES, RIGHT, frame_errors
 
 
-def experiment(recordings: Sequence[Path]) -> Experiment:
-    """Three rules on each team of the recordings: with right frames, with one of each robot's own, and aligned."""
-    teams = {
-        f"{frames}_{seed}": RecordedTeam(parts, frames, seed)
-        for seed, parts in enumerate(recorded_parts(recordings))
-        for frames in FRAMES
-    }
+def experiment(data: Sequence[Path]) -> Experiment:
+    """Three rules on each team of the data: with right frames, with one of each robot's own, and aligned."""
+    teams = teams_of(data, FRAMES)
     return Experiment(
         teams,
         (
@@ -36,16 +32,15 @@ def experiment(recordings: Sequence[Path]) -> Experiment:
     )  # fmt: skip
 
 
-def _changes(team: RecordedTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
+def _changes(team: RealTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     """Frames of a run, their errors, and the share of the robots' own occupied cells that the exchange made free."""
     with open_result(sweep.result(dict(row))) as result:
         robots = result.config.robots
         counts = [erased_cells(result.evidence(robot.robot_id), result.map(robot.robot_id)) for robot in robots]
-        right = load_team_file(robots[0].logs[0].parent / f"{RIGHT}.yaml")
-        shift, angle = frame_errors(right, result.config)
+        shift, angle = frame_errors(team.right_config(result.config), result.config)
     num_occupied, num_erased = (sum(count) for count in zip(*counts, strict=True))
     return {
-        "frames": team.frames, "num_recordings": len(team.parts), "num_robots": len(robots),
+        "frames": team.frames, "num_recordings": team.num_robots, "num_robots": len(robots),
         "frame_shift": shift, "frame_angle": angle, "erased": num_erased / num_occupied,
     }  # fmt: skip
 
