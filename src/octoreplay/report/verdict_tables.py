@@ -13,7 +13,7 @@ from rich.text import Text
 from octoreplay.errors import printable
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.evaluate.comparison import MapDifference, Point, ResultComparison, SettingDifference
-from octoreplay.report.tables import styled_table
+from octoreplay.report.tables import counted, styled_table
 
 _MOST_CHANGES = 12
 """Number of pairs of labels with a row of their own; one row sums up the others."""
@@ -37,8 +37,8 @@ def check_verdict(rows: Sequence[CheckRow]) -> str:
     """Return one sentence that names the failed checks."""
     failed = [row.name.replace("_", " ") for row in rows if not row.passed]
     if not failed:
-        return f"passed: {'all ' if len(rows) > 1 else ''}{_count(len(rows), 'check')}"
-    return f"failed: {len(failed)} of {_count(len(rows), 'check')}: {', '.join(failed)}"
+        return f"passed: {'all ' if len(rows) > 1 else ''}{counted(len(rows), 'check')}"
+    return f"failed: {len(failed)} of {counted(len(rows), 'check')}: {', '.join(failed)}"
 
 
 def comparison(found: ResultComparison, *, is_verbose: bool = False) -> Iterator[RenderableType]:
@@ -64,15 +64,15 @@ def comparison_verdict(found: ResultComparison) -> str:
     num_maps = len(found.maps)
     if found.is_same:
         num_relabelled = sum(one.num_relabelled for one in found.maps)
-        labels = f"; labels differ in {_count(num_relabelled, 'cell')}" if num_relabelled else ""
-        return f"the same{within}: all cells of {_count(num_maps, 'map')}{labels}"
+        labels = f"; labels differ in {counted(num_relabelled, 'cell')}" if num_relabelled else ""
+        return f"the same{within}: all cells of {counted(num_maps, 'map')}{labels}"
     parts = []
     differing = [one for one in found.maps if one.num_differing]
     if differing:
         worst = max(differing, key=lambda one: one.largest_difference)
         most = max(one.num_differing for one in differing)
         parts.append(
-            f"{len(differing)} of {_count(num_maps, 'map')}, in up to {_count(most, 'cell')},"
+            f"{len(differing)} of {counted(num_maps, 'map')}, in up to {counted(most, 'cell')},"
             f" by up to {six_digits(worst.largest_difference)} ({_place(worst)})"
         )
     parts += [f"only {result} has a map of {', '.join(names)}"
@@ -186,8 +186,3 @@ def _place(one: MapDifference) -> str:
 def _point(point: Point | None) -> str:
     """Coordinates as text."""
     return "" if point is None else ", ".join(f"{value:g}" for value in point)
-
-
-def _count(number_of: int, noun: str) -> str:
-    """Number with a noun in singular or plural."""
-    return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"

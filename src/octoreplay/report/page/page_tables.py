@@ -17,7 +17,8 @@ from octoreplay.transforms import transform_of
 def verdict(result: Result) -> str:
     """Return the verdict on a run as an HTML description list, with the end of an incomplete run."""
     summary = result.summary
-    rows = [("logs", f"{len(result.robots)} robots, {terminal_tables.seconds(summary.log_seconds)}")]
+    robots = terminal_tables.counted(len(result.robots), "robot")
+    rows = [("logs", f"{robots}, {terminal_tables.seconds(summary.log_seconds)}")]
     if not result.is_complete:
         rows.append(("incomplete", result.extent))
     rows += terminal_tables.verdict_rows(run_verdict(summary))

@@ -78,10 +78,7 @@ _CUT_OFF = Comparison(
     "cut",
     "rule",
     _variant,
-    tuple(
-        Measure(f"agreement after {count} idle ticks", f"agreement_occupied_idle_{count}")
-        for count in _IDLE_TICKS
-    ),
+    tuple(Measure(f"agreement after {count} idle ticks", f"agreement_occupied_idle_{count}") for count in _IDLE_TICKS),
     "bayes",
 )
 _HALVES = Comparison("halves", "rule", _variant, (DURING, SETTLED), "bayes")
