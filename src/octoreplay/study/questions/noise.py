@@ -68,10 +68,11 @@ _COMPARISON = Comparison(
         Measure("wrong in own map, %", "wrong", 2, 100.0),
         Measure("repaired, %", "repaired", 2, 100.0),
         Measure("made wrong, %", "spread", 2, 100.0),
+        Measure("wrong after the exchange, %", "wrong_after", 2, 100.0),
         MEAN_IOU,
     ),
     next(iter(_LEVELS)),
     "rule",
 )
 
-QUESTION = Question(experiment, (_COMPARISON,), {"noise.png": Dots(_COMPARISON)})
+QUESTION = Question(experiment, (_COMPARISON,), {"noise.png": Dots(_COMPARISON, 15.0)})
