@@ -7,7 +7,7 @@ import pytest
 from octoreplay.config.network import ScheduleEntry
 from octoreplay.config.team_file import load_team_file
 from octoreplay.replay.run import replay_team
-from octoreplay.replay.warnings import rule_warnings
+from octoreplay.replay.warnings import packet_warnings, rule_warnings
 from support.faulty_team import (
     ONE_WAY_RING,
     configured,
@@ -48,6 +48,32 @@ def test_flows_with_packets_that_round_give_a_warning_where_they_are_asked_for(p
         "flow_bits 3 with packets that do not hold the maps exactly: the maps do not come to rest;"
     )
     assert rule_warnings(configured(rule="gradient", flow_bits=3, **parameters), is_symmetric=True) == ()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "needed"),
+    [
+        ({"int8_step": 0.02}, "0.04"),
+        ({"int8_step": 0.02, "clamp_max": 2.0}, "0.04"),
+        ({"int8_step": 0.05, "clamp_min": -8.0}, "0.063"),
+        ({"int8_step": 0.02, "clamp_min": -2.0, "clamp_max": 2.5}, None),
+        ({"int8_step": 0.04}, None),
+        ({"int8_step": 0.02, "content": "float16"}, None),
+        ({"int8_step": 0.02, "evidence": "time-average", "rule": "gradient"}, None),
+        ({"int8_step": 0.02, "rule": "local"}, None),
+    ],
+)
+def test_packets_that_cannot_hold_the_clamps_give_a_warning(parameters, needed):
+    warnings = packet_warnings(configured(**{"rule": "bayes", "content": "int8", **parameters}))
+    assert len(warnings) == (needed is not None)
+    if needed is not None:
+        assert f"use --int8-step {needed} or more" in warnings[0]
+        assert packet_warnings(configured(**{**parameters, "content": "int8", "int8_step": float(needed)})) == ()
+
+
+def test_a_run_with_packets_that_cannot_hold_the_clamps_ends_with_the_warning():
+    config = load_team_file(PAIR_TEAM).with_parameters({"settle": 0, "content": "int8", "int8_step": 0.01})
+    assert sum("holds log-odds up to 1.27" in warning for warning in replay_team(config, None).warnings) == 1
 
 
 @pytest.mark.parametrize("rule", ["bayes", "ratio", "flood", "gradient"])

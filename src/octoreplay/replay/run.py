@@ -27,7 +27,7 @@ from octoreplay.replay.memory import MemoryWatch
 from octoreplay.replay.recorder import Recorder
 from octoreplay.replay.session import Session
 from octoreplay.replay.sources import TeamSources
-from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings
+from octoreplay.replay.warnings import coverage_warnings, map_warnings, packet_warnings, rule_warnings
 from octoreplay.run_metrics import RunSummary
 
 _log = logging.getLogger(__name__)
@@ -122,6 +122,7 @@ def replay_team(
             warnings = (
                 *config.warnings,
                 *rule_warnings(config, session.is_symmetric),
+                *packet_warnings(config),
                 *map_warnings(0 if recorder.last is None else recorder.last.metrics.num_known_cells),
                 *recorder.frame_warnings(),
                 *coverage_warnings(team.counts),

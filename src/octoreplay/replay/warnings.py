@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from octoreplay.config.resolved import ResolvedRun
-from octoreplay.config.rules import RULES
+from octoreplay.config.rules import RULES, Exchanged
 from octoreplay.mapping.contradiction import LABEL_LIMIT, MIN_OVERLAP, contradicting_pairs
+from octoreplay.mapping.quantise import INT8_MAX
 from octoreplay.records import MIN_GAP_NS, FrameCounts
 from octoreplay.run_metrics import MIN_COMPARED_CELLS, PairMetrics, TickMetrics, ranked_pairs
 
@@ -68,6 +70,21 @@ def _sum_warnings(config: ResolvedRun, ids: Sequence[str], is_symmetric: bool) -
         f"rule '{rule.name}' keeps the team's sum only when both ends of a link receive a map in the same tick; with"
         f" {', '.join([*found[:-2], ' and '.join(found[-2:])])} it drifts from the mean; use --rule"
         f" {' or '.join(others)}"
+    )
+    return (sentence,)
+
+
+def packet_warnings(config: ResolvedRun) -> tuple[str, ...]:
+    """Sentences on log-odds that the run's packets cannot hold."""
+    packet, sensor = config.effective_packet, config.effective_sensor
+    largest, allowed = INT8_MAX * packet.int8_step, max(-sensor.clamp_min, sensor.clamp_max)
+    sends_sums = config.consensus.evidence == "sum" and config.consensus.traits.exchanges is not Exchanged.NOTHING
+    if packet.content != "int8" or not sends_sums or allowed <= largest:
+        return ()
+    needed = math.ceil(1000 * allowed / INT8_MAX) / 1000
+    sentence = (
+        f"int8_step {packet.int8_step:g} holds log-odds up to {largest:g}, and the clamps allow {allowed:g}: larger"
+        f" ones are sent as {largest:g}, so that maps differ; use --int8-step {needed:g} or more, or closer clamps"
     )
     return (sentence,)
 

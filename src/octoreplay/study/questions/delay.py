@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from octoreplay.report.comparisons import Comparison, Row
+from octoreplay.report.comparisons import KILOBYTES, Comparison, Row
 from octoreplay.report.experiment_plots import Dots
 from octoreplay.study.experiments import Experiment, Plan, Question
 from octoreplay.study.questions.settings import DURING, LAST_MAPS, SETTLED, SHORT_SETTLING, villages
@@ -16,8 +16,7 @@ _DELAYS = {
     ("0.2", "0.2"): "ticks of 0.2 s, 0.2 s delay",
 }
 """Names by the length of a tick, which is called publish_period, and latency; all robots publish once a second."""
-_RULES = ("gradient+int8+0.02", "bayes+int8+0.02", "flood+int8+0.05")
-"""Rule, content and int8_step."""
+_RULES = ("gradient", "bayes", "flood")
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:
@@ -26,10 +25,10 @@ def experiment(duration: float, num_villages: int) -> Experiment:
         label: dataclasses.replace(team, publish_period=1.0) for label, team in villages(duration, num_villages).items()
     }
     vary = (
-        f"rule+content+int8_step={','.join(_RULES)}",
+        f"rule={','.join(_RULES)}",
         f"publish_period+latency={','.join('+'.join(values) for values in _DELAYS)}",
     )
-    settings = {**SHORT_SETTLING, **LAST_MAPS}
+    settings = {"content": "int8", **SHORT_SETTLING, **LAST_MAPS}
     return Experiment(teams, (Plan("delay", tuple(teams), vary, settings, has_truth=False),))
 
 
@@ -38,6 +37,8 @@ def _delay(row: Row) -> str:
     return _DELAYS[str(row["publish_period"]), str(row["latency"])]
 
 
-_COMPARISON = Comparison("delay", "ticks and delay", _delay, (DURING, SETTLED), "ticks of 1 s, no delay", "rule")
+_COMPARISON = Comparison(
+    "delay", "ticks and delay", _delay, (DURING, SETTLED, KILOBYTES), "ticks of 1 s, no delay", "rule"
+)
 
-QUESTION = Question(experiment, (_COMPARISON,), {"delay.png": Dots(_COMPARISON, 9.0)})
+QUESTION = Question(experiment, (_COMPARISON,), {"delay.png": Dots(_COMPARISON)})

@@ -15,7 +15,13 @@ from octoreplay.io.results.result_writer import ResultWriter
 from octoreplay.io.results.tile_files import TileFile, TileList, put_file
 from octoreplay.records import CONVERGED, FrameCounts
 from octoreplay.replay.team_recorder import TeamRecorder
-from octoreplay.replay.warnings import coverage_warnings, map_warnings, rule_warnings, team_frame_warnings
+from octoreplay.replay.warnings import (
+    coverage_warnings,
+    map_warnings,
+    packet_warnings,
+    rule_warnings,
+    team_frame_warnings,
+)
 from octoreplay.run_metrics import RunSummary
 from octoreplay.study.tiles.geometry import Tile
 from octoreplay.study.tiles.joined_maps import JoinedMaps, OtherMaps
@@ -63,6 +69,7 @@ def write_result(
         warnings = (
             *config.warnings,
             *rule_warnings(config, outcome.is_symmetric),
+            *packet_warnings(config),
             *map_warnings(recorder.last.num_known_cells),
             *team_frame_warnings(recorder.last, {name: n for name, n in maps.num_evidence_cells.items() if n}),
             *coverage_warnings(outcome.counts),
