@@ -10,7 +10,7 @@ from octoreplay.report.experiment_plots import Curves
 from octoreplay.simulate.settings import SimulationConfig
 from octoreplay.simulate.world import village_classes
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import LAST_MAPS, rule_name
+from octoreplay.study.questions.settings import DURING, LAST_MAPS, rule_name
 
 _NUM_ROBOTS = (2, 4, 8, 16, 32, 64)
 _RESOLUTIONS = (0.1, 0.15, 0.2, 0.3, 0.5)
@@ -85,7 +85,9 @@ _MEASURES = (
 QUESTION = Question(
     experiment,
     (
-        Comparison("robots", "robots, graph, cells", lambda row: f"{row['num_robots']}, {_graph(row)}", _MEASURES),
+        Comparison(
+            "robots", "robots, graph, cells", lambda row: f"{row['num_robots']}, {_graph(row)}", (*_MEASURES, DURING)
+        ),
         Comparison("resolution", "cells, rule", lambda row: f"{row['resolution']} m, {row['rule']}", _MEASURES),
         Comparison("classes", "classes, rule", lambda row: f"{row['num_classes']}, {row['rule']}", _MEASURES),
     ),
