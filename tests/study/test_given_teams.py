@@ -136,3 +136,13 @@ def test_a_team_file_from_beginning_to_end(tmp_path: Path) -> None:
     assert all(float(row["frame_shift"]) == pytest.approx(0.0, abs=1e-6) for row in right)
     assert all(float(row["frame_shift"]) > 0.1 for row in own)
     assert float(own[0]["num_known_cells"]) > float(right[0]["num_known_cells"])
+
+
+@pytest.mark.long
+def test_a_team_without_occupied_cells_has_no_share_of_them(tmp_path: Path) -> None:
+    path = pair(tmp_path / "team")
+    path.write_text(path.read_text() + "max_range: 0.5\n")
+    done = octoreplay_process("experiment", "real", tmp_path / "real", "--data", path)
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((tmp_path / "real" / "real.csv").read_text(encoding="utf-8").splitlines()))
+    assert {row["erased"] for row in rows} == {"nan"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ def _changes(team: RealTeam, row: Row, sweep: Sweep) -> dict[str, Any]:
     num_occupied, num_erased = (sum(count) for count in zip(*counts, strict=True))
     return {
         "frames": team.frames, "num_recordings": team.num_robots, "num_robots": len(robots),
-        "frame_shift": shift, "frame_angle": angle, "erased": num_erased / num_occupied,
+        "frame_shift": shift, "frame_angle": angle,
+        "erased": num_erased / num_occupied if num_occupied else math.nan,
     }  # fmt: skip
 
 
