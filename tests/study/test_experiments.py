@@ -27,7 +27,7 @@ NUM_RUNS = {
     "rules": {"rules": 10 * 2 * 2},
     "forgetting": {"cut": 9 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
-    "radio": {"radio": 6 * 6 * 2},
+    "radio": {"radio": 7 * 6 * 2},
     "delay": {"delay": 3 * 4 * 2},
     "noise": {"noise": 14 * 3 * 2},
     "confidence": {
