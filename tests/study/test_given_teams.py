@@ -100,6 +100,9 @@ def test_teams_without_known_frames_and_single_robots_are_refused(tmp_path: Path
     missing = tmp_path / "missing.yaml"
     missing.write_text("robots: [{id: a, log: a.mcap}, {id: b, log: b.mcap}]\n")
     assert_fails(1, "missing.yaml: .*a.mcap: no such file", "experiment", "real", tmp_path / "out", "--data", missing)
+    # Exit code 2, as of every command with a team file that cannot be read.
+    nowhere, reason = tmp_path / "nowhere.yaml", "nowhere.yaml: cannot be read: No such file"
+    assert_fails(2, reason, "experiment", "real", tmp_path / "out", "--data", nowhere)
     assert not (tmp_path / "out").exists()
 
 

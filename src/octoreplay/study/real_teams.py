@@ -15,8 +15,8 @@ RealTeam = RecordedTeam | GivenTeam
 def teams_of(data: Sequence[Path], frames: Sequence[str]) -> dict[str, RealTeam]:
     """Return the teams of the data by label, each with each of these kinds of frames.
 
-    A file is a team file, and a folder has the recordings of ``recorded_parts``. Raises the errors of ``check_given``
-    and ``recorded_parts``.
+    A file or a path to ``*.yaml`` is a team file, and a folder has the recordings of ``recorded_parts``. Raises the
+    errors of ``check_given`` and ``recorded_parts``.
     """
     found = [team for path in data for team in _teams(path)]
     return {f"{kind}_{seed}": team(kind, seed) for seed, team in enumerate(found) for kind in frames}
@@ -24,7 +24,7 @@ def teams_of(data: Sequence[Path], frames: Sequence[str]) -> dict[str, RealTeam]
 
 def _teams(path: Path) -> Iterator[Callable[[str, int], RealTeam]]:
     """Teams of a file or a folder, each as a function of its frames and its seed."""
-    if path.is_file():
+    if path.is_file() or path.suffix == ".yaml":
         check_given(path)
         yield functools.partial(GivenTeam, path)
     else:
