@@ -118,8 +118,10 @@ def test_the_page_on_experiments_has_the_tables_of_the_stored_runs() -> None:
     assert folders
     for name in folders:
         stored = page.partition(f"<!-- {name} -->\n")[2].partition(script.END)[0]
-        made = script.page_tables(QUESTIONS[name], script.stored_runs(DOCS / "experiments" / name))
-        assert stored == made, "run python docs/tools/experiment_tables.py"
+        runs = script.stored_runs(DOCS / "experiments" / name)
+        assert stored == script.page_tables(QUESTIONS[name], runs), "run python docs/tools/experiment_tables.py"
+        titles = [table.title for table in QUESTIONS[name].tables(runs)]
+        assert len(set(titles)) == len(titles), f"two tables of {name} have one title"
 
 
 def test_the_runs_of_the_experiments_are_small() -> None:

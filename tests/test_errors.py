@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from octoreplay.errors import InputError, printable
+from octoreplay.errors import InputError, counted, printable
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,7 @@ from octoreplay.errors import InputError, printable
 def test_control_characters_in_messages_are_escaped(text, shown):
     assert printable(text) == shown
     assert str(InputError(text)) == shown
+
+
+def test_a_single_thing_is_in_the_singular():
+    assert [counted(number, "robot") for number in (0, 1, 1200)] == ["0 robots", "1 robot", "1,200 robots"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from octoreplay.errors import counted
 from octoreplay.report.comparisons import Tables, markdown
 from octoreplay.report.figures import save_figures
 from octoreplay.study.experiments import Question
@@ -41,8 +42,20 @@ def stored_runs(folder: Path) -> Tables:
 
 
 def page_tables(question: Question, found: Tables) -> str:
-    """Return the tables of an experiment as the page has them."""
-    return "\n".join(map(markdown, question.tables(found))) + "\n"
+    """Return the tables of an experiment as the page has them: the first open, the others folded."""
+    first, *others = question.tables(found)
+    if not others:
+        return f"{markdown(first)}\n"
+    titles = "; ".join(table.title for table in others)
+    return "\n".join(
+        (
+            markdown(first),
+            '<details markdown="1">',
+            f"<summary>{counted(len(others), 'more table')}: {titles}</summary>\n",
+            *map(markdown, others),
+            "</details>\n\n",
+        )
+    )
 
 
 if __name__ == "__main__":

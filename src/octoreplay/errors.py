@@ -81,3 +81,8 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     """Return the end of a sentence, '; did you mean ...?' with the most similar known name, or an empty string."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless the number is 1."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"

@@ -115,6 +115,8 @@ def test_sections_are_compared_by_themselves() -> None:
     found = {"runs": rows({"bayes": [1.0], "flood": [2.0]}) + rows({"bayes": [4.0], "flood": [3.0]}, "line")}
     ring, line = tables_of(COMPARED, found)
     assert (ring.title, line.title) == ("ring", "line")
+    named = tables_of(dataclasses.replace(COMPARED, title="six robots"), found)
+    assert [table.title for table in named] == ["six robots, ring", "six robots, line"]
     assert [ring.lines[1][2], line.lines[1][2]] == ["+1.00", "-1.00"]
 
 

@@ -88,10 +88,6 @@ def test_a_row_of_equal_robots_has_the_ranges_of_their_other_numbers() -> None:
     assert re.search("^beta ", text, re.M)
 
 
-def test_a_single_thing_is_in_the_singular() -> None:
-    assert [tables.counted(number, "robot") for number in (0, 1, 1200)] == ["0 robots", "1 robot", "1,200 robots"]
-
-
 def test_the_verdict_says_whether_the_team_agrees() -> None:
     last = tick_metrics(5)
     text = rendered(tables.results(summary([last]), num_warnings=2))

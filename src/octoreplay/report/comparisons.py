@@ -99,6 +99,8 @@ class Comparison:
         Column by whose values the runs are divided into tables; comparisons stay within a table.
     unit : str
         Noun for what the column TEAM numbers.
+    title : str
+        Title of the tables, which tells them from those of the question's other comparisons.
     """
 
     plan: str
@@ -108,6 +110,7 @@ class Comparison:
     baseline: str | None = None
     section: str | None = None
     unit: str = "village"
+    title: str = ""
 
     def sections(self, found: Tables) -> dict[str, dict[str, list[Row]]]:
         """Return the rows of each section by label, in the order of first occurrence."""
@@ -173,7 +176,8 @@ def tables_of(comparison: Comparison, found: Tables) -> Iterator[TextTable]:
             lines.append(tuple(line))
         every = [row for rows in parts.values() for row in rows]
         caption = _caption(every, comparison.unit, has_changes=baseline is not None)
-        yield TextTable(section, tuple(headings), tuple(lines), caption)
+        title = ", ".join(part for part in (comparison.title, section) if part)
+        yield TextTable(title, tuple(headings), tuple(lines), caption)
 
 
 def _caption(rows: Sequence[Row], unit: str, *, has_changes: bool) -> str:

@@ -48,11 +48,6 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-def counted(number_of: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless the number is 1."""
-    return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"
-
-
 def size(num_bytes: float) -> str:
     """Format a number of bytes in B, kB, MB or GB (powers of 1000); a dash if not finite."""
     if not math.isfinite(num_bytes):

@@ -10,10 +10,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from octoreplay.errors import printable
+from octoreplay.errors import counted, printable
 from octoreplay.evaluate.checks import CheckRow
 from octoreplay.evaluate.comparison import MapDifference, Point, ResultComparison, SettingDifference
-from octoreplay.report.tables import counted, styled_table
+from octoreplay.report.tables import styled_table
 
 _MOST_CHANGES = 12
 """Number of pairs of labels with a row of their own; one row sums up the others."""

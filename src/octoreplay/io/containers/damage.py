@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from octoreplay.config.file_url import InputFile
+from octoreplay.errors import counted
 
 
 class Damage:
@@ -78,11 +79,6 @@ def damage_sentence(path: InputFile, clauses: Sequence[str], start_ns: int | Non
 def log_times(start_ns: int, end_ns: int) -> str:
     """Return a span of log times [ns] in seconds."""
     return f"log times {start_ns / 1e9:.3f} s to {end_ns / 1e9:.3f} s"
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless the number is 1."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _were(number: int) -> str:

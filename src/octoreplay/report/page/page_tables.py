@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from octoreplay.config.parameters import PARAMETERS, SECTIONS
-from octoreplay.errors import escaped
+from octoreplay.errors import counted, escaped
 from octoreplay.evaluate.verdict import run_verdict
 from octoreplay.report import tables as terminal_tables
 from octoreplay.report.alignment_tables import FrameRow, frames_table
@@ -17,7 +17,7 @@ from octoreplay.transforms import transform_of
 def verdict(result: Result) -> str:
     """Return the verdict on a run as an HTML description list, with the end of an incomplete run."""
     summary = result.summary
-    robots = terminal_tables.counted(len(result.robots), "robot")
+    robots = counted(len(result.robots), "robot")
     rows = [("logs", f"{robots}, {terminal_tables.seconds(summary.log_seconds)}")]
     if not result.is_complete:
         rows.append(("incomplete", result.extent))

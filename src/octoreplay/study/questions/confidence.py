@@ -114,8 +114,11 @@ _OF_MODELS = Comparison(
         Measure("temperature", "temperature", 2),
     ),
     "defaults",
+    title="sensor models, against the truth",
 )
-_PREDICTED = Comparison("sensor_models", "sensor model", model_name, PREDICTION, "defaults")
+_PREDICTED = Comparison(
+    "sensor_models", "sensor model", model_name, PREDICTION, "defaults", title="sensor models, prediction"
+)
 _OF_RULES = Comparison(
     "calibration",
     "rule",
@@ -126,11 +129,14 @@ _OF_RULES = Comparison(
         Measure("calibration error, occupied", "calibration_error_occupied"),
     ),
     "bayes",
+    title="rules",
 )
-_OF_LABELS = Comparison("labels", "sensor model", _label_model, AGREEMENTS, "defaults", "rule")
-_OF_CONFIDENCES = Comparison("confidences", "confidences", _confidence_model, _OF_MODELS.measures, "hit", "network")
+_OF_LABELS = Comparison("labels", "sensor model", _label_model, AGREEMENTS, "defaults", "rule", title="priors")
+_OF_CONFIDENCES = Comparison(
+    "confidences", "confidences", _confidence_model, _OF_MODELS.measures, "hit", "network", title="confidences"
+)
 _OF_CONFIDENCES_WITH_PRIOR = dataclasses.replace(
-    _OF_CONFIDENCES, plan="confidences_prior", heading="confidences, prior 0.7, hit 3"
+    _OF_CONFIDENCES, plan="confidences_prior", title="confidences, prior 0.7, hit 3"
 )
 
 QUESTION = Question(

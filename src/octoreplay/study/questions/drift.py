@@ -113,9 +113,15 @@ _PANELS = {
     )
 }
 _OF_DRIFT = Comparison(
-    "drift", "drift", lambda row: f"{float(row['drift']):g} %, {float(row['drift']) / 2:g}° per 10 m", _MEASURES
+    "drift",
+    "drift",
+    lambda row: f"{float(row['drift']):g} %, {float(row['drift']) / 2:g}° per 10 m",
+    _MEASURES,
+    title="drift of dead reckoning",
 )
-_OF_NOISE = Comparison("noise", "noise", lambda row: f"{float(row['pose_noise']):g} m", _MEASURES)
+_OF_NOISE = Comparison(
+    "noise", "noise", lambda row: f"{float(row['pose_noise']):g} m", _MEASURES, title="noise of a localisation"
+)
 
 QUESTION = Question(
     experiment,

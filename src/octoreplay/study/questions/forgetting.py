@@ -80,8 +80,9 @@ _CUT_OFF = Comparison(
     _variant,
     tuple(Measure(f"agreement after {count} idle ticks", f"agreement_occupied_idle_{count}") for count in _IDLE_TICKS),
     "bayes",
+    title="one robot without links",
 )
-_HALVES = Comparison("halves", "rule", _variant, (DURING, SETTLED), "bayes")
+_HALVES = Comparison("halves", "rule", _variant, (DURING, SETTLED), "bayes", title="two halves apart and rejoined")
 
 QUESTION = Question(
     experiment,

@@ -150,13 +150,24 @@ _MEASURES = (
     Measure("accepted wrongly, % of all pairs", "wrong", 1, 100.0),
     Measure("robots connected, %", "connected", 0, 100.0),
 )
-_OF_CONDITIONS = Comparison("conditions", "condition", lambda row: str(row["condition"]), _MEASURES, _DEFAULT)
+_OF_CONDITIONS = Comparison(
+    "conditions", "condition", lambda row: str(row["condition"]), _MEASURES, _DEFAULT, title="noise, classes and poses"
+)
 _OVERLAP = Measure("mean overlap, %", "overlap", 1, 100.0)
 _OF_LENGTHS = Comparison(
-    "lengths", "length of the logs", lambda row: f"{float(row['duration']):g} s", (_OVERLAP, *_MEASURES)
+    "lengths",
+    "length of the logs",
+    lambda row: f"{float(row['duration']):g} s",
+    (_OVERLAP, *_MEASURES),
+    title="length of the logs",
 )
 _OF_AGES = Comparison(
-    "ages", "age of one map", lambda row: f"{float(row['age']):g} s", (_OVERLAP, *_MEASURES[:3]), "0 s"
+    "ages",
+    "age of one map",
+    lambda row: f"{float(row['age']):g} s",
+    (_OVERLAP, *_MEASURES[:3]),
+    "0 s",
+    title="age of one map",
 )
 
 QUESTION = Question(

@@ -93,9 +93,9 @@ _PANELS = {
 }
 
 
-def _comparison(plan: str, name: Label) -> Comparison:
+def _comparison(plan: str, title: str, name: Label) -> Comparison:
     """Table of one kind of error for each case."""
-    return Comparison(plan, "error of a frame", name, (*_MEASURES, _CLEAR), section="frames")
+    return Comparison(plan, "error of a frame", name, (*_MEASURES, _CLEAR), section="frames", title=title)
 
 
 def _figure(plan: str, x: str, x_label: str) -> Contrasts:
@@ -107,8 +107,8 @@ def _figure(plan: str, x: str, x_label: str) -> Contrasts:
 QUESTION = Question(
     experiment,
     (
-        _comparison("shifts", lambda row: f"{float(row['shift']):g} m"),
-        _comparison("turns", lambda row: f"{float(row['angle']):g}°"),
+        _comparison("shifts", "shift", lambda row: f"{float(row['shift']):g} m"),
+        _comparison("turns", "rotation", lambda row: f"{float(row['angle']):g}°"),
     ),
     {
         "shifts.png": _figure("shifts", "shift", "shift of a wrong frame [m]"),

@@ -41,7 +41,7 @@ def _exact(row: Row) -> str:
 
 
 _COMPARISONS = tuple(
-    Comparison(plan, "packets", _exact, AGREEMENTS, "delta float32", "rule")
+    Comparison(plan, "packets", _exact, AGREEMENTS, "delta float32", "rule", title=plan.replace("_", " "))
     for plan in ("six_robots", "sixteen_robots")
 )
 

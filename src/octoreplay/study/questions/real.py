@@ -70,8 +70,11 @@ _OF_FRAMES = Comparison(
     RIGHT,
     "rule",
     "team",
+    title="frames",
 )
-_OF_RULES = Comparison("real", "rule", rule_name, (DURING, SETTLED, _ERASED, KILOBYTES), "bayes", "frames", "team")
+_OF_RULES = Comparison(
+    "real", "rule", rule_name, (DURING, SETTLED, _ERASED, KILOBYTES), "bayes", "frames", "team", title="rules"
+)
 _DRAWN = dataclasses.replace(_OF_FRAMES, measures=(_CLEAR, *_RESULTS))
 
 QUESTION = Question(experiment, (_OF_FRAMES, _OF_RULES), {"real.png": Dots(_DRAWN, 19.0)})

@@ -86,10 +86,18 @@ QUESTION = Question(
     experiment,
     (
         Comparison(
-            "robots", "robots, graph, cells", lambda row: f"{row['num_robots']}, {_graph(row)}", (*_MEASURES, DURING)
+            "robots",
+            "robots, graph, cells",
+            lambda row: f"{row['num_robots']}, {_graph(row)}",
+            (*_MEASURES, DURING),
+            title="robots",
         ),
-        Comparison("resolution", "cells, rule", lambda row: f"{row['resolution']} m, {row['rule']}", _MEASURES),
-        Comparison("classes", "classes, rule", lambda row: f"{row['num_classes']}, {row['rule']}", _MEASURES),
+        Comparison(
+            "resolution", "cells, rule", lambda row: f"{row['resolution']} m, {row['rule']}", _MEASURES, title="cells"
+        ),
+        Comparison(
+            "classes", "classes, rule", lambda row: f"{row['num_classes']}, {row['rule']}", _MEASURES, title="classes"
+        ),
     ),
     {
         "robots.png": Curves("robots", "num_robots", "robots", _MEASURES[:4], _graph, is_log=True),
