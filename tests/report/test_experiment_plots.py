@@ -44,6 +44,20 @@ def test_dots_have_a_marker_and_bars_for_every_label_and_section() -> None:
     figure.canvas.draw()
 
 
+def test_a_label_can_be_left_out_of_dots() -> None:
+    comparison = Comparison("runs", "rule", rule, (SCORE,), "bayes", "graph")
+    (score,) = Dots(comparison, without=("bayes",)).draw({"runs": rows()}).axes
+    assert [text.get_text() for text in score.get_yticklabels()] == ["flood"]
+
+
+@pytest.mark.parametrize(("highest", "labels"), [(30.0, [5.0, 10.0, 20.0]), (2000.0, [10.0, 100.0, 1000.0])])
+def test_numbers_of_a_logarithmic_axis_are_far_apart(highest: float, labels: list[float]) -> None:
+    found = {"runs": [{"rule": "flood", "village": 0, "bytes": 1e3 * value} for value in (4.0, highest)]}
+    (num_bytes,) = Dots(Comparison("runs", "bytes", lambda row: str(row["bytes"]), (BYTES,))).draw(found).axes
+    low, high = num_bytes.get_xlim()
+    assert [tick for tick in num_bytes.get_xticks() if low < tick < high] == labels
+
+
 def test_curves_have_bands_and_theory_as_a_curve() -> None:
     def theory(label: str) -> tuple[np.ndarray, np.ndarray]:
         """A line for each label."""

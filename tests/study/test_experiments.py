@@ -25,6 +25,7 @@ pytestmark = pytest.mark.long
 
 NUM_RUNS = {
     "rules": {"rules": 10 * 2 * 2},
+    "graphs": {"graphs": 4 * 4 * 2},
     "forgetting": {"cut": 9 * 2, "halves": 9 * 2},
     "packets": {"six_robots": 16 * 2, "sixteen_robots": 16 * 2},
     "radio": {"radio": 7 * 6 * 2},
@@ -37,7 +38,7 @@ NUM_RUNS = {
         "confidences": 3 * 5 * 2,
         "confidences_prior": 5 * 2,
     },
-    "steps": {"steps": 2 * 5 * 6 * 2, "bound": 4 * 8},
+    "steps": {"steps": 2 * 5 * 6 * 2, "evidence": 3 * 3 * 2, "bound": 4 * 8},
     "scale": {"robots": 6 * 3, "resolution": 5 * 2, "classes": 4 * 2},
     "frames": {"conditions": 15 * 2, "lengths": 4 * 2, "ages": 4 * 2},
     "drift": {"drift": 5 * 2 * 2, "noise": 3 * 2 * 2},

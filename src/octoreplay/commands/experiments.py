@@ -174,6 +174,7 @@ def _add_experiment(name: str, duration: float, num_villages: int, question: str
 
 
 _add_experiment("rules", 300.0, 10, "Compare the consensus rules.")
+_add_experiment("graphs", 30.0, 10, "Measure what the hops of a graph cost.")
 _add_experiment(
     "forgetting", 30.0, 10, "Measure what is kept by a robot that is cut off, and by a team that separates."
 )
@@ -182,7 +183,7 @@ _add_experiment("radio", 30.0, 10, "Measure what each fault of a radio costs.")
 _add_experiment("delay", 30.0, 10, "Measure what a delay costs with ticks of two lengths.")
 _add_experiment("noise", 30.0, 10, "Measure which wrong labels, poses and depths the exchange repairs and spreads.")
 _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
-_add_experiment("steps", 30.0, 10, "Vary the step sizes epsilon and gamma.")
+_add_experiment("steps", 30.0, 10, "Vary the step sizes epsilon and gamma, and the evidence that acts.")
 _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
 _add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and which wrong ones it accepts.")
 _add_experiment("drift", 40.0, 10, "Measure what wrong poses cost, and what 'refine' repairs.")

@@ -36,14 +36,21 @@ class Drawing(Protocol):
 
 @dataclass(frozen=True)
 class Dots:
-    """One panel for each measure of a comparison, one line for each label, one colour for each section."""
+    """One panel for each measure of a comparison, one line for each label, one colour for each section.
+
+    Labels in ``without`` are left out, such as one that is so far from the others that these would not differ.
+    """
 
     comparison: Comparison
     width: float = 13.0
+    without: tuple[str, ...] = ()
 
     def draw(self, found: Tables) -> Figure:
         """Return the figure: means over the teams with their intervals."""
-        sections = self.comparison.sections(found)
+        sections = {
+            section: {label: rows for label, rows in parts.items() if label not in self.without}
+            for section, parts in self.comparison.sections(found).items()
+        }
         labels = list(dict.fromkeys(label for parts in sections.values() for label in parts))
         figure = new_figure(self.width, 1.4 + 0.16 * len(labels) * (1 + len(sections)))
         panels = figure.subplots(1, len(self.comparison.measures), sharey=True, squeeze=False)[0]

@@ -169,10 +169,13 @@ def label_plainly(axis: Axis) -> None:
 
 def _decades(axis: Axis) -> None:
     """Put a tick at every decade, and at 2 and 5 between where there is room."""
+    from matplotlib.axis import XAxis
     from matplotlib.ticker import LogLocator, NullLocator
 
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000 * low else (1.0,), numticks=100))
+    # Numbers beside each other need more room than those above each other.
+    widest = 100 if isinstance(axis, XAxis) else 1000
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < widest * low else (1.0,), numticks=100))
     axis.set_minor_locator(NullLocator())
 
 

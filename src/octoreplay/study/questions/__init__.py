@@ -12,6 +12,7 @@ from octoreplay.study.questions import (
     drift,
     forgetting,
     frames,
+    graphs,
     misalignment,
     noise,
     packets,
@@ -26,6 +27,7 @@ from octoreplay.study.questions import (
 QUESTIONS: Mapping[str, Question] = MappingProxyType(
     {
         "rules": rules.QUESTION,
+        "graphs": graphs.QUESTION,
         "forgetting": forgetting.QUESTION,
         "packets": packets.QUESTION,
         "radio": radio.QUESTION,

@@ -55,8 +55,7 @@ def _frames(row: Row) -> str:
 
 _CLEAR = Measure("clear contradiction, %", "clear_contradiction", 2, 100.0)
 _ERASED = Measure("own occupied made free, %", "erased", 2, 100.0)
-_CELLS = Measure("known cells, 1000", "num_known_cells", None, 1e-3, is_ratio=True)
-_RESULTS = (DURING, SETTLED, _ERASED, _CELLS, KILOBYTES)
+_CELLS = Measure("known cells, thousands", "num_known_cells", None, 1e-3, is_ratio=True)
 _OF_FRAMES = Comparison(
     "real",
     "frames",
@@ -65,7 +64,11 @@ _OF_FRAMES = Comparison(
         Measure("contradiction, %", "contradiction", 1, 100.0),
         _CLEAR,
         Measure("different labels during the logs, %", "label_disagreement_mean", 2, 100.0),
-        *_RESULTS,
+        DURING,
+        SETTLED,
+        _ERASED,
+        _CELLS,
+        KILOBYTES,
     ),
     RIGHT,
     "rule",
@@ -75,6 +78,6 @@ _OF_FRAMES = Comparison(
 _OF_RULES = Comparison(
     "real", "rule", rule_name, (DURING, SETTLED, _ERASED, KILOBYTES), "bayes", "frames", "team", title="rules"
 )
-_DRAWN = dataclasses.replace(_OF_FRAMES, measures=(_CLEAR, *_RESULTS))
+_DRAWN = dataclasses.replace(_OF_FRAMES, measures=(_CLEAR, DURING, _ERASED, KILOBYTES))
 
-QUESTION = Question(experiment, (_OF_FRAMES, _OF_RULES), {"real.png": Dots(_DRAWN, 19.0)})
+QUESTION = Question(experiment, (_OF_FRAMES, _OF_RULES), {"real.png": Dots(_DRAWN)})

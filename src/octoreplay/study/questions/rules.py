@@ -25,4 +25,4 @@ def _rule(row: Row) -> str:
 
 _COMPARISON = Comparison("rules", "rule", _rule, AGREEMENTS, "bayes", "topology")
 
-QUESTION = Question(experiment, (_COMPARISON,), {"rules.png": Dots(_COMPARISON)})
+QUESTION = Question(experiment, (_COMPARISON,), {"rules.png": Dots(_COMPARISON, without=("local",))})

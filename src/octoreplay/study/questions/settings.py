@@ -64,3 +64,8 @@ def counts_of(stored: StoredMap, truth: Truth, region: Region) -> TruthCounts:
 def rule_name(row: Row) -> str:
     """Name of a run's rule."""
     return str(row["rule"])
+
+
+def graph_name(row: Row) -> str:
+    """Name of a run's graph."""
+    return str(row["topology"])

@@ -1,4 +1,4 @@
-"""Effect of the steps epsilon and gamma, and the bound on epsilon."""
+"""Effect of the steps epsilon and gamma and of the evidence's reading, and the bound on epsilon."""
 
 from __future__ import annotations
 
@@ -7,18 +7,29 @@ import numpy as np
 from octoreplay.evaluate import mixing
 from octoreplay.records import Float64Array
 from octoreplay.report.comparisons import Comparison, Measure, Row
-from octoreplay.report.experiment_plots import Curves, Squares
+from octoreplay.report.experiment_plots import Curves, Dots, Squares
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
-from octoreplay.study.questions.settings import DURING, LAST_MAPS, SETTLED, SHORT_SETTLING, villages
+from octoreplay.study.questions.settings import (
+    DURING,
+    LAST_MAPS,
+    MEAN_IOU,
+    SETTLED,
+    SHORT_SETTLING,
+    graph_name,
+    villages,
+)
 from octoreplay.study.sweep import Sweep
 
 _NUM_ROBOTS = 6
 _TOPOLOGIES = ("complete", "ring", "line", "star")
 _SHARES = (0.1, 0.25, 0.5, 0.67, 0.8, 0.9, 0.95, 0.99)
+_EVIDENCE = ("sum", "time-average", "cell-average")
+_GAMMAS = {("0.5", "0"): "γ 0.5", ("1", "0"): "γ 1", ("1", "1"): "γ 1/k"}
+"""Names by gamma and gamma_power."""
 
 
 def experiment(duration: float, num_villages: int) -> Experiment:
-    """Epsilon and gamma against each other, and mixing alone with epsilon near its bound."""
+    """Epsilon and gamma against each other, readings of the evidence, and mixing with epsilon near its bound."""
     teams = villages(duration, num_villages)
     bounds = ",".join(
         f"{topology}+{share * mixing.epsilon_bound(topology, _NUM_ROBOTS):.6g}"
@@ -34,6 +45,12 @@ def experiment(duration: float, num_villages: int) -> Experiment:
                 ("rule=gradient,natural", "epsilon=0.1,0.2,0.35,0.5,0.7", "gamma=0.05,0.1,0.25,0.5,1,1.5"),
                 {"topology": "ring", "packets": "full", **SHORT_SETTLING, **LAST_MAPS},
                 has_truth=False,
+            ),
+            Plan(
+                "evidence",
+                tuple(teams),
+                (f"evidence={','.join(_EVIDENCE)}", f"gamma+gamma_power={','.join(map('+'.join, _GAMMAS))}"),
+                {"rule": "gradient", **LAST_MAPS},
             ),
             Plan(
                 "bound",
@@ -54,16 +71,16 @@ def _theory(_: SimulatedTeam, row: Row, __: Sweep) -> dict[str, float]:
     return {"epsilon_share": epsilon / bound, "contraction_theory": mixing.contraction(*graph, epsilon)}
 
 
-def _topology(row: Row) -> str:
-    """Name of a run's graph."""
-    return str(row["topology"])
-
-
 def _curve(topology: str) -> tuple[Float64Array, Float64Array]:
     """Factor per tick in theory over epsilon as a share of its bound."""
     shares = np.linspace(0.0, 1.1, 400)
     bound = mixing.epsilon_bound(topology, _NUM_ROBOTS)
     return shares, np.array([mixing.contraction(topology, _NUM_ROBOTS, share * bound) for share in shares])
+
+
+def _reading(row: Row) -> str:
+    """Name of a reading of the evidence, and of gamma."""
+    return f"{row['evidence']}, {_GAMMAS[str(row['gamma']), str(row['gamma_power'])]}"
 
 
 def _point(row: Row) -> str:
@@ -73,6 +90,18 @@ def _point(row: Row) -> str:
 
 _FACTOR = Measure("factor of Φ per tick", "contraction")
 _PHI = Measure("Φ over all pairs, end of the logs", "total_distance_all_log_end", None, is_ratio=True)
+_OF_STEPS = Comparison(
+    "steps",
+    "ε, γ",
+    lambda row: f"{float(row['epsilon']):g}, {float(row['gamma']):g}",
+    (_PHI, DURING, SETTLED),
+    "0.5, 0.5",
+    "rule",
+    title="steps",
+)
+_OF_EVIDENCE = Comparison(
+    "evidence", "evidence, γ", _reading, (_PHI, DURING, SETTLED, MEAN_IOU), "sum, γ 0.5", title="evidence"
+)
 
 QUESTION = Question(
     experiment,
@@ -87,10 +116,14 @@ QUESTION = Question(
                 Measure("factor in theory", "contraction_theory"),
                 Measure("ticks to consensus", "ticks_to_consensus", None),
             ),
+            title="bound",
         ),
+        _OF_STEPS,
+        _OF_EVIDENCE,
     ),
     {
-        "steps.png": Squares("steps", "gamma", "epsilon", (_PHI, DURING, SETTLED), "rule"),
-        "bound.png": Curves("bound", "epsilon_share", "epsilon / bound", (_FACTOR,), _topology, theory=_curve),
+        "steps.png": Squares("steps", "gamma", "epsilon", _OF_STEPS.measures, "rule"),
+        "evidence.png": Dots(_OF_EVIDENCE),
+        "bound.png": Curves("bound", "epsilon_share", "epsilon / bound", (_FACTOR,), graph_name, theory=_curve),
     },
 )
