@@ -69,6 +69,7 @@ class Dots:
                 label_plainly(axes.xaxis)
             else:
                 axes.locator_params(axis="x", nbins=_NUM_STEPS)
+                axes.ticklabel_format(axis="x", useOffset=False)
         panels[0].set_yticks(range(len(labels)), labels, fontsize=9)
         panels[0].invert_yaxis()
         if len(sections) > 1:
