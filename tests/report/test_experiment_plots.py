@@ -50,7 +50,9 @@ def test_a_label_can_be_left_out_of_dots() -> None:
     assert [text.get_text() for text in score.get_yticklabels()] == ["flood"]
 
 
-@pytest.mark.parametrize(("highest", "labels"), [(30.0, [5.0, 10.0, 20.0]), (2000.0, [10.0, 100.0, 1000.0])])
+@pytest.mark.parametrize(
+    ("highest", "labels"), [(30.0, [5.0, 10.0, 20.0]), (2000.0, [10.0, 100.0, 1000.0]), (4e6, [100.0, 1e4, 1e6])]
+)
 def test_numbers_of_a_logarithmic_axis_are_far_apart(highest: float, labels: list[float]) -> None:
     found = {"runs": [{"rule": "flood", "village": 0, "bytes": 1e3 * value} for value in (4.0, highest)]}
     (num_bytes,) = Dots(Comparison("runs", "bytes", lambda row: str(row["bytes"]), (BYTES,))).draw(found).axes

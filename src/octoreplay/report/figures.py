@@ -168,14 +168,15 @@ def label_plainly(axis: Axis) -> None:
 
 
 def _decades(axis: Axis) -> None:
-    """Put a tick at every decade, and at 2 and 5 between where there is room."""
+    """Put a tick at every decade, or at fewer of many, and at 2 and 5 between where there is room."""
     from matplotlib.axis import XAxis
     from matplotlib.ticker import LogLocator, NullLocator
 
     low, high = axis.get_view_interval()
     # Numbers beside each other need more room than those above each other.
-    widest = 100 if isinstance(axis, XAxis) else 1000
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < widest * low else (1.0,), numticks=100))
+    widest, most = (100, 5) if isinstance(axis, XAxis) else (1000, 100)
+    is_wide = high >= widest * low
+    axis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0), numticks=most if is_wide else 100))
     axis.set_minor_locator(NullLocator())
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from octoreplay.evaluate import mixing
 from octoreplay.records import Float64Array
-from octoreplay.report.comparisons import Comparison, Measure, Row
+from octoreplay.report.comparisons import KILOBYTES, Comparison, Measure, Row
 from octoreplay.report.experiment_plots import Curves, Dots, Squares
 from octoreplay.study.experiments import Experiment, Plan, Question, SimulatedTeam
 from octoreplay.study.questions.settings import (
@@ -100,7 +100,7 @@ _OF_STEPS = Comparison(
     title="steps",
 )
 _OF_EVIDENCE = Comparison(
-    "evidence", "evidence, γ", _reading, (_PHI, DURING, SETTLED, MEAN_IOU), "sum, γ 0.5", title="evidence"
+    "evidence", "evidence, γ", _reading, (_PHI, DURING, MEAN_IOU, KILOBYTES), "sum, γ 0.5", title="evidence"
 )
 
 QUESTION = Question(
