@@ -185,7 +185,7 @@ _add_experiment("noise", 30.0, 10, "Measure which wrong labels, poses and depths
 _add_experiment("confidence", 60.0, 10, "Measure how far the probabilities of sensor models and rules can be trusted.")
 _add_experiment("steps", 30.0, 10, "Vary the step sizes epsilon and gamma, and the reading of the evidence.")
 _add_experiment("scale", 20.0, 1, "Measure run times for numbers of robots, cells and classes.", is_timed=True)
-_add_experiment("frames", 40.0, 5, "Measure which frames 'align' finds, and which wrong ones it accepts.")
+_add_experiment("frames", 40.0, 10, "Measure which frames 'align' finds, and which wrong ones it accepts.")
 _add_experiment("drift", 40.0, 10, "Measure what wrong poses cost, and what 'refine' repairs.")
 _add_experiment("misalignment", 40.0, 10, "Measure from which errors of the frames on an exchange of maps does harm.")
 
