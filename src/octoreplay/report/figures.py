@@ -175,8 +175,10 @@ def _decades(axis: Axis) -> None:
     low, high = axis.get_view_interval()
     # Numbers beside each other need more room than those above each other.
     widest, most = (100, 5) if isinstance(axis, XAxis) else (1000, 100)
-    is_wide = high >= widest * low
-    axis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0), numticks=most if is_wide else 100))
+    if high < widest * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=100))
+    else:
+        axis.set_major_locator(LogLocator(numticks=most))
     axis.set_minor_locator(NullLocator())
 
 
