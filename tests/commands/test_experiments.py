@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from octoreplay.cli import cli
 from octoreplay.commands import experiments
 from octoreplay.study.questions import QUESTIONS
+from support.command_line import assert_fails
 
 
 @pytest.mark.parametrize("has_data", [False, True])
@@ -39,3 +40,11 @@ def test_all_experiments_run_one_after_the_other_with_shared_teams(
         entry[1:] == (folder / entry[0], {"teams_folder": folder / "teams", "num_jobs": 3}) for entry in answered
     )
     assert len(json.loads(done.stdout)["written"]) == len(names)
+
+
+def test_teams_in_a_file_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "teams.txt"
+    path.touch()
+    reason = "teams.txt: is a file; name a folder"
+    assert_fails(1, reason, "experiment", "graphs", tmp_path / "out", "--teams", path)
+    assert not (tmp_path / "out").exists()

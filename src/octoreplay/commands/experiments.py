@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from octoreplay.commands.console import prints, terminal
-from octoreplay.commands.options import existing_path, lock_folder
+from octoreplay.commands.options import check_no_file, existing_path, lock_folder
 from octoreplay.commands.progress import progress_bar, replay_bar
 from octoreplay.commands.suggestions import SuggestingGroup
 from octoreplay.config.run import RunConfig
@@ -72,10 +72,10 @@ def paper(folder: Path, duration: float, robots: int, seed: int) -> int:
     return 0
 
 
-def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> list[Path]:
+def _answer(name: str, teams: Experiment, folder: Path, *, teams_folder: Path | None, **run: Any) -> list[Path]:
     """Run the experiment of a question, and write its tables and figures; return the written files.
 
-    ``run`` are options of run_experiment.
+    ``teams_folder`` and ``run`` are options of run_experiment. Raises OutputError where ``teams_folder`` is a file.
     """
     from octoreplay.io.output_file import mark_written, write_whole
     from octoreplay.report.comparisons import latex, markdown
@@ -84,9 +84,17 @@ def _answer(name: str, teams: Experiment, folder: Path, **run: Any) -> list[Path
     from octoreplay.study.experiments import run_experiment
     from octoreplay.study.questions import QUESTIONS
 
+    if teams_folder is not None:
+        check_no_file(teams_folder)
     question = QUESTIONS[name]
     with progress_bar(name) as update:
-        found = run_experiment(teams, folder, **run, progress=lambda stage, share: update(share, None, stage))
+        found = run_experiment(
+            teams,
+            folder,
+            teams_folder=teams_folder,
+            **run,
+            progress=lambda stage, share: update(share, None, stage),
+        )
     tables = question.tables(found)
     write_whole(folder / "tables.md", "\n".join(map(markdown, tables)))
     write_whole(folder / "tables.tex", "\n".join(map(latex, tables)))

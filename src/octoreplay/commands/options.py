@@ -275,7 +275,7 @@ def check_new_folder(path: Path) -> None:
 
     With --force it may hold files.
     """
-    _check_no_file(path)
+    check_no_file(path)
     with writing(path):
         is_present = path.exists() and any(entry.name != FOLDER_LOCK for entry in path.iterdir())
     _check_new(path, is_present=is_present)
@@ -283,11 +283,11 @@ def check_new_folder(path: Path) -> None:
 
 def lock_folder(path: Path) -> None:
     """Check that an output folder, which the command may continue, is no file, and lock it. Raises OutputError."""
-    _check_no_file(path)
+    check_no_file(path)
     click.get_current_context().with_resource(locked(path, is_folder=True, is_awaited=True))
 
 
-def _check_no_file(path: Path) -> None:
+def check_no_file(path: Path) -> None:
     """Raise OutputError for a folder that is a file."""
     with writing(path):
         if path.exists() and not path.is_dir():
